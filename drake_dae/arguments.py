@@ -1,4 +1,4 @@
-"""Arguments of public names, checked by their annotations: the same words everywhere."""
+"""Checks of the arguments of public names by their annotations, with uniform messages."""
 
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -28,12 +28,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class _Rule(NamedTuple):
-    """What an annotation asks of a value.
+    """The condition that an annotation imposes on a value.
 
     Attributes:
         words: As in "must be ...".
-        holds: Whether a value is such, looking at it alone.
-        inside: (place, value, rule) of the values that it holds, for what has parts.
+        holds: Whether a value satisfies it, without its parts.
+        inside: (place, value, rule) of the parts of a value, for containers.
     """
 
     words: str
@@ -42,15 +42,15 @@ class _Rule(NamedTuple):
 
 
 def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
-    """A function that refuses arguments which are not what their annotations say.
+    """A function that refuses arguments which do not match their annotations.
 
-    Of a class: its constructor and its public methods. A number must be finite and no bool, arrays
-    must be of such numbers, text is no list of letters, and what a list or a mapping holds
-    is looked at too; shapes and ranges are left to the function. Where an argument's default is
-    None, None is fine.
+    For a class, its constructor and its public methods are checked. A number must be finite and not
+    a bool, arrays must consist of such numbers, text is not accepted as a list of letters, and the
+    entries of lists and mappings are checked, too; shapes and ranges are left to the function. None
+    is accepted if it is the argument's default.
 
     Args:
-        error: Makes what is raised of a text "<function>: <argument> must be <what>, got <value>".
+        error: Makes the exception from a text "<function>: <argument> must be <what>, got <value>".
     """
 
     def decorate(target: F) -> F:
@@ -75,7 +75,7 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
     rest: list[tuple[str, _Rule, Any]] = []
 
     def read() -> None:
-        """Reads the annotations: when they are needed, since they may name what comes later."""
+        """Reads the annotations when they are needed, since they may refer to later definitions."""
         hints = get_type_hints(function)
         for name, parameter in inspect.signature(function).parameters.items():
             entry = (name, _rule(hints.get(name, Any)), parameter.default)
@@ -111,7 +111,7 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
 
 
 def _wrong(what: str, value: Any, rule: _Rule) -> str:
-    """What is wrong about a value; empty if nothing is."""
+    """What is wrong with a value; empty if it is valid."""
     if not rule.holds(value):
         return f"{what} must be {rule.words}, got {brief(value)}{_hint(value, rule)}"
     for place, part, inner in rule.inside(what, value) if rule.inside else ():
@@ -122,7 +122,7 @@ def _wrong(what: str, value: Any, rule: _Rule) -> str:
 
 
 def _hint(value: Any, rule: _Rule) -> str:
-    """Where a value holds what is meant."""
+    """A hint, if an attribute of the value would be valid."""
     holders = ("dae", "system", "model", "diagram", "links")
     parts = vars(value) if hasattr(value, "__dict__") and not inspect.isclass(value) else {}
     meant = [name for name in holders if name in parts and rule.holds(parts[name])]
@@ -133,7 +133,7 @@ _ARRAY = set(get_args(ArrayLike)) or {ArrayLike}  # A union, or in newer NumPy a
 
 
 def _rule(hint: Any) -> _Rule:
-    """What an annotation asks."""
+    """The rule of an annotation."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _rule(arguments[0])
@@ -169,7 +169,7 @@ _CALLABLE = get_origin(Callable[[], None])
 
 
 def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
-    """One of several."""
+    """The rule that one of several rules holds."""
     rules = []
     if members >= _ARRAY:
         rules.append(_ARRAYS)
@@ -194,7 +194,7 @@ def _list(entry: _Rule) -> _Rule:
     def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
         return ((f"{what}[{index}]", part, entry) for index, part in enumerate(value))
 
-    # Also sets and the views of dictionaries; no generators, which could be read only once.
+    # Also sets and views of dictionaries; not generators, which can be read only once.
     return _Rule(
         "a list",
         lambda value: (
@@ -234,7 +234,7 @@ def _mapping(key: _Rule, entry: _Rule) -> _Rule:
 
 
 def _protocol(protocol: Any) -> _Rule:
-    """Everything that has the members of a protocol."""
+    """The rule that a value has the members of a protocol."""
     bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
     members = {
         name
@@ -280,7 +280,7 @@ def _is_real(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    # Those that a float holds exactly: nobody means more, and loops over them would not end.
+    # Those that a float represents exactly; loops over larger ones would not end.
     return isinstance(value, Integral) and not _is_bool(value) and abs(int(value)) <= 2**53
 
 

@@ -1,4 +1,4 @@
-"""Arrays of numbers: how arguments are checked, and how messages show them."""
+"""Arrays of numbers: checks of arguments, and formatting for messages."""
 
 import re
 from collections.abc import Iterable
@@ -17,19 +17,19 @@ FloatArray = np.typing.NDArray[np.float64]
 Booleans = np.typing.NDArray[np.bool_]
 
 MEANINGFUL = 1e12
-"""A state with a larger number has left all measure, in whatever units."""
+"""The largest meaningful number in a state, in any units."""
 
 
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
-    """Real numbers as a new array; they need not be finite. Text and masked entries are none.
+    """Real numbers as a new array; not necessarily finite. Text and masked entries are refused.
 
     Args:
-        what: How a message calls them.
+        what: Their name in messages.
         value: The numbers, in any shape.
         error: The class of exception to raise.
 
     Raises:
-        ModelError: The value holds something else, or rows of different lengths.
+        ModelError: The value contains something else, or rows of different lengths.
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value.copy()
@@ -50,9 +50,9 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
 
 
 def number_in(text: str) -> float | None:
-    """The finite number that a text is, as JSON has it or with a sign; None if it is none.
+    """The finite number of a text, as in JSON or with a sign; None if it is not one.
 
-    Python itself reads "1_0", "nan" and digits of other alphabets as well.
+    Python's float also accepts "1_0", "nan" and digits of other alphabets.
     """
     if not _NUMBER.fullmatch(text.strip(" \t")):
         return None
@@ -64,15 +64,15 @@ _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def can_be_written(text: str) -> bool:
-    """Whether a file can hold a text: not where it has half of a letter, a lone surrogate."""
+    """Whether a text can be written to a file: it must not contain a lone surrogate."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def check_writable(what: str, text: str) -> None:
-    """Refuses a text that no file can hold.
+    """Refuses a text that cannot be written to a file.
 
     Raises:
-        ModelError: It has half of a letter.
+        ModelError: It contains a lone surrogate.
     """
     if not can_be_written(text):
         raise ModelError(
@@ -121,32 +121,32 @@ def vector(
 
 
 def check_whole_number(what: str, value: Any, least: int) -> None:
-    """Refuses what is no whole number that is at least `least`.
+    """Refuses a value that is not a whole number of at least `least`.
 
     Raises:
-        ModelError: The value is too small, or no whole number.
+        ModelError: The value is too small, or not a whole number.
     """
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ModelError(f"{what} must be a whole number from {least}, got {brief(value)}")
 
 
 def check_axes(name: str, axes: str) -> None:
-    """Refuses what is not distinct letters of "xyz".
+    """Refuses a text that does not consist of distinct letters of "xyz".
 
     Raises:
-        ModelError: A letter is another one, or stands twice, or there is none.
+        ModelError: A letter is another one, or occurs twice, or there is none.
     """
     if not axes or any(a not in "xyz" for a in axes) or len(set(axes)) != len(axes):
         raise ModelError(f"{name} must be distinct letters of x, y, z, got '{axes}'")
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """What a message says of a name that is not among those that are known.
+    """The text for an unknown name, with the known ones.
 
     Args:
-        kind: What the name should belong to, for example "frame".
-        name: The one that was given.
-        known: Those that would do.
+        kind: The kind of the name, for example "frame".
+        name: The unknown name.
+        known: The valid names.
 
     Returns:
         A text such as "no frame 'tol'; did you mean 'tool'? there are base, tool".
@@ -158,7 +158,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[str], most: int = 8) -> str:
-    """Names for a line of text, as "[a, b]"; of many the first ones, and how many more."""
+    """Names in a line of text, "[a, b]"; of many the first ones and the number of the others."""
     every = list(names)
     more = [f"... {len(every) - most} more"] if len(every) > most else []
     return f"[{', '.join([*every[:most], *more])}]"
@@ -170,12 +170,12 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
 
 
 def brief(value: Any) -> str:
-    """Any value in a message: in one line, and short however large it is."""
+    """Any value in a message, in one short line."""
     try:
         text = " ".join(_BRIEF.repr(value).split())
-    except Exception:  # Of a __repr__ that is not ours.
+    except Exception:  # From a __repr__ of others.
         text = f"a {type(value).__name__}"
-    if text.startswith("<"):  # It says where in memory it is, and no more.
+    if text.startswith("<"):  # A default __repr__, with the address only.
         return f"a {type(value).__name__}"
     return text if len(text) <= 200 else f"{text[:197]}..."
 
@@ -188,7 +188,7 @@ def show(array: ArrayLike) -> str:
 
 
 def show_state(state: ArrayLike) -> str:
-    """A state in a message: its numbers, or how far it has grown where they mean nothing more."""
+    """A state in a message: its numbers, or its size if it has diverged."""
     values = np.asarray(state, dtype=float)
     largest = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
     return f"grown to {largest:.0e}" if largest > MEANINGFUL else show(values)

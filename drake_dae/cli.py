@@ -1,5 +1,6 @@
 """The command `drake-dae`."""
 
+import argparse
 import gc
 import json
 import logging
@@ -7,7 +8,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 
@@ -19,23 +20,26 @@ from drake_dae.errors import (
     describe_os_error,
 )
 from drake_dae.scenario.shipped import description, shipped_scenarios
-from drake_dae.simulation.records.interruption import end_at_once, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 
 YOUNG = 50_000
-"""So many new objects are there before garbage is looked for: what a command loads and builds
-stays, and to look through it as often as Python does takes a sixth of a short run."""
+"""The number of new objects before a garbage collection.
+
+The objects that a command loads and builds are kept: collecting as often as Python does takes a
+sixth of a short run.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 1 for an error, also where a run ends early; 2 for a problem that `analyze` found, for a
-    run that missed its task where `--check` asks for it, and for wrong usage; 128 + signal after
-    Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
+    0, or 1 for an error, also if a run ends early; 2 for a problem found by `analyze`, with
+    `--check` for a run that missed its task, and for wrong usage; 128 + signal after Ctrl-C (130),
+    SIGTERM (143) or SIGHUP (129).
 
     Args:
-        arguments: Those after the command's name; those of this process, which then is the
-            command's alone, if None.
+        arguments: Those after the command's name; None for those of this process, which must then
+            run nothing else.
     """
     if arguments is not None:
         return _main(arguments)
@@ -43,58 +47,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _main(None)
     finally:
-        gc.freeze()  # The process ends, and its memory with it.
+        gc.freeze()  # Not needed: the process ends.
 
 
 def _main(arguments: Sequence[str] | None) -> int:
     options = parse_options(arguments)
     if isinstance(sys.stdout, TextIOWrapper):
-        # Names may have letters that the terminal does not.
+        # Names may have letters that the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
     as_json = getattr(options, "json", False)
     try:
         if options.command == "list":
             return _list(as_json)
-        # What a command needs is loaded with it: Drake alone takes a second.
-        ignored: list[type[Warning]] = []
-        if options.command == "show":
-            from drake_dae.commands.show import run_command
-        elif options.command in ("keys", "schema"):
-            from drake_dae.commands.keys import run_command
-        elif options.command == "view":
-            from drake_dae.commands.view import run_command
-        elif options.command == "cache":
-            from drake_dae.commands.cache import run_command
-        elif options.command == "analyze":
-            from drake_dae.commands.analyze import run_command
-
-            ignored.append(NonMinimumPhaseWarning)  # The report tells it.
-        elif options.command == "export":
-            from drake_dae.commands.export import run_command
-        elif options.command == "film":
-            from drake_dae.commands.film import run_command
-        elif options.command == "new":
-            from drake_dae.commands.new import run_command
-        elif options.command == "sweep":
-            from drake_dae.commands.sweep import run_command
-        else:
-            from drake_dae.commands.simulate import run_command
+        run_command = _loaded(options.command)
+        # The report tells it.
+        ignored = [NonMinimumPhaseWarning] if options.command == "analyze" else []
         if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
-        # Drake tells where each Meshcat listens, also the one that only records.
+        # Drake logs the port of each Meshcat, also of one that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)
-        # Files on their way go when a signal ends it.
+        # Unfinished files are removed when a signal ends it.
         with _warnings(*ignored), ending_signals(end_at_once):
             return run_command(options)
     except DrakeDaeError as error:
-        # A scenario has a line for each problem; other texts, as of Drake, are made one.
+        # A scenario's error has a line for each problem; other texts, as of Drake, become one line.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
         print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
         if as_json:
             print(json.dumps({"error": text}))
         return 1
     except BrokenPipeError:
-        # The reader of our output, such as head, has enough; Python would complain on exit.
+        # The reader of the output, such as head, has closed it; Python would report that on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -106,6 +89,37 @@ def _main(arguments: Sequence[str] | None) -> int:
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
+
+
+def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
+    """What runs a command, with what that needs: Drake alone takes a second.
+
+    A signal waits meanwhile: Drake's modules would make an ImportError of it.
+    """
+    with ending_signals(interruption := Interruption()):
+        if command == "show":
+            from drake_dae.commands.show import run_command
+        elif command in ("keys", "schema"):
+            from drake_dae.commands.keys import run_command
+        elif command == "view":
+            from drake_dae.commands.view import run_command
+        elif command == "cache":
+            from drake_dae.commands.cache import run_command
+        elif command == "analyze":
+            from drake_dae.commands.analyze import run_command
+        elif command == "export":
+            from drake_dae.commands.export import run_command
+        elif command == "film":
+            from drake_dae.commands.film import run_command
+        elif command == "new":
+            from drake_dae.commands.new import run_command
+        elif command == "sweep":
+            from drake_dae.commands.sweep import run_command
+        else:
+            from drake_dae.commands.simulate import run_command
+    if interruption.signal is not None:
+        end_at_once(interruption.signal)
+    return run_command
 
 
 def _list(as_json: bool) -> int:
@@ -121,7 +135,7 @@ def _list(as_json: bool) -> int:
 
 @contextmanager
 def _warnings(*ignored: type[Warning]) -> Iterator[None]:
-    """Prints warnings as errors are printed, without the line of code; some are ignored."""
+    """Prints warnings like errors, without the line of code; some are ignored."""
     with warnings.catch_warnings():
         for category in ignored:
             warnings.simplefilter("ignore", category)

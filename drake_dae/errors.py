@@ -11,7 +11,7 @@ class DrakeDaeError(Exception):
 
 
 class ModelError(DrakeDaeError, ValueError):
-    """A system, robot, surface or signal that is not well formed."""
+    """A system, robot, surface, signal or argument that is not valid."""
 
 
 class GainError(DrakeDaeError, ValueError):
@@ -23,10 +23,10 @@ class ReferenceSignalError(DrakeDaeError, ValueError):
 
 
 class ScenarioError(DrakeDaeError, ValueError):
-    """A scenario that cannot be used; the message has a line "key: text" for each problem.
+    """An invalid scenario; the message has a line "key: text" for each problem.
 
     Attributes:
-        problems: The dotted key and the text of each; the key is "" where a problem has none.
+        problems: The dotted key and the text of each; the key is "" if a problem has none.
     """
 
     def __init__(self, *problems: tuple[str, str]) -> None:
@@ -42,8 +42,8 @@ class AssumptionError(DrakeDaeError):
     Attributes:
         assumption: The number of the assumption in the paper, 1 to 5.
         state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
-        violation: What was found, as a `dae.structure.assumptions.Violation`; None where
-            integrators were sought and none help.
+        violation: Details, as a `dae.structure.assumptions.Violation`; None if `dynamic_extension`
+            found no integrators.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class AssumptionError(DrakeDaeError):
 
 
 class InconsistentStateError(DrakeDaeError):
-    """A state that is not on the manifold N* of (4), or not where it was asked to be.
+    """A state that is not on the manifold N* of (4), or does not satisfy further conditions.
 
     Attributes:
-        residual: What is not zero: the constraint outputs and their derivatives, shape
-            (sum r_i,), then the output errors if outputs were pinned; x' where no equilibrium is
-            found; from `NormalForm.state` what is left in the coordinates, shape (n,).
+        residual: The nonzero residual: the constraint outputs and their derivatives, shape (sum
+            r_i,), then the output errors if outputs were prescribed; x' if no equilibrium was
+            found; from `NormalForm.state` the error of the coordinates, shape (n,).
     """
 
     def __init__(self, message: str, residual: ArrayLike) -> None:
@@ -74,15 +74,15 @@ class InconsistentStateError(DrakeDaeError):
 
 
 class WiringError(DrakeDaeError, ValueError):
-    """Blocks that must not be connected like this: an algebraic loop, or a loop that diverges."""
+    """Blocks that cannot be connected in this way: an algebraic loop, or a loop that diverges."""
 
 
 class MachineCodeError(DrakeDaeError):
-    """Functions that cannot become machine code: no compiler, or no cache that can be trusted."""
+    """Functions that cannot be compiled: no compiler, or no trusted cache."""
 
 
 class SimulationError(DrakeDaeError):
-    """A run that cannot go on.
+    """A run that cannot continue.
 
     Attributes:
         time: When it failed, in s.
@@ -100,7 +100,7 @@ class SimulationError(DrakeDaeError):
 
 
 class SingularityError(SimulationError):
-    """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank on the way."""
+    """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank during a run."""
 
 
 class PainleveError(SingularityError):
@@ -123,19 +123,19 @@ class NonFiniteError(SimulationError):
 
 
 class NonMinimumPhaseWarning(UserWarning):
-    """A law for a system with unstable zero dynamics: outputs follow, but states run off."""
+    """A law for a system with unstable zero dynamics: outputs are tracked, but states diverge."""
 
 
 class AdviceWarning(UserWarning):
-    """Gains that are advised outside of the range in which they are right."""
+    """Recommended gains outside of the range of validity of the recommendation."""
 
 
 class NegligibleWarning(UserWarning):
-    """What is larger than round-off counts as zero where relative degrees are decided."""
+    """A number larger than round-off is treated as zero in the relative degrees."""
 
 
 class MachineCodeWarning(UserWarning):
-    """Functions that run interpreted where machine code was asked for, or would have paid."""
+    """Functions run interpreted although machine code was requested, or would be faster."""
 
 
 class GeometryWarning(UserWarning):
@@ -143,9 +143,9 @@ class GeometryWarning(UserWarning):
 
 
 class RobotFileWarning(UserWarning):
-    """What of a robot's file the equations take otherwise than it is written."""
+    """A part of a robot's file that the equations treat differently than written."""
 
 
 def describe_os_error(error: OSError) -> str:
-    """What a message says of a file that could not be read or written."""
+    """The text for a file that could not be read or written."""
     return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -1,4 +1,4 @@
-"""Files that a user names: read whole, where they are files at all and no larger than allowed."""
+"""Reads files that a user names, if they are regular files and not too large."""
 
 import errno
 import os
@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 MOST_BYTES = 1 << 28
-"""A file of data is no larger: that many bytes of numbers take gigabytes in Python."""
+"""The largest size of a file of data: so many bytes of numbers take gigabytes in Python."""
 
 
 def open_file(path: str | Path) -> BinaryIO:
     """Opens a file for reading, if it is one.
 
-    A pipe, which may wait for ever for its writer, and a device, which may never end, are refused.
+    Pipes, on which reading may block for ever, and devices, which may never end, are refused.
 
     Raises:
         OSError: It cannot be read, or is no regular file.
-        ValueError: The path holds a null byte, or letters that no path holds.
+        ValueError: The path contains a null byte, or characters that paths must not have.
     """
     # A pipe is opened without waiting for its writer.
     number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -42,7 +42,7 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
 
     Raises:
         OSError: It cannot be read, is no regular file, or is too large; see `open_file`.
-        ValueError: The path holds a null byte, or letters that no path holds.
+        ValueError: The path contains a null byte, or characters that paths must not have.
     """
     with open_file(path) as file:
         data = file.read(most + 1)

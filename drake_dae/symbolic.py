@@ -47,7 +47,7 @@ _DISCONTINUOUS: dict[ExpressionKind, Callable[..., ca.SX]] = {
     ExpressionKind.Floor: ca.floor,
     ExpressionKind.IfThenElse: ca.if_else,
 }
-"""What has no derivatives everywhere, and can be computed all the same."""
+"""Functions without derivatives everywhere, which can be evaluated nevertheless."""
 
 _RELATIONS: dict[FormulaKind, Callable[..., ca.SX]] = {
     FormulaKind.True_: lambda: ca.SX(1),
@@ -91,7 +91,7 @@ def from_symbolic(
 ) -> DaeSystem:
     """A system (1)-(3) whose functions are expressions of `pydrake.symbolic`.
 
-    These share no subexpressions, so that what stands in them twice is translated twice.
+    These share no subexpressions, so repeated subexpressions are translated repeatedly.
 
     Args:
         state: The variables x, in order.
@@ -103,7 +103,7 @@ def from_symbolic(
 
     Raises:
         ModelError: A variable is neither a state nor a parameter; an expression is not smooth, such
-            as abs, or not known, such as an uninterpreted function; or the functions make no
+            as abs, or not known, such as an uninterpreted function; or the functions form no valid
             system, see `DaeSystem`.
     """
     owner = labels.get("name", "system")
@@ -117,7 +117,7 @@ def from_symbolic(
             )
         if variable.get_id() in symbols:
             raise ModelError(
-                f"{owner}: the variable {variable} stands twice among the states and parameters"
+                f"{owner}: the variable {variable} occurs twice among the states and parameters"
             )
         symbols[variable.get_id()] = ca.SX.sym(variable.get_name())
 
@@ -151,7 +151,7 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True
 
     Args:
         expression: The expression, or a Formula in it.
-        symbols: Variable.get_id() -> what stands for it.
+        symbols: Variable.get_id() -> its CasADi symbol.
         smooth: Whether it must have derivatives everywhere.
 
     Raises:

@@ -41,7 +41,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.course import Loop
+from drake_dae.pictures.course import ShownLoop
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
@@ -222,7 +222,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
-    Loop: loop,
+    ShownLoop: loop,
 }
 
 # What fits an argument with a name, of all names or of one.
@@ -579,10 +579,10 @@ EVERY = tuple(labels())
 # What a call does apart from its arguments is not wanted here.
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
-    "Record.save": "it writes where it is told",
-    "export_code": "it writes where it is told",
-    "sweep": "it writes where it is told",
-    "Study.save": "it writes where it is told",
+    "Record.save": "it writes to the given path",
+    "export_code": "it writes to the given path",
+    "sweep": "it writes to the given path",
+    "Study.save": "it writes to the given path",
 }
 
 

@@ -240,7 +240,7 @@ INERTIA = """<sdf version="1.9"><model name="m"><link name="base"/>
 @pytest.mark.parametrize(
     ("mass", "moment"), [("1", "9"), ("1", "-1"), ("1", "nan"), ("0", "1"), ("-1", "1")]
 )
-def test_an_inertia_of_no_body_in_sdformat_is_told_by_its_link(mass, moment, tmp_path):
+def test_an_inertia_of_no_body_in_sdformat_is_reported_by_its_link(mass, moment, tmp_path):
     (tmp_path / "arm.sdf").write_text(INERTIA.format(mass, moment))
     reasons = "mass or inertia of no body|no body can|without mass|a mass is positive"
     with pytest.raises(ModelError, match=rf"link 'arm': ({reasons})"):

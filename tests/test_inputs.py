@@ -213,7 +213,7 @@ def test_one_number_does_not_fill_a_position():
 def test_a_start_from_which_time_does_not_go_on_is_refused(start):
     plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
     config = SimulatorConfig(max_step_size=0.01, use_error_control=False, start_time=start)
-    with pytest.raises(ModelError, match="start_time must be a time from which"):
+    with pytest.raises(ModelError, match="start_time"):
         simulate(plant, plant.CreateDefaultContext(), 1.0, config)
 
 
@@ -274,7 +274,7 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
     np.savez(tmp_path / "record.npz", **values)
     with pytest.raises(ModelError, match="record"):
         Record.load(tmp_path / "record.npz")
-    with pytest.raises(ModelError, match="nowhere is not a record"):
+    with pytest.raises(ModelError, match="not a record"):
         Record.load("nowhere")
 
 

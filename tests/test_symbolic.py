@@ -234,8 +234,8 @@ def test_refused_variables():
     with pytest.raises(ModelError, match=r"state must be a list, got Variable"):
         from_symbolic(x, f=[x], h=[1.0], l=[x])
     for states, parameters, message in (
-        ([x, x], {}, "the variable x stands twice"),
-        ([x], {x: 1.0}, "the variable x stands twice"),
+        ([x, x], {}, "the variable x occurs twice"),
+        ([x], {x: 1.0}, "the variable x occurs twice"),
         (["x"], {}, r"state\[0\] must be a Variable, got 'x'"),
         ([Variable("n", Variable.Type.INTEGER)], {}, "must be continuous Variables"),
         ([x, Variable("x")], {}, "names must be unique"),

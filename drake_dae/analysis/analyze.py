@@ -41,10 +41,10 @@ from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 
 STATEMENTS = (
     "v acts on y_i first in derivative r_i",
-    "A(x) has rank m, so v can keep all constraints",
+    "A(x) has rank m, so v can enforce all constraints",
     "u does not act on y_i before derivative r_i",
     "u acts on z_i first in derivative mu_i",
-    "B(x) has rank p, so u can steer all outputs",
+    "B(x) has rank p, so u can control all outputs",
 )
 """What Assumptions (1) to (5) ask for, in a line each."""
 
@@ -107,7 +107,10 @@ def analyze(
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
     if start is not None and reference is None:
-        raise ModelError(f"{system.name}: start is where a reference begins, and there is none")
+        raise ModelError(
+            f"{system.name}: start is the state at the beginning of a reference, and no "
+            "reference is given"
+        )
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
     random = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ def contact_margin_in_words(findings: Findings, where: str, margin: ContactMargi
     """The share of A(x) that remains with friction, and the critical coefficients."""
     critical = ", ".join(f"{name} {value:.4g}" for name, value in margin.critical_friction.items())
     if not np.all(np.isfinite([*margin.critical_friction.values()])):
-        return f"Friction: {where} no amount of it leads to the Painleve paradox."
+        return f"Friction: {where} no coefficient leads to the Painleve paradox."
     when = "" if margin.time is None else f"t = {margin.time:.4g} s, "
     constrained, system = findings.constraint_structure, findings.system
     used = None

@@ -104,7 +104,7 @@ def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -
         taken: Those of them that are consistent and inside the domain, shape (l, n).
 
     Raises:
-        InconsistentStateError: A state is not consistent; the message tells which, and why.
+        InconsistentStateError: A state is not consistent; the message says which, and why.
         ModelError: A state is outside the domain.
     """
     name = manifold.system.name

@@ -151,8 +151,8 @@ def _shared(system: DaeSystem) -> str:
     gone = ", ".join(f"'{signal.name}'" for signal in sharing.left_out_signals)
     forces = ", ".join(sharing.undetermined)
     return (
-        f"Left out as redundant: {gone}. The split of {forces} is not determined by (1)-(3): it is "
-        "that of least squares, and another one has the same motion."
+        f"Left out as redundant: {gone}. The distribution of {forces} is not determined by "
+        "(1)-(3): it is computed by least squares, and any other gives the same motion."
     )
 
 
@@ -170,7 +170,7 @@ def _findings(findings: Findings) -> Table:
     if findings.output_degrees is not None:
         singular = findings.independence is not None and findings.independence.is_singular
         chains = Finding.FAILS if singular else Finding.SATISFIED
-    none = ": there are none" if findings.zero_dynamics_dimension == 0 else ""
+    none = ": the system has none" if findings.zero_dynamics_dimension == 0 else ""
     rows += [
         [
             "2.1  theorem: gradients of all chains are independent",
@@ -205,13 +205,13 @@ def _places(findings: Findings) -> list[Part]:
     ]
     why = why_no_law(findings.system)
     if why and findings.constraint_structure is not None:
-        lines.append(f"Not more was examined: {why}.")
+        lines.append(f"The rest was not examined: {why}.")
     zero = findings.zero_dynamics
     spare = findings.system.num_controls - findings.system.num_outputs
     if findings.system.control_metric is not None and findings.structure is not None:
         lines.append(
-            f"B(x) leaves {count_of(spare, 'combination')} of the controls open: they are next to "
-            "free_control in the system's control_metric."
+            f"B(x) leaves {count_of(spare, 'combination')} of the controls undetermined: they are "
+            "as close as possible to free_control in the system's control_metric."
         )
     if zero is not None and zero.eigenvalues.size:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")

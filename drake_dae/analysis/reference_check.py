@@ -56,16 +56,16 @@ def check_reference(
     )
     signals = layout.reference_signals(system.output_signals)
     for i in map(int, layout.chained):
-        told, found = values[:, i + 1], slopes[:, i]
-        scale = max(np.abs(told).max(), np.abs(found).max())
+        stated, found = values[:, i + 1], slopes[:, i]
+        scale = max(np.abs(stated).max(), np.abs(found).max())
         round_off = 1e-13 * np.abs(values[:, i]).max() / step
         unsure = 4.0 * np.abs(found - coarse[:, i])
-        excess = np.abs(told - found) - 1e-3 * scale - round_off - unsure
+        excess = np.abs(stated - found) - 1e-3 * scale - round_off - unsure
         worst = int(np.argmax(excess))
         if excess[worst] > 0.0:
             raise ModelError(
-                f"{system.name}: the reference contradicts itself: it tells "
-                f"{signals[i + 1].name} = {told[worst]:.4g} at t = {tried[worst]:.4g} s, but "
-                f"{signals[i].name} changes by {found[worst]:.4g} per second. Give the derivatives "
-                "of r, output by output: r_1, r_1', ..., r_2, ..."
+                f"{system.name}: the reference contradicts itself: its {signals[i + 1].name} = "
+                f"{stated[worst]:.4g} at t = {tried[worst]:.4g} s, but {signals[i].name} "
+                f"changes by {found[worst]:.4g} per second. Give the derivatives of r, output by "
+                "output: r_1, r_1', ..., r_2, ..."
             )

@@ -9,7 +9,7 @@ from drake_dae.scenario.shipped import find_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Prints what is found about the scenario that the options name; returns the exit code."""
+    """Prints the report on the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     found = find_feasibility(load_scenario(path, options.settings))
     if options.json:

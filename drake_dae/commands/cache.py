@@ -1,4 +1,4 @@
-"""`drake-dae cache`: shows the machine code that is kept, or removes it."""
+"""`drake-dae cache`: shows the machine code in the cache, or removes it."""
 
 import argparse
 
@@ -8,7 +8,7 @@ from drake_dae.trace.compiler import find_compiler
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Prints what is kept and which compiler is found; returns the exit code."""
+    """Prints the cache's contents and the compiler; returns the exit code."""
     files = contents()
     size = sum(path.stat().st_size for path in files if path.is_file())
     what = f"{len(files)} files, {size / 1e6:.1f} MB"

@@ -20,7 +20,7 @@ def run_command(options: argparse.Namespace) -> int:
     scenario = load_scenario(path, options.settings)
     loop, context = build_scenario(scenario)
     if loop.generator is None:
-        text = "exports know `references` alone; `drake-dae simulate` runs a task"
+        text = "exports support only `references`; `drake-dae simulate` runs a task"
         raise ScenarioError(("task", text))
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
@@ -35,12 +35,12 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
-    """What the scenario runs and the code has not; the loop as a whole leaves nothing out."""
+    """The parts of the scenario that are not in the exported code; none if the whole loop is."""
     if parts_of(loop).compiled is not None:
         return []
     closed = "the code has the plant with all contacts closed"
     parts = {
-        "the observer, which finds the disturbance and the friction among law_parameters": (
+        "the observer, which estimates the disturbance and the friction among law_parameters": (
             loop.observer is not None
         ),
         "the limits of the drives": scenario.saturation,

@@ -1,4 +1,4 @@
-"""`drake-dae film`: renders what a run left in its folder."""
+"""`drake-dae film`: renders the run in a folder."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""`drake-dae keys` and `drake-dae schema`: what a scenario may hold."""
+"""`drake-dae keys` and `drake-dae schema`: the keys of a scenario."""
 
 import argparse
 import json

@@ -17,8 +17,10 @@ def run_command(options: argparse.Namespace) -> int:
     robot = Path(options.robot)
     out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
     if out.exists():
-        raise ScenarioError(("--out", f"'{out}' exists, and is not written over; name another"))
-    # What the simulation will leave out it tells itself, and Drake's parser tells of every tag.
+        raise ScenarioError(
+            ("--out", (f"'{out}' exists, and is not overwritten; choose another name"))
+        )
+    # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)

@@ -1,4 +1,4 @@
-"""What the command line takes: commands, options and their words."""
+"""The command line: commands, options and their help texts."""
 
 import argparse
 import re
@@ -11,7 +11,7 @@ from drake_dae.arrays import number_in
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 
 TIME_LIMIT = 3600.0
-"""How long a run of a sweep may take where nobody says, in s."""
+"""The default time limit of a run of a sweep, in s."""
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -21,7 +21,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         arguments: Those after the command's name; those of this process if None.
 
     Raises:
-        SystemExit: They mean nothing, which is told, or ask for help or the version.
+        SystemExit: They are invalid, or ask for help or the version.
     """
     parser = argparse.ArgumentParser(
         prog="drake-dae",
@@ -29,9 +29,11 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
-    listed = commands.add_parser("list", help="name the shipped scenarios")
+    listed = commands.add_parser("list", help="list the shipped scenarios")
     _add_json(listed, "print names and descriptions as JSON")
-    shown = commands.add_parser("show", help="print a scenario, to begin one with")
+    shown = commands.add_parser(
+        "show", help=("print a shipped scenario, as the beginning of your own")
+    )
     shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
     shown.add_argument("--path", action="store_true", help="print where its file is instead")
     commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
@@ -60,9 +62,12 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "simulate",
         parents=[named],
         help="run a scenario",
-        epilog="exit code: 0 if the run came to its end, 1 for an error, also where it ended "
-        "early; with --check 2 if it missed its task: errors are not as predicted, without a "
-        "reason or to the end, or a contact, a drive or a joint would have to do what it cannot",
+        epilog=(
+            "exit code: 0 if the run came to its end, 1 for an error, also where it ended "
+            "early; with --check 2 if it missed its task: errors are not as predicted, "
+            "without a reason or up to the end, or a contact would have to pull, or a drive "
+            "or a joint exceeds its limit"
+        ),
     )
     run.add_argument(
         "--out", type=_path, help="folder for the results (default: runs/<scenario>-<time>)"
@@ -76,9 +81,11 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     run.add_argument(
         "--rollout",
         action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function, which pays for many "
-        "runs (see sweep) rather than for one; the record has every fixed step, or 1000 rows under "
-        "error control, and is written at the end alone",
+        help=(
+            "run the whole loop as one function, without Drake's Simulator; faster for many "
+            "runs (see sweep), not for one; the record has every fixed step, or 1000 rows under "
+            "error control, and is written at the end alone"
+        ),
     )
     run.add_argument(
         "--check", action="store_true", help="exit code 2 for a run that missed its task"
@@ -109,12 +116,14 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "folder compiles it and compares it with Python.",
     )
     written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
-    _add_json(written, "print as JSON what is written")
+    _add_json(written, "print the names of the files as JSON")
     film = commands.add_parser(
         "film",
         help="film a run, into a GIF or a strip of pictures",
-        description="Renders what a run left in its folder, with the paths and the forces of its "
-        "contacts. It takes no screen, and no browser.",
+        description=(
+            "Renders the run in a folder, with the paths and the forces of its contacts. "
+            "It needs no screen and no browser."
+        ),
     )
     film.add_argument("folder", type=_path, help="the folder of a run, as runs/seven_joint_wall")
     film.add_argument(
@@ -122,7 +131,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         type=_path,
         help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
     )
-    kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
+    kept = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
     if options.command == "simulate" and options.rollout and options.meshcat:
@@ -134,23 +143,28 @@ def _add_new(commands: Any) -> None:
     begin = commands.add_parser(
         "new",
         help="write a scenario for a robot of your own",
-        description="Writes a scenario for a robot of which only the file is known: it finds base, "
-        "chain and tip, locks what grasps or rolls, puts a surface where the tip reaches it well, "
-        "and has it circle and press there within the limits. Each line says why.",
+        description=(
+            "Writes a scenario for a robot of which only the file is known: it finds "
+            "base, chain and tip, locks grippers and wheels, places a surface within "
+            "good reach of the tip, and makes the tip circle and press there within the "
+            "limits. Comments give the reasons."
+        ),
     )
     begin.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
     begin.add_argument(
         "--surface",
         choices=["plane", "cylinder", "sphere"],
         default="plane",
-        help="what it works on (default: plane)",
+        help="the surface (default: plane)",
     )
     begin.add_argument(
         "--tip",
         default="",
         metavar="LINK[:x,y,z]",
-        help="the link or frame that touches, and the point in it in m (default: the end of the "
-        "longest chain)",
+        help=(
+            "the link or frame in contact, and the contact point in it in m (default: the end "
+            "of the longest chain)"
+        ),
     )
     begin.add_argument(
         "--out", type=_path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
@@ -162,9 +176,11 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         "sweep",
         parents=[named],
         help="run a scenario many times with other values",
-        description="Runs a scenario once for every combination of the values of some keys, on all "
-        "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
-        "moment and started again with the same command, it continues where it was.",
+        description=(
+            "Runs a scenario once for every combination of the values of some keys, on "
+            "all cores, and writes a table with figures of each run, a summary and "
+            "plots. If it is killed, the same command continues it."
+        ),
         epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
         "slow: the same command tries that run again; with --check 2 if a run did not finish",
     )
@@ -183,7 +199,10 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         "--random",
         type=_whole,
         metavar="COUNT",
-        help="so many runs with random values, all in a range equally likely, instead of a grid",
+        help=(
+            "number of runs with random values, uniformly distributed in their ranges, instead "
+            "of a grid"
+        ),
     )
     chosen.add_argument(
         "--together",
@@ -219,7 +238,7 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
 
 
 def _path(text: str) -> Path:
-    """A path of the command line; "", as of a variable of the shell that is not set, is none."""
+    """A path of the command line; "", as from an unset variable of the shell, is refused."""
     if not text:
         raise argparse.ArgumentTypeError("a name is needed, got ''")
     return Path(text)

@@ -1,4 +1,4 @@
-"""The folder that a run leaves its files in."""
+"""The folder for the files of a run."""
 
 import errno
 import fcntl
@@ -17,38 +17,38 @@ from drake_dae.simulation.records.interruption import Interruption, end_at_once,
 
 SCENARIO = "scenario.yaml"
 PART = "record.part"
-"""The record while the run goes on, and what is left of it where the run was killed."""
+"""The record during the run, and after a run that was killed."""
 
 ANIMATION = "animation.html"
 
 FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, ANIMATION)
-"""What a run leaves in its folder."""
+"""The files of a run in its folder."""
 
 FILM = "film.gif"
-"""What `drake-dae film` adds to them."""
+"""The files of `drake-dae film`."""
 
 MARK = "# Scenario as run by drake-dae"
-"""Begins the scenario in a run's folder: only such a folder is written to again."""
+"""The first line of the scenario in a run's folder: only such a folder is reused."""
 
 _STAGE = ".unfinished-"
 
 
 @contextmanager
 def run_folder(folder: Path) -> Iterator[Path | None]:
-    """Makes the folder of a run, and keeps other runs out of it as long as the block lasts.
+    """Makes the folder of a run, and locks it against other runs for the duration of the block.
 
-    The files of an earlier run move into a folder beside it, "<folder>-1", "<folder>-2", ...;
-    others stay. The scenario is there, empty, and holds the lock; no file is written through a
+    The files of an earlier run are moved to a folder "<folder>-1", "<folder>-2", ...; others
+    remain. The scenario file is created empty and carries the lock; no file is written through a
     symbolic link.
 
     Yields:
-        The folder that the earlier run is kept in; None if there was none.
+        The folder to which the earlier run was moved; None if there was none.
 
     Warns:
         UserWarning: The file system has no locks.
 
     Raises:
-        ModelError: The folder cannot be used; why.
+        ModelError: The folder cannot be used; the message says why.
     """
     if "\0" in str(folder):
         raise ModelError(f"no path holds a null byte, got {brief(str(folder))}")
@@ -69,7 +69,7 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
 
 
 def _prepare(folder: Path) -> tuple[int, Path | None]:
-    """The open file with the lock, and where an earlier run is kept."""
+    """The open file with the lock, and the folder to which an earlier run was moved."""
     folder.mkdir(parents=True, exist_ok=True)
     _check(folder, None)
     lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -102,7 +102,7 @@ def _keep(folder: Path, files: Sequence[Path]) -> Path | None:
             break
         except FileExistsError:
             number += 1
-    # The copy first: a folder of a run is known by it.
+    # The copy first: it identifies a folder of a run.
     shutil.copyfile(folder / SCENARIO, kept / SCENARIO)
     for file in files:
         file.rename(kept / file.name)
@@ -114,9 +114,9 @@ def _present(folder: Path) -> list[Path]:
 
 
 def _check(folder: Path, text: str | None) -> None:
-    """Refuses the files of others; the text is that of the scenario, None if not yet read."""
+    """Refuses a folder with other files; the text is that of the scenario, None if not yet read."""
     present, scenario = _present(folder), folder / SCENARIO
-    # Empty: just made, or by a run that was killed in its first moment.
+    # Empty: new, or from a run that was killed at once.
     own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
     if present and (present[0] != scenario or scenario.is_symlink() or not own):
         found = ", ".join(file.name for file in present)
@@ -141,7 +141,7 @@ def _lock(file: int, folder: Path) -> None:
 
 @contextmanager
 def stage(folder: Path, *names: str) -> Iterator[Path]:
-    """A place to write files, which appear in the folder when they are complete.
+    """A temporary folder for files, which are moved to the folder when they are complete.
 
     Raises:
         OSError: Some file cannot be written; with the path of the first of the names if the error
@@ -154,7 +154,7 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
             for name in names:
                 Path(place, name).replace(folder / name)
     except OSError as error:
-        # What NumPy, zipfile and Pillow raise has no path, or one in a place that is gone.
+        # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
         if place is None or str(error.filename or place).startswith(place):
             error.filename, error.filename2 = str(folder / names[0]), None
         raise
@@ -162,9 +162,9 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
 
 @contextmanager
 def _workplace(folder: Path) -> Iterator[str]:
-    """A folder inside of another one, which goes at the end also when a signal comes.
+    """A temporary folder inside another one, removed at the end also after a signal.
 
-    A signal waits while the folder is made and while it is removed.
+    Signals are deferred while the folder is made and while it is removed.
     """
     place = None
     ending, last = Interruption(), Interruption()

@@ -7,7 +7,7 @@ from drake_dae.scenario.shipped import find_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Prints the file of the scenario that the options name, or where it is.
+    """Prints the file of the scenario that the options name, or its path.
 
     Raises:
         ScenarioError: The file cannot be read.

@@ -1,4 +1,4 @@
-"""`drake-dae simulate`: runs a scenario and writes what it leaves into a folder."""
+"""`drake-dae simulate`: runs a scenario and writes its files into a folder."""
 
 import argparse
 import gc
@@ -62,19 +62,21 @@ def run_command(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     if options.open and not scenario.write.animation:
-        raise ScenarioError(("write.animation", "--open shows the animation: leave it true"))
+        raise ScenarioError(
+            ("write.animation", ("--open shows the animation, so write.animation must be true"))
+        )
     if not options.json:
         return _simulate(options, path.stem, scenario)[0]
     with redirect_stdout(sys.stderr):
-        code, told = _simulate(options, path.stem, scenario)
-    print(json.dumps(told, indent=2))
+        code, results = _simulate(options, path.stem, scenario)
+    print(json.dumps(results, indent=2))
     return code
 
 
 def _simulate(
     options: argparse.Namespace, name: str, scenario: Scenario
 ) -> tuple[int, dict[str, Any]]:
-    """Runs a scenario; returns the exit code, and what JSON says of the run."""
+    """Runs a scenario; returns the exit code, and the results for JSON."""
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
@@ -93,16 +95,16 @@ def _simulate(
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
         title = f"{name}: {scenario.description}" if scenario.description else name
-        code, told = _run(loop, context, completed, folder, simulate_by, title)
+        code, results = _run(loop, context, completed, folder, simulate_by, title)
     if options.open:
         show(folder)
-    if code == 0 and options.check and told.get("missed"):
+    if code == 0 and options.check and results.get("missed"):
         code = 2
-    return code, {"scenario": name, "folder": str(folder), **told}
+    return code, {"scenario": name, "folder": str(folder), **results}
 
 
 def _unused(name: str) -> Path:
-    """A folder below runs/ that was not there before."""
+    """A new folder below runs/."""
     runs, number = Path("runs"), 1
     runs.mkdir(exist_ok=True)
     while True:
@@ -116,7 +118,7 @@ def _unused(name: str) -> Path:
 
 @dataclass
 class _Run:
-    """A run: what it is of, where it is written, and how it ended."""
+    """A run: its scenario, its folder, and its outcome."""
 
     loop: ClosedLoop
     context: Context
@@ -130,7 +132,7 @@ class _Run:
     pictures: bool = True
     record: Record | None = None
     recorded: RecordAfter | None = None
-    told: dict[str, Any] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
 
 
 def _step(run: _Run) -> RunStatistics:
@@ -148,7 +150,7 @@ def _step(run: _Run) -> RunStatistics:
 
 
 def _tell_rate(run: _Run) -> None:
-    """Says before a run in real time that it will not keep up."""
+    """Warns before a run in real time that is too slow for it."""
     scenario, config = run.scenario, run.scenario.integrator
     wanted = config.target_realtime_rate
     if not wanted:
@@ -166,7 +168,7 @@ def _roll(run: _Run) -> RunStatistics:
     """Runs by `rollout`.
 
     Raises:
-        SimulationError: The run cannot go on.
+        SimulationError: The run cannot continue.
     """
     from drake_dae.scenario.rolled import roll_scenario
 
@@ -197,7 +199,7 @@ def _run(
     simulate_by: Callable[[_Run], RunStatistics],
     title: str,
 ) -> tuple[int, dict[str, Any]]:
-    """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
+    """Runs and writes; the record is kept also when the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
 
     def recorded(context: Context, after: float | None) -> Record:
@@ -216,15 +218,15 @@ def _run(
         finally:
             complete = _write(run)
     if run.statistics.interrupted:
-        return 128 + run.statistics.interrupted, run.told
-    return 0 if complete else 1, run.told
+        return 128 + run.statistics.interrupted, run.results
+    return 0 if complete else 1, run.results
 
 
 def _write(run: _Run) -> bool:
     """Writes the files, prints the summary, and says whether all files are complete."""
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
-    # A signal that comes now does not stop before the record is written, but before the pictures.
+    # A signal from here on takes effect after the record is written and before the pictures.
     with ending_signals(ending := Interruption()):
         record = run.record or loop.record(run.context)
         if record.time.size == 0:
@@ -240,9 +242,9 @@ def _write(run: _Run) -> bool:
         text = summary(
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
-        run.told = _as_data(run, judge(record, predicted, accuracy), reasons)
-        run.told["shortfalls"] = [*shortfalls(record, limits), *map(str, behind)]
-        run.told["missed"] |= bool(run.told["shortfalls"])
+        run.results = _as_data(run, judge(record, predicted, accuracy), reasons)
+        run.results["shortfalls"] = [*shortfalls(record, limits), *map(str, behind)]
+        run.results["missed"] |= bool(run.results["shortfalls"])
         if model is not None:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
@@ -257,8 +259,8 @@ def _write(run: _Run) -> bool:
             with _collected(problems):
                 _write_record(replace(record, about=run.writer.about), run)
         with _collected(problems), stage(folder, "summary.txt") as place:
-            told = "\n".join([text, *run.notes, ""])
-            (place / "summary.txt").write_text(told, encoding="utf-8")
+            results = "\n".join([text, *run.notes, ""])
+            (place / "summary.txt").write_text(results, encoding="utf-8")
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)
@@ -276,7 +278,7 @@ def _write(run: _Run) -> bool:
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PART) if (folder / name).exists()]
-        run.told["files"] = files
+        run.results["files"] = files
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
             if ANIMATION in files:
@@ -300,7 +302,7 @@ def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehin
 
 
 def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
-    """What JSON says of a run."""
+    """The results of a run for JSON."""
     found = run.statistics
     return {
         **as_data(verdict, reasons),
@@ -312,19 +314,19 @@ def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
-    """Why a run may be off what theory predicts for an ideal one."""
+    """Reasons for deviations from the prediction for an ideal run."""
     reasons = {
-        "the drives were cut off at their limits": record["excess"].any()
+        "the drives were saturated": record["excess"].any()
         if "excess" in record.signals
         else False,
-        "the plant has numbers that the law does not know (plant_parameters)": bool(
+        "parameters of the plant differ from those of the law (plant_parameters)": bool(
             scenario.plant_parameters
         ),
         "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
         "disturbance forces act on the plant, unknown to the law": bool(
             scenario.plant_disturbances
         ),
-        "Drake's own contact gives way": not loop.plant.is_ideal,
+        "Drake's own contact is compliant": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
@@ -340,7 +342,7 @@ def _write_record(record: Record, run: _Run) -> None:
             record.save(place / "record.npz")
     except OSError as error:
         with suppress(OSError):
-            writer.finish(run.context)  # Rows that fit are kept.
+            writer.finish(run.context)  # The rows written so far are kept.
         with suppress(OSError, ModelError, IndexError):
             kept = Record.load(writer.path).time[-1]
             error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
@@ -349,7 +351,7 @@ def _write_record(record: Record, run: _Run) -> None:
 
 
 def _print(text: str, file: TextIO) -> None:
-    """Prints now; what is closed, as a terminal after SIGHUP, gets no second try on exit."""
+    """Prints and flushes; a closed output, as after SIGHUP, is not tried again on exit."""
     try:
         print(text, end="\n" if text and text[-1] != "\n" else "", file=file, flush=True)
     except OSError:
@@ -359,9 +361,9 @@ def _print(text: str, file: TextIO) -> None:
 
 @contextmanager
 def _frozen() -> Iterator[None]:
-    """Spares what was made up to here the garbage collector, which would look through it all.
+    """Excludes the objects made so far from garbage collection.
 
-    A figure makes so many objects that this takes as long as to draw it.
+    A figure creates so many objects that collecting would take as long as drawing it.
     """
     gc.freeze()
     try:
@@ -372,7 +374,7 @@ def _frozen() -> Iterator[None]:
 
 @contextmanager
 def _collected(problems: list[str]) -> Iterator[None]:
-    """Keeps what is wrong with a file for later: the other files are written, and the summary."""
+    """Collects an error of a file for later: the other files are written, and the summary."""
     try:
         yield
     except OSError as error:

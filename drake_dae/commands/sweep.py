@@ -23,13 +23,13 @@ def run_command(options: argparse.Namespace) -> int:
     if not options.json:
         return _sweep(options)[0]
     with redirect_stdout(sys.stderr):
-        code, told = _sweep(options)
-    print(json.dumps(told, indent=2))
+        code, report = _sweep(options)
+    print(json.dumps(report, indent=2))
     return code
 
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Runs the study; returns the exit code, and what JSON says of it."""
+    """Runs the study; returns the exit code, and the results for JSON."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(
@@ -60,7 +60,7 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     names = ", ".join([file.name, *(written.name for written in files)])
     print(f"{study}\nwritten to {folder}/: {names}", flush=True)
     unfinished = [result for result in study.results if result.outcome is not Outcome.FINISHED]
-    told = {
+    report = {
         "scenario": path.stem,
         "folder": str(folder),
         "runs": len(study.results),
@@ -75,5 +75,5 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     if again := [str(one.run) for one in unfinished if not one.outcome.is_final]:
         text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
         print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
-        return 1, told
-    return 2 if unfinished and options.check else 0, told
+        return 1, report
+    return 2 if unfinished and options.check else 0, report

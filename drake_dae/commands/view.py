@@ -10,7 +10,7 @@ _ANIMATION = "animation.html"
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Opens what is in the folder that the options name; returns the exit code."""
+    """Opens the animation in the folder that the options name; returns the exit code."""
     show(options.folder)
     return 0
 
@@ -35,7 +35,7 @@ def show(folder: Path) -> None:
 
 
 def _missing(folder: Path) -> str:
-    """What to do where there is no animation."""
+    """The message for a folder without animation."""
     if folder.is_file():
         return f"'{folder}' is a file; name the folder of a run"
     if not folder.is_dir():
@@ -48,5 +48,6 @@ def _missing(folder: Path) -> str:
     there = f"; it has the pictures {', '.join(pictures)}" if pictures else ""
     return (
         f"'{folder}' has no {_ANIMATION}{there}. A run writes it at its end, unless "
-        "write.animation is false: `drake-dae simulate` with its scenario.yaml runs it again"
+        "write.animation is false; to repeat the run, call `drake-dae simulate` with its "
+        "scenario.yaml"
     )

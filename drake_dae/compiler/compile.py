@@ -8,7 +8,8 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram, Place, Rate, dense_function
+from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.compiler.rates import Place, Rate, dense_function
 from drake_dae.compiler.trace import Expressions
 from drake_dae.compiler.wires import Port, Wires
 from drake_dae.errors import ModelError
@@ -106,8 +107,8 @@ def _compiled(
         ),
         "row": expressions.checked(lambda: [expressions.port(port) for port in chosen]),
     }
-    rates = _rates(expressions, blocks, places["held"])
-    asked |= {f"update_{i}": values for i, (_, values, _) in enumerate(rates)}
+    rates = _rates(expressions, blocks, places["held"], given)
+    asked |= {f"update_{i}": values for i, (_, values) in enumerate(rates)}
     guards = dict[str, list[Place]]()
     for name, in_samples in (("guard", False), ("watch", True)):
         own_blocks = [
@@ -118,6 +119,7 @@ def _compiled(
         guards[name] = []
         if own_blocks:
             asked[name], guards[name] = _guards(expressions, own_blocks)
+    _check_stepped(blocks, places["state"])
     return CompiledDiagram(
         wires,
         context,
@@ -127,10 +129,7 @@ def _compiled(
         tuple(places["parameters"]),
         tuple(fixed),
         tuple(places["noise"]),
-        tuple(
-            Rate(*key, dense_function("update", given, expressions.expanded(values)), held)
-            for key, values, held in rates
-        ),
+        tuple(rate for rate, _ in rates),
         blocks,
         tuple(guards["guard"]),
         tuple(guards["watch"]),
@@ -160,6 +159,9 @@ def _needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[S
                 expressions.call(block, update.computation)
             if block.guard is not None:
                 expressions.call(block, block.guard.computation)
+            if block.stepped is not None:
+                expressions.source(block, HELD)
+                expressions.source(block, block.stepped.reads)
             if block.initial is not None:
                 expressions.call(block, block.initial)
     return done
@@ -167,6 +169,23 @@ def _needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[S
 
 def _has_state(block: Block) -> bool:
     return any(DERIVATIVE in one.outputs for one in block.computations)
+
+
+def _check_stepped(blocks: Mapping[System, Block], states: Sequence[Place]) -> None:
+    """Refuses what cannot be sampled beside a block that Drake steps."""
+    stepped = [block.system.get_name() for block in blocks.values() if block.stepped is not None]
+    if not stepped:
+        return
+    changing = [block.system for block in blocks.values() if block.guard is not None]
+    others = [*(system for system, _ in states), *changing]
+    if others or len(stepped) > 1:
+        other = others[0].get_name() if others else stepped[1]
+        raise ModelError(
+            f"'{stepped[0]}' has Drake's own contact, beside which a rollout knows samplers alone, "
+            f"and not '{other}', which has a continuous state, phases or contact of its own: "
+            "sample the law, with a force sensor without a time constant, or run the loop by "
+            "simulate"
+        )
 
 
 def _refuse(wires: Wires) -> None:
@@ -201,9 +220,15 @@ def _stacked(
 
 
 def _rates(
-    expressions: Expressions, blocks: Mapping[System, Block], held: Sequence[Place]
-) -> list[tuple[tuple[float, float, bool], tuple[ca.SX, ca.SX], tuple[int, ...]]]:
-    """The updates of all blocks, those of one instant together: when, what, and of which places."""
+    expressions: Expressions,
+    blocks: Mapping[System, Block],
+    held: Sequence[Place],
+    given: Sequence[ca.SX],
+) -> list[tuple[Rate, tuple[ca.SX, ca.SX]]]:
+    """The updates of all blocks, those of one instant together, and what they compute.
+
+    Those come last that Drake makes.
+    """
     parts = dict(held)
     groups: dict[tuple[float, float, bool], list[tuple[Block, Computation]]] = {}
     for block in blocks.values():
@@ -218,8 +243,21 @@ def _rates(
     found = []
     for key, members in groups.items():
         places = [i for block, _ in members for i in _entries(parts[block.system])]
-        found.append((key, expressions.checked(partial(asked, members)), tuple(places)))
+        values = expressions.checked(partial(asked, members))
+        function = dense_function("update", given, expressions.expanded(values))
+        found.append((Rate(*key, function, tuple(places)), values))
+    for block in blocks.values():
+        if (stepped := block.stepped) is not None:
+            values = expressions.checked(partial(_read, expressions, block, stepped.reads))
+            function = dense_function("update", given, expressions.expanded(values))
+            count = sum(stepped.system.GetOutputPort(name).size() for name in stepped.ports)
+            own = tuple(_entries(parts[block.system])[:count])
+            found.append((Rate(stepped.period, 0.0, True, function, own, block), values))
     return found
+
+
+def _read(expressions: Expressions, block: Block, port: str) -> list[ca.SX]:
+    return [expressions.source(block, port)]
 
 
 def _guards(expressions: Expressions, blocks: Sequence[Block]) -> tuple[list[ca.SX], list[Place]]:

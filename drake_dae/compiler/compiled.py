@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.rates import Place, Rate, dense_function
 from drake_dae.compiler.trace import Call, Expressions
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
@@ -21,32 +21,6 @@ from drake_dae.systems.blocks.traced import (
 
 ARGUMENTS = ("time", "state", "held", "parameters")
 """What the functions of a diagram take; an update takes new random numbers, "noise", as well."""
-
-
-class Place(NamedTuple):
-    """Where a column of a block stands among those of the diagram."""
-
-    system: System
-    part: slice
-
-
-@dataclass(frozen=True, eq=False)
-class Rate:
-    """Updates of discrete states at t_k = offset + k period.
-
-    Attributes:
-        period, offset: In s.
-        is_unrestricted: As of an `Update`.
-        function: (time, state, held, parameters, noise) -> new values of some held entries, and a
-            number that is finite if they are of use.
-        places: Which entries these are.
-    """
-
-    period: float
-    offset: float
-    is_unrestricted: bool
-    function: ca.Function
-    places: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +143,11 @@ class CompiledDiagram:
             own = system.GetMyContextFromRoot(context)
             state[part] = own.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
-            own = system.GetMyContextFromRoot(context)
-            groups = range(own.num_discrete_state_groups())
-            held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
+            own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
+            values = [own.get_discrete_state(i).value() for i in range(_groups(own))]
+            if stepped is not None:
+                values = [stepped.held(own)]
+            held[part] = np.concatenate(values)
         return state, held
 
     def put(
@@ -313,6 +289,18 @@ class CompiledDiagram:
         return found
 
     @property
+    def has_stepped(self) -> bool:
+        """Whether Drake steps one of the blocks, which is not traced."""
+        return bool(self.rates) and self.rates[-1].stepped is not None
+
+    @property
+    def stepped(self) -> tuple[Rate, Block]:
+        """The steps of the block that Drake runs, and this block; only where there is one."""
+        rate = self.rates[-1]
+        assert rate.stepped is not None
+        return rate, rate.stepped
+
+    @property
     def projects(self) -> bool:
         """Whether a block has a manifold that its state is brought to."""
         return any(block.projection is not None for block in self.blocks.values())
@@ -331,7 +319,5 @@ class CompiledDiagram:
         return dense_function(name, [self._columns[each] for each in ARGUMENTS], values)
 
 
-def dense_function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
-    """Expressions as a function with dense outputs and without what is common twice."""
-    dense = [ca.densify(value) for value in values]
-    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})
+def _groups(context: Context) -> int:
+    return int(context.num_discrete_state_groups())

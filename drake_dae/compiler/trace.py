@@ -239,6 +239,8 @@ class Expressions:
             return self.time
         if name == PARAMETERS:
             return self.parameters(block)
+        if name == HELD and block.stepped is not None:
+            return self.symbol(system, HELD, block.stepped.size)
         if name in (STATE, HELD, NOISE):
             return self.symbol(system, name, self._size(system, name))
         if system.HasInputPort(name):

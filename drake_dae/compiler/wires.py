@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
 
+from drake_dae.systems.blocks.traced import Traced
+
 Port = tuple[System, int]
-"""A leaf system and the index of one of its ports."""
+"""A leaf system, or a diagram that is one block, and the index of one of its ports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +41,7 @@ class Wires:
 
 def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port]) -> None:
     for system in diagram.GetSystems():
-        if isinstance(system, Diagram):
+        if isinstance(system, Diagram) and not isinstance(system, Traced):
             _collect(system, systems, sources)
         else:
             systems.append(system)
@@ -51,7 +53,7 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
 
 def _output(system: System, index: int) -> Port:
     """The leaf's port behind an output port."""
-    while isinstance(system, Diagram):
+    while isinstance(system, Diagram) and not isinstance(system, Traced):
         system, inner = system.get_output_port_locator(OutputPortIndex(index))
         index = int(inner)
     return system, index
@@ -59,7 +61,7 @@ def _output(system: System, index: int) -> Port:
 
 def _inputs(system: System, index: int) -> list[Port]:
     """The leaves' ports behind an input port."""
-    if not isinstance(system, Diagram):
+    if not isinstance(system, Diagram) or isinstance(system, Traced):
         return [(system, index)]
     found = []
     for inner, port in system.GetInputPortLocators(InputPortIndex(index)):

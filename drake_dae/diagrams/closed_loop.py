@@ -29,26 +29,26 @@ from drake_dae.systems.sensing.force_sensor import ForceSensor
 @checked(WiringError)
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """A plant under a controller: a Drake diagram with named parts, which tells what a run was.
+    """A plant under a controller: a Drake diagram with named parts, and the record of its runs.
 
     Attributes:
         diagram: The diagram, with the output ports `state`, `constraint_force`,
-            `constraint_residual`, `controlled_output`, `control`, and what else a record has of
-            plant, controller and sensors, as `reference`; what the controller shows besides, as
-            `tracking_error`; `link_state` of a robot.
+            `constraint_residual`, `controlled_output`, `control`, further signals of plant,
+            controller and sensors such as `reference`, further ports of the controller such as
+            `tracking_error`, and `link_state` of a robot.
         plant, controller: The systems in it.
-        generator: What gives the references; None for a controller that plans them itself.
-        loggers: Port name -> (sink, names and units), one sample per step: of what has memory of
-            its own. `record` computes everything else from that, when it is asked for.
-        signals: Names and units of each signal that is logged or computed so.
+        generator: The generator of references; None for a controller that plans them itself.
+        loggers: Port name -> (sink, names and units), one sample per step, for signals with memory.
+            `record` computes the other signals from these.
+        signals: Names and units of each signal that is logged or computed.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: That for the plant, or None.
-        encoders: What measures the state for the law, or None.
+        encoders: The sensor of the state for the law, or None.
         observer: The observer that feeds the law instead, or None.
-        memory: What `rollout` made of the loop, and uses again.
+        memory: The data that `rollout` reuses.
     """
 
     diagram: Diagram
@@ -71,16 +71,15 @@ class ClosedLoop:
 
     @property
     def reference(self) -> ReferenceGenerator:
-        """What gives the references.
+        """The generator of references.
 
         Raises:
             ModelError: There is none.
         """
         if self.generator is None:
             raise ModelError(
-                f"{self.controller.get_name()} plans its references itself, so that no generator "
-                "tells them: rollouts, exports and laws of `references` alone know one; run the "
-                "loop by simulate"
+                f"{self.controller.get_name()} plans its references itself and has no generator, "
+                "which rollouts and exports need; run the loop by simulate"
             )
         return self.generator
 
@@ -94,7 +93,7 @@ class ClosedLoop:
         seed_noise(self.noise, context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Starts the plant at a state, shape (n,), as it is given.
+        """Sets the state of the plant, shape (n,), as given.
 
         Args:
             context: The diagram's context.
@@ -106,7 +105,7 @@ class ClosedLoop:
         self.plant.set_state(self.plant.GetMyMutableContextFromRoot(context), state)
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """When each phase of a run began, and why; none where the controller has no phases.
+        """The start of each phase of a run, with the reason; none without phases.
 
         Args:
             context: The diagram's context.
@@ -114,19 +113,19 @@ class ClosedLoop:
         return self.controller.changes(self.controller.GetMyContextFromRoot(context))
 
     def record(self, context: Context, after: float | None = None) -> Record:
-        """What was logged up to now, and what follows from it.
+        """The logged signals up to now, and those computed from them.
 
-        That has `desired_output` r and `tracking_error` z - r (29), and what else the controller
-        tells; see its class. Parameters and gains are those that the blocks had at each moment. At
-        the moment of an impact or of a change of phases all is what was before.
+        It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
+        controller; see its class. Parameters and gains are those of each time. At an impact or a
+        change of phase, values are those before it.
 
         Args:
             context: The diagram's context.
-            after: Only what was logged later than this time, in s; None for all.
+            after: Only later samples than this time, in s; None for all.
 
         Raises:
-            WiringError: An input port of plant or controller has a fixed value in this context, of
-                which nobody knows since when.
+            WiringError: An input port of plant or controller has a fixed value in this context,
+                since an unknown time.
         """
         logged = Record.from_logs(self.loggers, context, after)
         if self.plant.functions:
@@ -138,7 +137,7 @@ class ClosedLoop:
         return replace(found, events=tuple(one for one in events if begin < one.time <= end))
 
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
-        """A record with what its controller derives besides: `tracking_error` and others.
+        """A record with the derived signals of its controller: `tracking_error` and others.
 
         Args:
             record: The record.
@@ -158,7 +157,7 @@ class ClosedLoop:
         return Record(record.time, {**record.signals, **derived})
 
     def predicted_error(self, record: Record) -> FloatArray:
-        """The error (30), (31) that theory predicts for a record, one column for each output."""
+        """The predicted error (30), (31) of a record, one column for each output."""
         parameters = self.controller.law.system.parameter_values
         if self.exogenous is not None:
             moving = self.exogenous.reference(record.time[0])

@@ -1,4 +1,4 @@
-"""The wire from a plant's constraint force to a law that takes it."""
+"""The wire from a plant's constraint force to its law."""
 
 from collections.abc import Sequence
 
@@ -28,10 +28,10 @@ def add_force_feedback(
     Args:
         builder: The builder of the diagram, with plant, controller and sensor in it.
         plant: The plant.
-        controller: The controller, whose law takes a measured force.
-        sensor: The sensor; None for the force as it is.
-        sampling: When the control is read and acts; None where it does so at once.
-        others: What takes the measured force as well.
+        controller: The controller, whose law uses a measured force.
+        sensor: The sensor; None for the exact force.
+        sampling: The sampling of the control; None for continuous control.
+        others: Further blocks that use the measured force.
 
     Returns:
         The source of the sensor's noise, if it has one.
@@ -63,7 +63,7 @@ def _check_loop(
     sensor: ForceSensor | None,
     sampling: Sampling | None,
 ) -> None:
-    """Refuses what Drake would not solve, or would diverge in silence."""
+    """Refuses an algebraic loop, or a sampled loop that diverges."""
     force, measured = plant.GetOutputPort("constraint_force"), controller.law.measured_force
     control = plant.GetInputPort("control").get_index()
     at_once = plant.HasDirectFeedthrough(control, force.get_index())
@@ -97,14 +97,15 @@ def _check_loop(
 
 
 def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> float:
-    """By how much a sample multiplies the force error of a rigid robot.
+    """The factor of the force error of a rigid robot per sample.
 
-    The force follows the control that acts, lambda = -Gbar y of an earlier sample, and the sensor
-    the force, y' = a y + (1 - a) lambda: z^(d + 1) - a z^d + (1 - a) Gbar = 0 for d late samples.
+    The force follows the acting control, lambda = -Gbar y of an earlier sample, and the sensor
+    follows the force, y' = a y + (1 - a) lambda: z^(d + 1) - a z^d + (1 - a) Gbar = 0 for d late
+    samples.
     """
     lag = sensor.time_constant if sensor is not None else 0.0
     a = float(np.exp(-sampling.period / lag)) if lag else 0.0
-    # What a sensor takes at the same instant is read at the next one.
+    # A value that a sensor takes at the same instant is read at the next one.
     late = sampling.late_samples + bool(sensor is not None and sensor.sample_period)
     polynomial = np.zeros(late + 2)
     polynomial[0] = 1.0

@@ -28,15 +28,15 @@ def add_observer(
         builder: The builder of the diagram, with the other blocks in it.
         plant: The plant.
         controller: The controller.
-        observing: How the observer observes.
-        state: The state that the controller gets.
-        sampling: That of the hold behind the controller.
-        control: What arrives at the plant.
+        observing: The rates of the observer.
+        state: The state input of the controller.
+        sampling: The sampling of the hold after the controller.
+        control: The control at the plant.
         reference: R(t).
         limits: The limits of the drives.
 
     Raises:
-        WiringError: There are no samples to observe at, or the law takes no measured force.
+        WiringError: There is no sampling, or the law uses no measured force.
         ModelError: The law has no disturbance.
     """
     step = plant.time_step

@@ -1,4 +1,4 @@
-"""The parts of a closed loop: how each is added to a diagram, and what of it is refused."""
+"""The parts of a closed loop: adding them to a diagram, and checks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,12 +31,12 @@ Block = TypeVar("Block", bound=System)
 
 
 def add_block(builder: DiagramBuilder, block: Block) -> Block:
-    """Adds what the caller made."""
+    """Adds a block that the caller made."""
     try:
         return builder.AddSystem(block)
     except RuntimeError:
         raise WiringError(
-            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
+            f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
         ) from None
 
 
@@ -55,7 +55,7 @@ def add_exogenous(
         exogenous: The references, in the order of the signals.
 
     Raises:
-        WiringError: The references are not as many as the signals.
+        WiringError: The number of references differs from that of the signals.
     """
     names = [signal.name for signal in dae.exogenous.signals]
     size = sum(reference.size for reference in exogenous)
@@ -73,7 +73,7 @@ def add_exogenous(
 
 
 _NEEDS = dict.fromkeys(
-    ("observer", "tolerances"), "it takes the references of a generator, and here is none"
+    ("observer", "tolerances"), "it needs the references of a generator, and there is none"
 )
 
 
@@ -83,17 +83,17 @@ def check_parts(
     reference: ReferenceGenerator | None,
     parts: LoopSettings,
 ) -> None:
-    """Refuses parts that do not fit: Drake would name the ports, but not what is wrong.
+    """Refuses parts that do not fit; Drake would name only the ports.
 
     Args:
         plant: The plant.
         controller: The controller.
-        reference: What gives it its references, if anything.
+        reference: The source of its references, if any.
         parts: The parts.
 
     Raises:
-        WiringError: The controller cannot be wired with a part, or needs references that are not
-            given, the sensor measures another number of forces, or no law uses it.
+        WiringError: The controller does not support a part, references are missing, the sensor has
+            another number of forces, or the law does not use it.
     """
     if controller.HasInputPort("reference") is not (reference is not None):
         needs = "plans its references itself: leave `reference` out"
@@ -130,7 +130,7 @@ def add_drives(
     sampling: Sampling | None,
     control_limits: ArrayLike | None,
 ) -> tuple[OutputPort, ControlLimits | None]:
-    """Adds what stands between controller and plant, and returns the control that arrives."""
+    """Adds hold and limits between controller and plant; returns the control at the plant."""
     control, limits = controller.GetOutputPort("control"), None
     if sampling is not None:
         hold = builder.AddSystem(ControlHold(control.size(), sampling))
@@ -155,14 +155,14 @@ def add_watch(
     law: TrackingLaw,
     tolerances: Tolerances,
 ) -> None:
-    """Adds what ends a run whose errors are too large.
+    """Adds the watch that ends a run with too large errors.
 
     Raises:
         WiringError: There is no such output.
     """
     dae = plant.dae
     sizes = law.layout.reference_size, dae.num_states
-    # Of a continuous plant often enough for what is recent.
+    # For a continuous plant, often enough for the time constant.
     period = plant.time_step or tolerances.window / 20.0
     lowest = law.layout.lowest
     try:
@@ -180,7 +180,7 @@ def add_watch(
 def add_hold(
     builder: DiagramBuilder, controller: Controller, sources: Sequence[OutputPort]
 ) -> None:
-    """Lets the integrals of a controller stand still while a signal is not 0.
+    """Connects signals that stop the integrals of a controller while they are not 0.
 
     Args:
         builder: The builder of the diagram.
@@ -201,12 +201,12 @@ def add_hold(
 
 
 def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) -> list[OutputPort]:
-    """Ports for the `hold` of a controller: integrals of forces of open contacts stand still.
+    """Ports for the `hold` of a controller: integrals of forces of open contacts are not updated.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The plant.
-        controller: The controller, of whose law they are.
+        controller: The controller of the integrals.
     """
     if not controller.HasInputPort("hold"):
         return []
@@ -228,8 +228,8 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
 def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> VectorLogSink:
     """Logs once per step.
 
-    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
-    instant that the run has not reached.
+    For a discrete plant it is periodic: after the last step of a run its state belongs to a time
+    that the run has not reached.
     """
     if plant.time_step:
         return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
@@ -237,7 +237,7 @@ def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> Vector
 
 
 def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
-    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
+    """The sampling of the hold: a discrete plant uses the control held one of its steps before."""
     step = plant.time_step
     if step and sampling.delay < step * (1.0 - 1e-9):
         raise WiringError(

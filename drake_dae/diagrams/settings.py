@@ -1,4 +1,4 @@
-"""What a closed loop has beside its plant, its controller and its references."""
+"""The settings of a closed loop besides plant, controller and references."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,29 +18,27 @@ from drake_dae.systems.sensing.tolerances import Tolerances
 @checked(WiringError)
 @dataclass(frozen=True, eq=False)
 class LoopSettings:
-    """What a closed loop has beside its plant, its controller and its references.
+    """The settings of a closed loop besides plant, controller and references.
 
     Attributes:
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
-            force is connected as it is, where that closes no algebraic loop.
-        encoders: How the state is measured that the law gets, when it reads; the signal
-            "estimated_state" of the record tells it. None where it gets the state as it is.
-        sampling: When the law reads and acts: a period and a delay, and its control is held
-            between. The error is that of the theory up to one order of these times. None for a law
-            that acts continuously, or, on a discrete plant, at each of its steps.
-        control_limits: The largest |u| that the drives give, shape (p,), such as
-            `model.control_limits`; the signal "excess" of the record tells what was cut off, and
-            when. Integrals stand still meanwhile. None for drives without limits.
-        observer: How a `DisturbanceObserver` observes what the law's model lacks, for a sampled law
-            with measured force of a system that `with_disturbance` made. The signals "disturbance"
-            and "friction" of the record are what it found, and integrals stand still while a
-            contact is lost.
-        exogenous: The exogenous signals of the plant, which its law knows too, as references that
-            together cover all entries of w, in their order; without any nothing moves.
-        plant_exogenous: Those of the plant, where its law knows others, or has none; None for the
-            same.
-        tolerances: How large errors may be, or a run ends with an exception that tells it.
-        start_time: When a run begins, in s: the zero dynamics are judged at the references then.
+            force is connected directly, if that closes no algebraic loop.
+        encoders: The measurement of the state for the law, at its samples; the record has it as
+            "estimated_state". None for the exact state.
+        sampling: The period and delay of the law; its control is held between. The error is
+            predicted up to first order in these times. None for a continuous law, or, on a discrete
+            plant, one that acts at each of its steps.
+        control_limits: The largest |u| of the drives, shape (p,), such as `model.control_limits`;
+            the record has "excess", the part beyond. Integrals are not updated meanwhile. None for
+            no limits.
+        observer: The settings of a `DisturbanceObserver`, for a sampled law with measured force of
+            a system that `with_disturbance` made. The record has its "disturbance" and "friction",
+            and integrals are not updated while a contact is lost.
+        exogenous: The exogenous signals of plant and law, as references for all entries of w in
+            their order; constant if none are given.
+        plant_exogenous: Those of the plant if they differ from the law's; None if they are equal.
+        tolerances: The tolerated errors; a run that exceeds them ends with an exception.
+        start_time: The start of a run, in s: the zero dynamics are judged at the references then.
     """
 
     sensor: ForceSensor | None = None

@@ -14,7 +14,7 @@ from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 @dataclass(frozen=True, eq=False)
 class MeasuredState:
-    """What stands between a plant's state and its law.
+    """The measurement between a plant's state and its law.
 
     Attributes:
         sensor: The encoders.
@@ -26,7 +26,7 @@ class MeasuredState:
 
     @property
     def output(self) -> OutputPort:
-        """The state that the law gets."""
+        """The measured state."""
         return self.sensor.GetOutputPort("estimated_state")
 
     def set_seed(self, context: Context, seed: int) -> None:
@@ -42,10 +42,10 @@ class MeasuredState:
 
 
 def encoder_seed(seed: int) -> int:
-    """The seed of the noise of encoders: other numbers than a force sensor's with the same seed.
+    """The seed of the noise of encoders, other than a force sensor's with the same seed.
 
     Args:
-        seed: The seed that the user gave, below 2^32.
+        seed: The user's seed, below 2^32.
     """
     return (seed + 2**31) % 2**32
 
@@ -76,17 +76,17 @@ def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
 def add_encoders(
     builder: DiagramBuilder, plant: Plant, encoders: Encoders, period: float
 ) -> MeasuredState:
-    """Adds the encoders of a robot, which measure when its law reads.
+    """Adds the encoders of a robot, sampled with its law.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The robot.
-        encoders: How its state is measured.
-        period: The time between samples in s; 0 for a law that acts continuously.
+        encoders: The encoders.
+        period: The time between samples in s; 0 for a continuous law.
 
     Raises:
-        WiringError: The law reads no samples, or this is no robot; or the velocities are no
-            derivatives of the positions, and are to be differences of these.
+        WiringError: The law is not sampled, the plant is not a robot, or velocities are to be
+            differences of positions of which they are not the derivatives.
     """
     sensor = make_sensor(plant, encoders, period)
     builder.AddSystem(sensor)

@@ -1,4 +1,4 @@
-"""The wiring of a closed loop: a plant, what is wanted of it, and what computes its control."""
+"""The wiring of a closed loop: plant, references and controller."""
 
 from collections.abc import Mapping, Sequence
 
@@ -39,7 +39,7 @@ from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
-"""Name -> output port, names and units of what a record has."""
+"""Name -> output port, names and units of a recorded signal."""
 
 
 @checked(WiringError)
@@ -54,24 +54,24 @@ def make_closed_loop(
 ) -> ClosedLoop:
     """Wires a plant, a tracking law and its references, with loggers and a view.
 
-    While a contact of a `UnilateralRobotPlant` is open the law goes on as it is, so that
-    phi'' = -A(x) lambda_d, lambda_d being the force that is wanted, and the integral of its force
-    stands still. With a `ContactPlant` everything is logged at its steps.
+    While a contact of a `UnilateralRobotPlant` is open the law continues, so that phi'' = -A(x)
+    lambda_d with the desired force lambda_d, and the integral of its force is not updated. With a
+    `ContactPlant` everything is logged at its steps.
 
     Args:
         plant: A `RobotPlant`, or any other `Plant`.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
-            -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
-            a `SystemReference` with all degrees of the law takes it.
-        settings: Sensors, drives, samples and what else stands in the loop; nothing of it if None.
-        scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
-            its geometry can be drawn. Left out where nothing is drawn.
-        meshcat: Where to draw the surface, the contact force, and the robot if there is a
-            scene_graph, while it runs: `FRAME_RATE` times a second, which shortens the
-            integrator's steps. None draws nothing; `make_animation` needs none.
+            -> reference, as `references_by_name` takes them; or a Drake System with R(t), as for a
+            `SystemReference` with all degrees of the law.
+        settings: Sensors, drives, sampling and other parts of the loop; none if None.
+        scene_graph: The scene graph with which the robot's MultibodyPlant was registered before
+            parsing, for drawings of its geometry; None without drawings.
+        meshcat: The Meshcat for a live view of surfaces, contact forces, and the robot if there is
+            a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps. None
+            for no live view; `make_animation` does not need it.
 
-    A loop that draws, samples, limits and watches nothing converts to AutoDiffXd, for Drake's
+    A loop without view, sampling, limits and tolerances converts to AutoDiffXd, for Drake's
     Linearize.
 
     Warns:
@@ -79,8 +79,8 @@ def make_closed_loop(
 
     Raises:
         WiringError: The law or the sensor has other sizes than the plant; measured force would
-            close an algebraic loop, or a sampled loop that diverges; no law uses the sensor; or an
-            observer lacks samples or measured force.
+            close an algebraic loop, or a sampled loop that diverges; the law does not use the
+            sensor; or an observer lacks sampling or measured force.
     """
     settings = settings or LoopSettings()
     check_law(plant.dae, law)
@@ -93,7 +93,7 @@ def make_closed_loop(
     try:
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:
-        outputs = None  # A trajectory that begins later.
+        outputs = None  # A trajectory that starts later.
     is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(
         law, settings.sampling, settings.control_limits
     )
@@ -119,17 +119,17 @@ def wire_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
 ) -> ClosedLoop:
-    """Wires a plant and any controller, as that of a task, with loggers and a view.
+    """Wires a plant and any controller, such as that of a task, with loggers and a view.
 
     Args:
         plant: The plant.
-        controller: What computes its control.
-        reference: What gives the controller its references; None where it plans them itself.
-        settings, scene_graph, meshcat: As of `make_closed_loop`.
+        controller: The controller.
+        reference: The source of its references; None if the controller plans them itself.
+        settings, scene_graph, meshcat: As for `make_closed_loop`.
 
     Raises:
-        WiringError: The controller is not for this plant, or cannot be wired with one of these
-            parts; or as of `make_closed_loop`.
+        WiringError: The controller does not fit this plant or one of these parts; or as for
+            `make_closed_loop`.
     """
     parts = settings or LoopSettings()
     controller.check_plant(plant)
@@ -149,8 +149,8 @@ def wire_loop(
         state = measured.output
     builder.Connect(state, controller.GetInputPort("estimated_state"))
 
-    # Its control goes back to the plant, held between samples and cut off by drives; or the plant
-    # takes the law itself.
+    # Its control goes to the plant, held between samples and limited by drives; or the plant uses
+    # the law itself.
     held = None if parts.sampling is None else hold_before(plant, parts.sampling)
     control, limits = add_drives(builder, controller, held, parts.control_limits)
     if controller.HasOutputPort("feedback"):
@@ -160,13 +160,13 @@ def wire_loop(
         if goal is not None:
             builder.Connect(goal, controller.GetInputPort("reference"))
 
-    # What nobody here steers goes to both, to the plant as it is and to the law as it knows it.
+    # Exogenous signals go to the plant, and to the law as known there.
     own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
     moving = add_exogenous(builder, plant, plant.dae, own)
     known = add_exogenous(builder, controller, law.system, parts.exogenous)
 
-    # An observer tells the law what its model lacks. Integrals stand still while a contact is open
-    # or lost, or a drive is at its limit.
+    # An observer estimates model errors for the law. Integrals are not updated while a contact is
+    # open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if parts.observer is not None and goal is not None:
         observer = add_observer(
@@ -177,7 +177,7 @@ def wire_loop(
         holds.append(limits.GetOutputPort("is_limited"))
     add_hold(builder, controller, holds)
 
-    # The constraint force goes to whoever measures it, through its sensor.
+    # The constraint force goes through its sensor to the blocks that measure it.
     noise = None
     if controller.HasInputPort("measured_force"):
         if parts.sensor is not None:
@@ -187,7 +187,7 @@ def wire_loop(
     if parts.tolerances is not None and reference is not None:
         add_watch(builder, plant, reference, law, parts.tolerances)
 
-    # Every signal has its own name: it is exported, and logged at each step or told afterwards.
+    # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {
         **_of_plant(plant, moving, reference, law, control),
         **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
@@ -246,15 +246,15 @@ def _logged(
         control: What arrives at the plant.
         named: The signals.
     """
-    told: set[str] = set()
+    available: set[str] = set()
     if plant.functions:
-        told = {*plant.functions, "reference", "exogenous"}
+        available = {*plant.functions, "reference", "exogenous"}
         if controller.follows and control.get_system() is controller:
-            told.add("control")
+            available.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
-        if name not in told:
+        if name not in available:
             loggers[name] = (log_steps(builder, port, plant), signals)
     for name in controller.shown:
         builder.ExportOutput(controller.GetOutputPort(name), name)

@@ -36,10 +36,10 @@ _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _FLASH = Rgba(1.0, 0.75, 0.1, 0.6)
 
 _FOREVER = 2**31 - 1
-"""How often the animation is repeated."""
+"""The number of repetitions of the animation."""
 
 _SIDES = 6
-"""Of a line that is drawn as a tube: those of a browser are one pixel wide."""
+"""The sides of a line drawn as a tube, since lines of a browser are one pixel wide."""
 
 _OVERLAY = Path(__file__).with_name("overlay.html")
 
@@ -56,11 +56,10 @@ class AnimationPage(str):
 def make_animation(
     loop: ShownLoop, record: Record, context: Context, title: str = ""
 ) -> AnimationPage:
-    """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
+    """Replays a record of a robot in Meshcat, with the paths of its constrained points.
 
-    The page shows the clock and the size of each constraint force at its arrow, draws the path that
-    the robot took as it takes it, over the one that was wanted, and begins again at the end. An
-    impact flashes; a contact that is open has no arrow.
+    The page shows the clock and the size of each constraint force at its arrow, draws the actual
+    path over the desired one, and repeats. An impact flashes; an open contact has no arrow.
 
     Args:
         loop: A loop of a `RobotPlant`.
@@ -87,12 +86,12 @@ def animate(
     """The page of `make_animation`.
 
     Args:
-        course: Where the robot was.
+        course: The motion of the robot.
         scene_graph: The geometry of the robot, or None.
         title: The title of the page; the robot's name if empty.
-        phases: The phases of a task, told beside the clock.
+        phases: The phases of a task, shown beside the clock.
     """
-    # A server of its own, made only now: a run that nobody watches opens no port.
+    # A separate server, made only now: other runs do not open a port.
     with _quiet():
         meshcat = start_meshcat()
     plant, acting = course.plant, course.acting
@@ -101,7 +100,7 @@ def animate(
     links = view_of_links(plant, scene_graph, meshcat)
     arrows.measure(course.wrenches)
 
-    # What stands still: what it touches, where it went, and where the reference wanted it.
+    # The static parts: surfaces, actual paths and desired paths.
     _, size = scene_extent(model, acting, course.states[0], scene_graph)
     seen = surroundings(model, acting, course.points, course.parameters[0], size)
     draw_surroundings(meshcat, seen)
@@ -109,7 +108,7 @@ def animate(
     _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
     _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
 
-    # What moves: the links and the arrows, frame by frame.
+    # The moving parts: links and arrows, frame by frame.
     replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
     rows = zip(
@@ -150,7 +149,7 @@ def _add_flashes(meshcat: Meshcat, course: Course, radius: float) -> dict[int, s
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps Drake from telling where a server listens that nobody shall open."""
+    """Suppresses Drake's message about the address of a server that is not for users."""
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.WARNING)
@@ -191,7 +190,7 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     along = np.gradient(points, axis=0)
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 1.0])
-    # Two directions across the line, from one that is nowhere along it.
+    # Two directions normal to the line.
     aside = np.where(np.abs(along[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     first = np.cross(along, aside)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -232,7 +231,7 @@ def _with_overlay(page: str, course: Course, title: str, phases: Sequence[PhaseS
         "phases": [[span.begin, span.name] for span in phases],
         "paths": [["paths", constraint.name, "actual"] for constraint in constraints],
     }
-    # A name may hold what ends a script.
+    # A name may contain text that ends a script.
     text = json.dumps(data).replace("<", "\\u003c")
     overlay = _OVERLAY.read_text("utf-8").replace('"DATA"', text)
     name = html.escape(title)

@@ -1,4 +1,4 @@
-"""What constraints do to a robot, as arrows in Meshcat."""
+"""Constraint forces and moments as arrows in Meshcat."""
 
 from collections.abc import Sequence
 
@@ -21,26 +21,25 @@ _MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
 PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
 
 _PIECE = 32
-"""How many points a piece of a path has that grows."""
+"""The number of points in a piece of a growing path."""
 
 LEAST_SCALE = 1e-3
-"""How much of its length an arrow keeps where nothing acts: no transformation survives zero."""
+"""The scale of an arrow without force: a transformation must not be zero."""
 
 
 class ForceArrows:
-    """Draws what each constraint does to a robot: an arrow that begins where its force acts.
+    """Draws the force of each constraint on a robot: an arrow from its point of application.
 
-    It points as the constraint pushes, from a surface to its free side. A moment has an arrow of
-    its own, with two heads, along its axis. An arrow is as long as its force is large beside the
-    largest one drawn so far.
+    It points in the direction of the force, from a surface to its free side. A moment has its own
+    arrow with two heads, along its axis. Lengths are relative to the largest force so far.
 
     Args:
-        meshcat: Where to draw.
+        meshcat: The Meshcat to draw in.
         model: The robot.
         length: The length of the longest arrow, m.
 
     Attributes:
-        largest_force, largest_moment: What gets the longest arrow, N and N m.
+        largest_force, largest_moment: The force and moment of the longest arrow, N and N m.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
@@ -70,7 +69,7 @@ class ForceArrows:
                 self._draw_arrow(path_of(constraint, "moment"), point, turned, time)
 
     def place(self, parameters: FloatArray, time: float) -> None:
-        """Puts what moves where it is now.
+        """Moves exogenous surfaces to their present poses.
 
         Args:
             parameters: Values of all parameters.
@@ -84,7 +83,7 @@ class ForceArrows:
                 self._meshcat.SetTransform(path_of(constraint, "surface"), stands, time)
 
     def measure(self, course: Sequence[Wrenches]) -> None:
-        """Makes the arrows so short that none of these wrenches has one that is too long."""
+        """Adapts the scale to these wrenches."""
         for wrenches in course:
             force, moment = (
                 float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
@@ -103,10 +102,10 @@ class ForceArrows:
 
 
 class GrowingPaths:
-    """Draws where constraints act, further with each moment.
+    """Draws growing paths of the points of application of constraints.
 
     Args:
-        meshcat: Where to draw.
+        meshcat: The Meshcat to draw in.
         constraints: The constraints that act at a point.
     """
 
@@ -116,10 +115,10 @@ class GrowingPaths:
         self._number, self._time = 0, -np.inf
 
     def add(self, points: FloatArray, time: float) -> None:
-        """Goes on to where they act now; a time before the last one begins anew.
+        """Appends the present points; an earlier time than the last starts again.
 
         Args:
-            points: Where they act, m, shape (k, 3).
+            points: The points of application, m, shape (k, 3).
             time: The time in s.
         """
         if time < self._time:
@@ -131,7 +130,7 @@ class GrowingPaths:
         for row, constraint in enumerate(self._constraints):
             path = f"/paths/{constraint.name}/actual/{self._number}"
             self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
-        # In pieces: a line is sent as a whole with each of its points.
+        # In pieces, since a line is sent completely with each new point.
         if len(self._piece) > _PIECE:
             self._piece, self._number = [points], self._number + 1
 
@@ -142,13 +141,13 @@ class ConstraintForceVisualizer(LeafSystem):
     Input ports:
         link_state: (q, v).
         constraint_force: lambda, shape (m,).
-        exogenous: What the plant reads at its port of that name, if there is anything that moves.
+        exogenous: The plant's port of that name, with exogenous signals.
 
     Args:
-        arrows: What draws them.
+        arrows: The force arrows.
         meshcat: Where to draw the paths.
         model: The robot.
-        places: Where the entries of `exogenous` stand among the parameters.
+        places: The indices of the entries of `exogenous` among the parameters.
         period: Time between pictures in s.
     """
 
@@ -191,13 +190,13 @@ class ConstraintForceVisualizer(LeafSystem):
 
 
 def path_of(constraint: Constraint, what: str) -> str:
-    """Where a constraint's surface, force or moment stands in the scene."""
+    """The path of a constraint's surface, force or moment in the scene."""
     return f"/contact/{constraint.name}/{what}"
 
 
 def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
     """An arrow along z that begins at the origin, with one head behind the other."""
-    # A MeshcatCone stands on its tip: turned over, it points along +z.
+    # A MeshcatCone has its tip at the origin: rotated, it points along +z.
     turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
     head, names = 0.2 * length, ["head", "second_head"][:heads]
     for number, name in enumerate(names):
@@ -208,7 +207,7 @@ def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rg
     meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
     middle = np.array([0.0, 0.0, shaft / 2])
     meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
-    # Drawn last and over everything: the force in a joint acts inside of bodies.
+    # Drawn over everything, since the force in a joint acts inside bodies.
     for part in (*names, "shaft"):
         mesh = f"{path}/arrow/{part}/<object>"
         meshcat.SetProperty(mesh, "material.depthTest", False)

@@ -1,4 +1,4 @@
-"""How the axes of a picture stand, and what is written beside them."""
+"""The layout of axes in a figure, and their labels."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def grid(
     notes: Sequence[str] = (),
     noted: str = "",
 ) -> tuple[Figure, list[Axes]]:
-    """Axes over time in two columns; a last one alone in its row fills it.
+    """Axes over time in two columns; a single last one fills its row.
 
-    Their places are known beforehand: a layout that measures what it draws takes longer than the
-    drawing itself. Those below each other share their numbers, too.
+    Their places are computed beforehand, since automatic layout takes longer than drawing. Axes
+    below each other share their tick labels.
 
     Args:
-        titles: What stands above each of them.
+        titles: Their titles.
         labels: The entries of a legend above all axes, for which room is left.
-        notes: What stands in words below all axes.
-        noted: What stands before the notes.
+        notes: Notes below all axes.
+        noted: The text before the notes.
     """
     from matplotlib.figure import Figure
 
@@ -70,7 +70,7 @@ def grid(
         wspace=(_LEFT + _RIGHT) / (width / columns - _LEFT - _RIGHT),
         hspace=_GAP / _AXES,
     )
-    numbered = count - count % columns  # Above a wide one stands another scale.
+    numbered = count - count % columns  # Axes above a wide one have another scale.
     axes: list[Axes] = []
     for i, title in enumerate(titles):
         row, column = divmod(i, columns)
@@ -88,7 +88,7 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
     """Square axes in up to three columns.
 
     Args:
-        titles: What stands above each of them.
+        titles: Their titles.
         labels: The entries of a legend above all axes, for which room is left.
     """
     from matplotlib.figure import Figure
@@ -117,7 +117,7 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
 def decades(axis: Axes, floor: float) -> None:
     """Scales a logarithmic axis from the floor up, with few numbers.
 
-    They are plain text: Matplotlib's own ones are mathematics, which takes longer than the curves.
+    They are plain text, since Matplotlib's mathematical labels take longer than the curves.
     """
     low, high = floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor)
     axis.set_ylim(low, high)
@@ -140,12 +140,12 @@ def labelled(signal: Signal) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text in which Matplotlib reads no mathematics."""
+    """Text without mathematics for Matplotlib."""
     return text.replace("$", r"\$")
 
 
 def legend(figure: Figure, axis: Axes) -> None:
-    """One legend above all axes, where it hides nothing."""
+    """One legend above all axes."""
     handles, labels = axis.get_legend_handles_labels()
     columns = legend_shape(labels, figure.get_figwidth())[1]
     place = (0.5, 1.0 - 0.05 / figure.get_figheight())
@@ -177,5 +177,5 @@ def flatten(axis: Axes, values: FloatArray, noise: float, margin: float) -> None
 
 
 def round_off(values: FloatArray) -> float:
-    """Where errors of a signal of this size disappear, at least 1e-16: a logarithm has no zero."""
+    """The round-off of a signal of this size, at least 1e-16 for a logarithmic axis."""
     return float(np.finfo(float).eps * max(np.max(np.abs(values), initial=0.0), 0.45))

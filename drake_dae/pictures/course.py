@@ -1,4 +1,4 @@
-"""Where a robot was in a run, frame by frame, and where its reference wanted it."""
+"""The actual and desired motion of a robot in a run, frame by frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4
-"""A contact point whose path is shorter than this share of its distance has no path to draw."""
+"""A contact point whose path is shorter than this fraction of its distance has no path to draw."""
 
 _PLACES = 12
-"""So many states of a run tell how much room it takes."""
+"""The number of states for the extent of a run."""
 
 
 class ShownLoop(Protocol):
@@ -40,7 +40,7 @@ class ShownLoop(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A run of a robot at k moments, equally far apart.
+    """A run of a robot at k equidistant times.
 
     Attributes:
         plant: What was simulated.
@@ -49,12 +49,12 @@ class Course:
         start_time: When the run began, in s.
         states: x, shape (k, n).
         parameters: The values of all parameters, shape (k, number of parameters).
-        wrenches: What the constraints did.
-        wanted: Link states at rest with the desired outputs, as long as they are in reach,
-            shape (j, nq + nv) with j <= k.
-        acting: Where and how the constraints act, at the parameters of the start.
-        flashes: How bright each constraint flashes where an impact is shown, 0 to 1, shape
-            (k, constraints).
+        wrenches: The wrenches of the constraints.
+        wanted: Link states at rest with the desired outputs, as long as they are reachable, shape
+            (j, nq + nv) with j <= k.
+        acting: The constraint wrenches, for the parameters at the start.
+        flashes: The brightness of each constraint's flash at an impact, 0 to 1, shape (k,
+            constraints).
     """
 
     plant: Plant
@@ -70,12 +70,12 @@ class Course:
 
     @property
     def points(self) -> FloatArray:
-        """Where the constraints acted, m, shape (k, constraints, 3)."""
+        """The points of application, m, shape (k, constraints, 3)."""
         return np.array([wrench.points for wrench in self.wrenches])
 
     @property
     def wanted_points(self) -> FloatArray:
-        """Where they would have acted with the desired outputs, m, shape (j, constraints, 3)."""
+        """The points of application for the desired outputs, m, shape (j, constraints, 3)."""
         none = np.zeros(len(self.model.dae.force_signals))
         pairs = zip(self.wanted, self.parameters, strict=False)
         found = [self.acting(state, none, own).points for state, own in pairs]
@@ -89,9 +89,9 @@ class ContactPath:
     Attributes:
         name: The constraint's name.
         actual: The path along two axes of the surface, m, shape (k, 2).
-        desired: The path that the reference wanted, m, shape (j, 2).
-        points_left: Whether the first axis points to the left of who stands on the free side, where
-            the second points up.
+        desired: The desired path, m, shape (j, 2).
+        points_left: Whether the first axis points to the left for an observer on the free side,
+            with the second axis up.
     """
 
     name: str
@@ -136,10 +136,10 @@ def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
 
 
 def contact_paths(course: Course) -> list[ContactPath]:
-    """The paths of the points that surfaces push at and that move, each on its surface.
+    """The paths of moving contact points, each on its surface.
 
-    They are seen along the surface's mean normal: for a plane in its own coordinates, on a surface
-    that bends as in a tangent plane, relative to its reference point.
+    They are projected along the surface's mean normal: for a plane its own coordinates, for a
+    curved surface those of a tangent plane, relative to its reference point.
     """
     dae = course.model.dae
     size = float(np.max(np.abs(course.points), initial=0.0))
@@ -160,7 +160,7 @@ def contact_paths(course: Course) -> list[ContactPath]:
             stand.rotation().inverse() @ push
             for stand, push in zip(stands, pushes[:, row], strict=True)
         ]
-        # Of a path all around the surface no normal is the mean.
+        # A path all around the surface has no mean normal.
         normal = next(n for n in (np.mean(normals, axis=0), normals[0]) if np.linalg.norm(n) > 1e-3)
         axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
         points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
@@ -171,10 +171,10 @@ def contact_paths(course: Course) -> list[ContactPath]:
 
 
 def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
-    """The middle and the size, in m, of the box around all places of the robot.
+    """The center and the size, in m, of the box around the robot over the run.
 
     Args:
-        course: Where the robot was.
+        course: The motion of the robot.
         scene_graph: The geometry of its links, or None.
     """
     some = course.states[:: max(1, len(course.states) // _PLACES)]
@@ -186,9 +186,9 @@ def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArr
 
 
 def _pushes(course: Course) -> FloatArray:
-    """The directions in which surfaces push, in the world, shape (k, constraints, 3).
+    """The normals of the surfaces, in the world, shape (k, constraints, 3).
 
-    At rest nothing rubs, so that a push is along the normal.
+    At rest there is no friction, so that the force is along the normal.
     """
     model, links = course.model, course.model.links
     ones = [np.array(constraint.is_unilateral, float) for constraint in model.constraints]
@@ -217,7 +217,7 @@ def _desired_states(
     """
     nq, nv = model.links.q.numel(), model.links.v.numel()
     q, found = states[0, :nq], []
-    # Where rolling leaves open how a robot stands, it goes as it went.
+    # With rolling constraints the configuration is not determined; the actual one is used.
     moves = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
     try:
         wanted = desired[:, : len(model.position_signals)]
@@ -225,5 +225,5 @@ def _desired_states(
             q = model.configuration(row, q + move, own)
             found.append(np.concatenate([q, np.zeros(nv)]))
     except InconsistentStateError:
-        pass  # The reference leaves what the robot can reach: its path ends there.
+        pass  # The reference becomes unreachable: its path ends there.
     return np.array(found).reshape(-1, nq + nv)

@@ -13,11 +13,11 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.axes import Axes
 
 IMPACT, OPEN = "impact", "contact open"
-"""What marks in a picture mean."""
+"""The labels of marks in a plot."""
 
 
 def mark_labels(record: Record) -> tuple[str, ...]:
-    """What stands in the legend for the marks of a record, in any order."""
+    """The legend entries of the marks of a record, in any order."""
     found = [OPEN] if open_spans(record) else []
     return (*found, IMPACT) if impacts(record.events) else tuple(found)
 

@@ -52,14 +52,14 @@ STRIP = 4
 """Pictures of a strip."""
 
 _WIDTH, _HEIGHT = 480, 400
-_ANGLE = 0.62  # Of view, upwards, in rad.
-_LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of the run.
+_ANGLE = 0.62  # The vertical angle of view, in rad.
+_LEAST_FORCE = 0.02  # No arrow below this fraction of the largest force of the run.
 
 ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
-"""Colors of the path so far, of the one that is wanted, of forces, and of impacts."""
+"""Colors of the actual path, the desired path, forces, and impacts."""
 
 _LABEL = np.array([34.0, 14.0])
-"""The width and height that a label takes beside its middle, in pixels."""
+"""Half the width and height of a label, in pixels."""
 
 Pixels = NDArray[np.uint8]
 
@@ -68,7 +68,7 @@ Pixels = NDArray[np.uint8]
 def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
 
-    The path so far is blue, the one that the reference wants green; a star is an impact.
+    The actual path is blue, the desired one green; a star is an impact.
 
     Args:
         loop: A loop of a `RobotPlant` whose links have geometry.
@@ -104,7 +104,7 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
 
 
 def _screen(columns: int) -> tuple[Figure, list[Axes]]:
-    """A figure with room for so many pictures side by side."""
+    """A figure with a number of pictures side by side."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(columns * _WIDTH / 100, _HEIGHT / 100), dpi=100)
@@ -126,7 +126,7 @@ class _Camera:
         self.color = ColorRenderCamera(core)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Where points in the world are seen, in pixels; shape (k, 2)."""
+        """The pixels of points in the world, shape (k, 2)."""
         x, y, depth = self.pose.inverse().multiply(np.atleast_2d(points).T)
         info = self.info
         return np.column_stack(
@@ -138,7 +138,7 @@ class _Camera:
 
 
 class _Scene:
-    """The links and what they touch, before a camera."""
+    """The links and surfaces in front of a camera."""
 
     def __init__(self, course: Course, scene_graph: SceneGraph | None) -> None:
         model, links = course.model, course.model.links.plant
@@ -204,10 +204,10 @@ class _Scene:
                 place = _label_place(head, tail, taken)
                 taken.append(place)
                 x, y = place
-                told = axis.text(
+                caption = axis.text(
                     x, y, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
                 )
-                told.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+                caption.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:
                 x, y = self._camera.project(wrench.points[row])[0]
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
@@ -233,7 +233,7 @@ class _Scene:
 
 
 def _label_place(head: FloatArray, tail: FloatArray, taken: list[FloatArray]) -> FloatArray:
-    """Where the label of an arrow stands, in pixels: behind its tail, and not on others."""
+    """The place of the label of an arrow, in pixels: behind its tail, not over others."""
     way = tail - head
     length = float(np.linalg.norm(way))
     way = way / length if length > 1.0 else np.array([0.0, 1.0])
@@ -249,7 +249,7 @@ def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
         return form
     points = np.array(form.vertices())
     faces = np.array([[triangle.vertex(k) for k in range(3)] for triangle in form.triangles()])
-    # The renderer asks for normals at the corners: the mean of those around.
+    # The renderer needs normals at the vertices: the mean of those of adjacent triangles.
     corners, normals = points[faces], np.zeros_like(points)
     for k in range(3):
         edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -19,8 +19,8 @@ class PhaseSpan:
     """A phase in a record.
 
     Attributes:
-        name: What it is, "Press" for example.
-        begin, end: From when to when, in s.
+        name: Its name, "Press" for example.
+        begin, end: Its start and end, in s.
     """
 
     name: str
@@ -29,14 +29,14 @@ class PhaseSpan:
 
 
 def phase_spans(record: Record) -> list[PhaseSpan]:
-    """The phases of a record, one after the other; none if it has no tasks."""
+    """The phases of a record in order; none without a task."""
     if "phase" not in record.signals or not record.time.size:
         return []
     names = [
         signal.name.partition(" ")[2] or signal.name for signal in record.signals["phase"].signals
     ]
     places = np.argmax(record["phase"], axis=1)
-    # A sample at the moment of a change shows what was before.
+    # A sample at the time of a change has the values before it.
     last = np.flatnonzero(np.append(np.diff(places) != 0, True))
     begins = [record.time[0], *record.time[last[:-1]]]
     return [
@@ -46,14 +46,14 @@ def phase_spans(record: Record) -> list[PhaseSpan]:
 
 
 def phases_at(record: Record, times: FloatArray) -> list[str]:
-    """The name of the phase at each time in s; "" where there is no task."""
+    """The name of the phase at each time in s; "" without a task."""
     spans = phase_spans(record)
     ends = [span.end for span in spans[:-1]]
     return [spans[i].name if spans else "" for i in np.searchsorted(ends, times)]
 
 
 def mark_phases(figure: Figure, record: Record) -> None:
-    """Draws where phases begin into axes over time, each with its name."""
+    """Marks the start of each phase in axes over time, with its name."""
     spans = phase_spans(record)
     for axis in figure.axes:
         axis.margins(x=0.01)

@@ -1,4 +1,4 @@
-"""Pictures of a run."""
+"""Plots of a run."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from drake_dae.pictures.course import ContactPath
 
 PATHS = "path.png"
-"""The plot of the points that move on surfaces, where there are any."""
+"""The plot of points that move on surfaces, if there are any."""
 
 PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png", PATHS)
 """The files that `save_plots` writes."""
 
 HELD = 1e-4
-"""An output whose reference stands still is held, and not drawn, where it is as near as this beside
-its size."""
+"""An output with a constant reference counts as held, and is not drawn, if its relative error is
+below this."""
 
 _DPI = 110
 
@@ -78,7 +78,7 @@ def save_plots(
 
 
 def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
-    """Controlled outputs, with their references dashed; one that is held is a line of text.
+    """Controlled outputs, with their references dashed; held ones are a line of text.
 
     Args:
         record: A record with controlled_output and desired_output.
@@ -111,10 +111,10 @@ def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
 
 
 def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Figure:
-    """|z - r| of every output on a log scale, over the error that theory predicts.
+    """|z - r| of every output on a log scale, over the predicted error.
 
-    With an accuracy, what lies below it is grey: there errors are those of the integrator. An
-    output that is predicted to have no error, and stays there, is a line of text.
+    With an accuracy, the region below it is grey: there errors come from the integrator. An output
+    with neither predicted nor actual error is a line of text.
 
     Args:
         record: A record with controlled_output and desired_output.
@@ -168,7 +168,7 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
 
 
 def plot_residual(record: Record) -> Figure:
-    """Constraint outputs and their derivatives, as the steps leave them before projection."""
+    """Constraint outputs and their derivatives, after each step and before the projection."""
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
     title = "|constraint residual|, before each step's projection"
@@ -185,7 +185,7 @@ def plot_residual(record: Record) -> Figure:
 
 
 def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
-    """Controls, with the actuators' limits, drawn where these are in sight."""
+    """Controls, with the actuators' limits if these are within the plot."""
     values = record["control"]
     signals = record.signals["control"].signals
     bounds = np.full(len(signals), np.inf) if limits is None else limits
@@ -212,9 +212,9 @@ def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
 
 
 def plot_paths(paths: Sequence[ContactPath]) -> Figure:
-    """The paths of points on their surfaces, over those that the references want.
+    """The actual paths of points on their surfaces, over the desired ones.
 
-    They are drawn as they are seen from the free side.
+    They are drawn as seen from the free side.
     """
     figure, axes = squares(
         [f"path on {labelled(Signal(path.name))}" for path in paths], ("desired", "actual", "start")
@@ -226,7 +226,7 @@ def plot_paths(paths: Sequence[ContactPath]) -> Figure:
             (path.actual[:1], {"color": "C0", "marker": "o", "linestyle": "", "label": "start"}),
         ):
             axis.plot(*points.T, **style)
-        # A metre is as long in both directions, also where the path is a line.
+        # Equal scales in both directions, also if the path is a line.
         both = np.vstack([path.actual, path.desired])
         middle = (np.min(both, axis=0) + np.max(both, axis=0)) / 2.0
         half = 0.55 * float(np.max(np.ptp(both, axis=0))) or 1e-3

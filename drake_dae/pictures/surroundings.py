@@ -1,4 +1,4 @@
-"""What a robot touches, as it is drawn, and how much room a robot takes."""
+"""The drawn surfaces in contact with a robot, and the extent of a robot."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,11 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What is to be seen of a surface that a constraint, or some of them, touch.
+    """The drawn surface of one or several constraints.
 
     Attributes:
         constraint: The first of them.
-        stands: Where their parameters put it.
+        stands: Its pose for their parameters.
         picture: The surface, relative to that.
     """
 
@@ -37,17 +37,17 @@ def surroundings(
     parameters: FloatArray,
     size: float,
 ) -> list[Seen]:
-    """The surfaces that a robot touches, each once: two that coincide would flicker.
+    """The surfaces in contact with a robot, each once, since coinciding ones would flicker.
 
-    A surface without an end is drawn around the middle of what is touched of it, and as large as
-    that at least.
+    An unbounded surface is drawn around the middle of its contact points, and at least as large as
+    their extent.
 
     Args:
         model: The robot.
         acting: Its constraint wrenches.
         points: Where its constraints act along a run, m, shape (k, constraints, 3).
         parameters: The values of all parameters.
-        size: How large a piece of a surface to draw if it has no end, m.
+        size: The size of the drawn piece of an unbounded surface, m.
     """
 
     def seen(row: int, touched: FloatArray) -> Seen | None:
@@ -82,7 +82,7 @@ def surroundings(
 
 
 def _coincide(first: Seen, second: Seen) -> bool:
-    """Whether two pictures show the same."""
+    """Whether two pictures are equal."""
     poses = [one.stands @ one.picture.pose for one in (first, second)]
     if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):
         return False
@@ -101,13 +101,13 @@ def scene_extent(
     state: FloatArray,
     scene_graph: SceneGraph | None = None,
 ) -> tuple[FloatArray, float]:
-    """The middle and the size, in m, of the box around a robot and the points where it is held.
+    """The center and the size, in m, of the box around a robot and its constrained points.
 
     Args:
         model: The robot.
         wrenches: Its constraint wrenches.
-        state: x, or the link state (q, v) that it begins with.
-        scene_graph: The geometry of its links, or None: then each link is but its origin.
+        state: x, or only its first part, the link state (q, v).
+        scene_graph: The geometry of its links, or None: then each link is its origin.
     """
     links, dae = model.links, model.dae
     inputs = {"q": links.q, "parameters": dae.parameter_symbol}
@@ -120,7 +120,7 @@ def scene_extent(
 
 
 def _corners(model: RobotModel, state: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
-    """The corners of the boxes around what is to be seen of the links, m, shape (k, 3)."""
+    """The corners of the bounding boxes of the links' geometry, m, shape (k, 3)."""
     drawn = model.links.plant
     if scene_graph is None or drawn is None or drawn.get_source_id() is None:
         return np.zeros((0, 3))
@@ -134,7 +134,7 @@ def _corners(model: RobotModel, state: FloatArray, scene_graph: SceneGraph | Non
         for geometry in drawn.GetVisualGeometriesForBody(body):
             try:
                 box = inspector.GetObbInGeometryFrame(geometry)
-            except RuntimeError:  # A mesh of a kind that Drake does not read, or of no size.
+            except RuntimeError:  # A mesh that Drake does not read, or without extent.
                 continue
             if box is not None:
                 stands = pose @ inspector.GetPoseInFrame(geometry) @ box.pose()

@@ -1,4 +1,4 @@
-"""A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
+"""A constrained robot in Drake's Meshcat: links, surfaces and constraint forces."""
 
 import errno
 from collections.abc import Sequence
@@ -35,10 +35,10 @@ _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 @checked(ModelError)
 def start_meshcat(host: str = "localhost") -> Meshcat:
-    """A Meshcat server that only this machine reaches, unless told otherwise.
+    """A Meshcat server, by default reachable only from this machine.
 
     Raises:
-        OSError: No port is left for it.
+        OSError: There is no free port.
     """
     try:
         meshcat = Meshcat(MeshcatParams(host=host))
@@ -57,14 +57,14 @@ def add_live_view(
     meshcat: Meshcat,
     exogenous: OutputPort | None = None,
 ) -> None:
-    """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
+    """Adds the live view of a robot, drawn `FRAME_RATE` times a second.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
-        plant: The plant; nothing is drawn of one that is no robot.
+        plant: The plant; nothing is drawn if it is not a robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
-        meshcat: Where to draw.
-        exogenous: What the plant reads at its port of that name, if anything.
+        meshcat: The Meshcat to draw in.
+        exogenous: The plant's port of that name, if any.
     """
     if plant.model is None:
         return
@@ -87,15 +87,15 @@ def add_live_view(
 def draw_scene(
     plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
 ) -> ForceArrows:
-    """Draws what does not move, and returns what draws the constraint forces.
+    """Draws the static parts, and returns the force arrows.
 
     Args:
         plant: The robot.
-        meshcat: Where to draw.
+        meshcat: The Meshcat to draw in.
         scene_graph: The geometry of its links, or None.
 
     Raises:
-        ModelError: The plant is no robot.
+        ModelError: The plant is not a robot.
     """
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
@@ -111,9 +111,9 @@ def look_at(meshcat: Meshcat, middle: FloatArray, size: float) -> None:
     """Places the camera from behind, the side and a little above.
 
     Args:
-        meshcat: Where it looks.
-        middle: What it looks at, m, shape (3,).
-        size: How large that is, in m.
+        meshcat: The Meshcat.
+        middle: The center of the view, m, shape (3,).
+        size: The size of the view, in m.
     """
     meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
 
@@ -121,14 +121,14 @@ def look_at(meshcat: Meshcat, middle: FloatArray, size: float) -> None:
 def view_of_links(
     plant: Plant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
 ) -> Diagram | None:
-    """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
+    """Drake's own view of a robot, posed by our link state; its plant is not simulated.
 
     Args:
         plant: The robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
             has a copy of it.
-        meshcat: Where to draw.
-        period: Time between pictures in s; without one they are drawn when asked for.
+        meshcat: The Meshcat to draw in.
+        period: Time between pictures in s; if None they are drawn on request.
 
     Returns:
         A diagram with (q, v) as its input, or None if the links have no geometry.
@@ -149,11 +149,11 @@ def view_of_links(
 
 
 def draw_surroundings(meshcat: Meshcat, seen: Sequence[Seen]) -> None:
-    """Draws what a robot touches.
+    """Draws the surfaces in contact with a robot.
 
     Args:
-        meshcat: Where to draw.
-        seen: What there is to see.
+        meshcat: The Meshcat to draw in.
+        seen: The surfaces.
     """
     for one in seen:
         path = path_of(one.constraint, "surface")

@@ -67,7 +67,7 @@ def links_behind(
     geometry are; its surface is asked for the distance there. A surface may end before it reaches
     the robot's base, as a table does that the robot stands beside. So a link counts where it is not
     farther from the contact than from what stands still; its shape also where that is in front of
-    the surface. The shapes next to the base, and of what is at the contact, count for nothing.
+    the surface, if it is not the first link. The shapes of what is at the contact do not count.
 
     Args:
         model: The robot.
@@ -158,18 +158,20 @@ class _Surface:
         self, shapes: LinkShapes, times: FloatArray, states: FloatArray, parameters: FloatArray
     ) -> LinkBehind | None:
         """The link whose shape is deepest; None if none is behind."""
-        skipped, found = shapes.moved_with(self._touch.frame) | shapes.at_base(), []
-        if shapes.links <= skipped:
+        at_contact, at_base, found = shapes.moved_with(self._touch.frame), shapes.at_base(), []
+        if shapes.links <= at_contact:
             return None
         for state, own in zip(states, parameters, strict=True):
             shapes.place(state)
             row = np.zeros(shapes.count)
             for index, points, radius in shapes.corners():
-                if index in skipped:
+                if index in at_contact:
                     continue
                 values = self._corner(points.T, state[: self._nq], own)
                 depth, to_contact, to_base, base = (np.array(each).ravel() for each in values)
-                counts = (to_contact < NEARER * to_base) | (base < TOUCHING)
+                counts = to_contact < NEARER * to_base
+                if index not in at_base:
+                    counts |= base < TOUCHING
                 counts &= depth + radius > np.maximum(TOUCHING, SHAPE * to_contact)
                 row[index] = max(row[index], np.max(np.where(counts, depth + radius, 0.0)))
             found.append(row)

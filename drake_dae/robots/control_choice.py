@@ -37,10 +37,10 @@ def check_outputs(
     nu = own + len(motors)
     if nu == 0 and count + forces:
         raise ModelError(
-            f"{name}: there are no actuators, so nothing can be steered, but {count} positions and "
-            f"{forces} constraint forces are outputs. To simulate it leave `positions` empty, and "
-            "`forces` out; to steer it give joints actuators, by plant.AddJointActuator before "
-            "Finalize or a <transmission> in its file"
+            f"{name}: there are no actuators, so no output can be controlled, but {count} "
+            f"positions and {forces} constraint forces are outputs. To simulate it leave "
+            "`positions` empty, and `forces` out; to steer it give joints actuators, by "
+            "plant.AddJointActuator before Finalize or a <transmission> in its file"
         )
     if is_chosen:
         if not 0 < count + forces < nu:
@@ -59,9 +59,9 @@ def check_outputs(
         )
     if forces > nu:
         raise ModelError(
-            f"{name}: {forces} constraint forces are outputs, but {nu} actuators can steer "
-            f"{nu} outputs; name in `forces` those that are outputs, take constraints "
-            "away, or add actuators"
+            f"{name}: {forces} constraint forces are outputs, but {nu} actuators can steer {nu} "
+            "outputs; name in `forces` those that are outputs, remove constraints, or add "
+            "actuators"
         )
     if count + forces and count + forces != nu:  # A robot that is only simulated needs no outputs.
         names = ", ".join(signal.name for signal in positions) or "none"

@@ -127,9 +127,9 @@ class RobotModel:
         driven = chain(actuation, links)
         if driven.stages and bound.motors:
             raise ModelError(
-                f"{name}: '{bound.motors[0].name}' drives its joint at once, and the others drive "
-                "theirs through stages: the control would reach the outputs at different orders. "
-                "Cut the loop at a joint without motor"
+                f"{name}: '{bound.motors[0].name}' drives its joint directly, and the others "
+                "drive theirs through stages: the control would reach the outputs at different "
+                "orders. Cut the loop at a joint without motor"
             )
         controls = (*driven.control_signals, *bound.motors)
         choice = control_choice(name, control_weights, controls)
@@ -277,9 +277,8 @@ class RobotModel:
         state, _, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
-                f"{self.name}: no drive holds the robot at rest at q = "
-                f"{show(q)} with forces {load}; {left:.2g} N m is left. It "
-                "has fewer actuators than joints"
+                f"{self.name}: no control holds the robot at rest at q = {show(q)} with forces "
+                f"{load}; {left:.2g} N m is left. It has fewer actuators than joints"
             )
         return state
 

@@ -85,6 +85,8 @@ class LinkShapes:
         self._of_plant = plant.CreateDefaultContext()
         self._of_scene = scene_graph.CreateDefaultContext()
         self._bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
+        still = plant.GetBodiesWeldedTo(plant.world_body())
+        self._still = {int(body.index()) for body in still}
         self._body = {
             geometry: index
             for index, body in enumerate(self._bodies)
@@ -112,16 +114,15 @@ class LinkShapes:
 
     @property
     def links(self) -> set[int]:
-        """The links that have shapes."""
-        return set(self._body.values())
+        """The links that have shapes and move."""
+        return set(self._body.values()) - self._still
 
     def at_base(self) -> set[int]:
-        """What stands still, and the links at its joints."""
-        still = {int(b.index()) for b in self._plant.GetBodiesWeldedTo(self._plant.world_body())}
-        return still | {
+        """The links whose joints are on what stands still."""
+        return {
             int(joint.child_body().index())
             for joint in map(self._plant.get_joint, self._plant.GetJointIndices())
-            if int(joint.parent_body().index()) in still and joint.num_positions() < 3
+            if int(joint.parent_body().index()) in self._still and joint.num_positions() < 3
         }
 
     def overlaps(self) -> dict[tuple[int, int], float]:
@@ -139,7 +140,7 @@ class LinkShapes:
         return found
 
     def corners(self) -> Iterator[tuple[int, FloatArray, float]]:
-        """Of each shape its link, points, and how far it goes beyond these, in m.
+        """Of each shape that moves its link, points, and how far it goes beyond these, in m.
 
         The points are where they are now in the world, shape (k, 3).
         """
@@ -148,7 +149,7 @@ class LinkShapes:
             points, radius = _corners(inspector.GetShape(geometry))
             body = self._plant.EvalBodyPoseInWorld(self._of_plant, self._bodies[index])
             pose = body @ inspector.GetPoseInFrame(geometry)
-            if len(points):
+            if len(points) and index not in self._still:
                 yield index, pose.multiply(points.T).T, radius
 
     def held(self) -> set[tuple[int, int]]:

@@ -45,13 +45,16 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if material is None or not scenario.is_advised:
         return Completed(scenario)
     if scenario.task is not None:
-        raise ScenarioError(("gains", "none are advised for a task in Drake's contact: give some"))
+        raise ScenarioError(
+            ("gains", ("no gains are recommended for a task in Drake's contact: give some"))
+        )
     if model.stages:
         raise ScenarioError(
             (
                 "gains",
-                "behind springs, motors and valves nothing is advised for Drake's own contact; say "
-                "them, with integral and observer. The scenario wall_flexible_contact tells how",
+                "for Drake's own contact with springs, motors or valves no gains are "
+                "recommended; give them, with integral and observer, as in the scenario "
+                "wall_flexible_contact",
             )
         )
     sampling = scenario.sampling
@@ -101,12 +104,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     )
     known = ", ".join(observer.identify_friction) or "none"
     note = (
-        f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
-        f"{period:g} s and velocities within {noise:.2g} rad/s: "
-        f"Butterworth's poles of positions at {_rounded(found.position_rate):g} 1/s, and of "
-        f"forces one at {-_rounded(found.force_gain):g} 1/s, with integrals of "
-        f"{', '.join(integral)}, damping of the constraint "
-        f"{_rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
+        f"{period:g} s and velocities within {noise:.2g} rad/s: Butterworth's poles of positions "
+        f"at {_rounded(found.position_rate):g} 1/s, and of forces one at "
+        f"{-_rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
+        f"of the constraint {_rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}"
     )
     return Completed(chosen, (note,))

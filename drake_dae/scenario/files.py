@@ -109,11 +109,11 @@ def _check_no_robot(path: Path, text: str) -> None:
     found = _ROBOT.search(text) if is_markup or "directives" in text else None
     if found is None or is_markup == found[0].startswith("directives"):
         return
-    told = (
+    problem = (
         f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, and "
         "in one of your own it is robot.file"
     )
-    raise ScenarioError((str(path), told))
+    raise ScenarioError((str(path), problem))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

@@ -159,8 +159,8 @@ def scenario_structure(model: RobotModel) -> Structure:
     if model.dae.num_outputs == 0:
         actuators = model.dae.num_controls
         text = (
-            f"there are none, and nothing completes them without references or force outputs: name "
-            f"{actuators}, one for each actuator, or give references of some of them"
+            "there are none, and they cannot be completed without references or force outputs: "
+            f"name {actuators}, one for each actuator, or give references of some of them"
         )
         raise ScenarioError(("outputs", text))
     try:

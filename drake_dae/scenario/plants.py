@@ -115,9 +115,7 @@ class Unilateral(ScenarioPlant):
         with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
             pushing = [one.name for one in robot.model.constraints if any(one.is_unilateral)]
             if not pushing:
-                raise ModelError(
-                    "the robot has no constraint that can only push, so that none opens"
-                )
+                raise ModelError("the robot has no unilateral constraint, so no contact can open")
             return UnilateralRobotPlant(
                 robot.model,
                 self.restitution or dict.fromkeys(pushing, 0.0),

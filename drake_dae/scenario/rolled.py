@@ -23,23 +23,45 @@ ROWS = 1000
 PERIOD = 0.2
 """So often what a rollout has recorded is looked at for divergence while it goes on, in s."""
 
+SAME = 1e-6
+"""Two times that differ by less than this part of a step are one row."""
+
 MOST_ROWS = 1e7
 """The largest number of rows of fixed steps; a larger record takes gigabytes."""
 
 
-def rollout_times(scenario: Scenario) -> FloatArray:
-    """The times of the rows of a rollout's record, in s: equidistant, or the fixed steps."""
+def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
+    """The times of the rows of a rollout's record, in s: equidistant, or the fixed steps.
+
+    Args:
+        scenario: The scenario.
+        time_step: The step of a plant that Drake steps, in s; 0 for any other plant.
+
+    Raises:
+        ModelError: There are too many.
+    """
     config, rows = scenario.integrator, ROWS
+    if time_step:
+        _check_rows(scenario.duration / time_step, "time_step", time_step, scenario.duration)
+        end = config.start_time + scenario.duration
+        inside = time_step * np.arange(config.start_time // time_step + 1, ceil(end / time_step))
+        near = SAME * time_step
+        inside = inside[(inside > config.start_time + near) & (inside < end - near)]
+        return np.concatenate([[config.start_time], inside, [end]])
     if not config.use_error_control:
         steps = scenario.duration / config.max_step_size
-        if steps > MOST_ROWS:
-            raise ModelError(
-                f"max_step_size {config.max_step_size:g} s makes {steps:.2g} rows for "
-                f"{scenario.duration:g} s; a rollout keeps at most {MOST_ROWS:g}"
-            )
+        _check_rows(steps, "max_step_size", config.max_step_size, scenario.duration)
         rows = max(1, ceil(steps - 0.01))
     times: FloatArray = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
     return times
+
+
+def _check_rows(count: float, name: str, step: float, duration: float) -> None:
+    if count > MOST_ROWS:
+        raise ModelError(
+            f"{name} {step:g} s makes {count:.2g} rows for {duration:g} s; a rollout keeps at most "
+            f"{MOST_ROWS:g}"
+        )
 
 
 def roll_scenario(
@@ -74,7 +96,7 @@ def roll_scenario(
         loop,
         start,
         parameters,
-        rollout_times(scenario),
+        rollout_times(scenario, loop.plant.time_step),
         config=scenario.integrator,
         seeds=[seeds],
         lasting=lasting,

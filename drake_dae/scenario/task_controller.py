@@ -74,12 +74,12 @@ def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
             if name in fitting:
                 return fitting[name]
             raise ModelError(
-                f"'{name}' is no constraint with one force that can only push; such are "
+                f"'{name}' is not a unilateral constraint with one force; these are "
                 f"{', '.join(fitting) or 'none'}"
             )
         if len(fitting) != 1:
             raise ModelError(
-                "needed, since the constraints with one force that can only push are "
+                "needed, since the unilateral constraints with one force are "
                 f"{', '.join(fitting) or 'none'}"
             )
     return next(iter(fitting.values()))

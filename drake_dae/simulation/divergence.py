@@ -1,13 +1,13 @@
 """Runs that end where they diverge, with what grew and since when."""
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Self
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import SimulationError
 from drake_dae.simulation.records.record import Record
 from drake_dae.systems.control.contract import Compared, Controller
@@ -20,7 +20,8 @@ ENORMOUS = 1e6
 """An error that is so many times the size of its output diverges at once."""
 
 BEYOND = 1e9
-"""A state that is so many times its size diverges at once. A joint that turns all day does not."""
+"""A state or a control that is so many times its size diverges at once. A joint that turns all day
+does not."""
 
 WINDOW = 0.01
 """The share of a run over which errors are averaged. The mean is that of their logarithms: the peak
@@ -37,7 +38,8 @@ EVERY = 32
 class DivergenceWatch:
     """Ends a run whose states or errors leave all measure.
 
-    A state is compared with its value at the start and with `DaeSystem.scale`. The error z - r of
+    A state is compared with its value at the start and with `DaeSystem.scale`, a control with what
+    had its unit at the start. The error z - r of
     an output is compared with the largest number in its unit that the reference has had up to now,
     or that outputs, states, forces and controls had at the start. So nothing depends on units, and
     the force of an impact, the sag under a load or a start far away are no divergence.
@@ -56,15 +58,17 @@ class DivergenceWatch:
         self._controllers *= len(self._plants) == 1
         self._diagram, self._steps, time = diagram, 0, context.get_time()
         self._states = [
-            _States(plant.dae, time, plant.state(plant.GetMyContextFromRoot(context)))
+            _Amounts.states(plant, time, plant.state(plant.GetMyContextFromRoot(context)))
             for plant in self._plants
         ]
         self._errors: list[tuple[Controller, _Errors]] = []
+        self._controls: _Amounts | None = None
         for controller in self._controllers:
+            plant = self._plants[0]
+            start = _sizes(plant, self._shown(context))
+            self._controls = _Amounts.controls(plant, time, start)
             if (now := self._compared(controller, context)) is None:
                 continue
-            plant = self._plants[0]
-            start = _sizes(plant, _shown(plant, context))
             sizes, window = _with(start, now[2], now[0]), WINDOW * duration
             errors = _Errors(now[2], time, window, sizes, _least(plant))
             self._errors.append((controller, errors))
@@ -88,12 +92,15 @@ class DivergenceWatch:
         if self._steps % EVERY and not always:
             return
         self.look_at_states(context)
+        if not self._controllers:
+            return
+        times, shown = np.array([context.get_time()]), self._shown(context)
+        state, control = shown("state")[None], shown("control")[None]
+        if self._controls is not None and control.size:
+            _raise_first([self._controls.look(times, control, state)])
         for controller, errors in self._errors:
-            now = self._compared(controller, context)
-            if now is not None:
-                state = _shown(self._plants[0], context)("state")
-                rows = (each[None] for each in (*now[:2], state))
-                _raise_first([errors.look(np.array([context.get_time()]), *rows)])
+            if (now := self._compared(controller, context)) is not None:
+                _raise_first([errors.look(times, now[0][None], now[1][None], state)])
 
     def look_at_states(self, context: Context) -> None:
         """Looks at the states alone: where a run has failed, outputs may have no values.
@@ -102,15 +109,35 @@ class DivergenceWatch:
             SimulationError: They diverge.
         """
         times = np.array([context.get_time()])
-        pairs = zip(self._plants, self._states, strict=True)
-        _raise_first(
-            [each.look(times, _shown(plant, context)("state")[None]) for plant, each in pairs]
-        )
+        for plant, amounts in zip(self._plants, self._states, strict=True):
+            state = plant.state(plant.GetMyContextFromRoot(context))[None]
+            _raise_first([amounts.look(times, state, state)])
 
     def _compared(self, controller: Controller, context: Context) -> Compared | None:
         """The outputs of a controller and what they should be; None if nobody says."""
-        shown = _shown(self._plants[0], context)
-        return controller.compared(controller.GetMyContextFromRoot(context), shown)
+        own = controller.GetMyContextFromRoot(context)
+        return controller.compared(own, self._shown(context))
+
+    def _shown(self, context: Context) -> Callable[[str], FloatArray]:
+        """What the plant shows now, by the names that a record has; empty for nothing."""
+        plant = self._plants[0]
+        own = plant.GetMyContextFromRoot(context)
+
+        def value(name: str) -> FloatArray:
+            if name == "state":
+                return plant.state(own)
+            if name != "control":
+                return np.array(plant.GetOutputPort(name).Eval(own))
+            port = plant.GetInputPort("control")
+            if port.HasValue(own):
+                return np.array(port.Eval(own))
+            # A law that is fed back as a value.
+            is_known = self._diagram.HasOutputPort("control")
+            return np.array(
+                self._diagram.GetOutputPort("control").Eval(context) if is_known else []
+            )
+
+        return value
 
 
 class RecordWatch:
@@ -123,7 +150,7 @@ class RecordWatch:
 
     def __init__(self, plant: Plant, duration: float) -> None:
         self._plant, self._duration = plant, duration
-        self._watched: tuple[_States, _Errors] | None = None
+        self._watched: tuple[_Amounts, _Amounts, _Errors] | None = None
 
     def look(self, record: Record) -> None:
         """Looks at rows that follow those that were looked at.
@@ -139,34 +166,21 @@ class RecordWatch:
             start = _sizes(self._plant, lambda name: record[name][0])
             window = WINDOW * self._duration
             self._watched = (
-                _States(self._plant.dae, time, states[0]),
+                _Amounts.states(self._plant, time, states[0]),
+                _Amounts.controls(self._plant, time, start),
                 _Errors(signals, time, window, start, _least(self._plant)),
             )
-        of_states, of_errors = self._watched
+        of_states, of_controls, of_errors = self._watched
         found = [
             of_errors.look(record.time, outputs, record["desired_output"], states),
-            of_states.look(record.time, states),
+            of_states.look(record.time, states, states),
+            of_controls.look(record.time, record["control"], states),
         ]
         _raise_first(found)
 
 
 Sizes = dict[str, float]
 """Unit -> the largest number in it."""
-
-
-def _shown(plant: Plant, context: Context) -> Callable[[str], FloatArray]:
-    """What a plant shows now, by the names that a record has."""
-    own = plant.GetMyContextFromRoot(context)
-
-    def value(name: str) -> FloatArray:
-        if name == "state":
-            return plant.state(own)
-        if name != "control":
-            return np.array(plant.GetOutputPort(name).Eval(own))
-        port = plant.GetInputPort("control")
-        return np.array(port.Eval(own)) if port.HasValue(own) else np.zeros(0)
-
-    return value
 
 
 def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
@@ -196,16 +210,28 @@ def _with(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
     return found
 
 
-class _States:
-    """The states of a plant beside their sizes."""
+class _Amounts:
+    """The states, or the controls, of a plant beside their sizes."""
 
-    def __init__(self, dae: DaeSystem, time: float, start: FloatArray) -> None:
-        self._signals, self._since = dae.state_signals, time
-        self._size = np.maximum(dae.scale, np.abs(start))
+    def __init__(self, signals: Sequence[Signal], time: float, size: FloatArray) -> None:
+        self._signals, self._since, self._size = signals, time, size
 
-    def look(self, times: FloatArray, states: FloatArray) -> SimulationError | None:
+    @classmethod
+    def states(cls, plant: Plant, time: float, start: FloatArray) -> Self:
+        """Those of its states."""
+        return cls(plant.dae.state_signals, time, np.maximum(plant.dae.scale, np.abs(start)))
+
+    @classmethod
+    def controls(cls, plant: Plant, time: float, sizes: Sizes) -> Self:
+        """Those of its controls; of a unit in which nothing has a size none is watched."""
+        found = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
+        return cls(plant.dae.control_signals, time, np.array(found))
+
+    def look(
+        self, times: FloatArray, values: FloatArray, states: FloatArray
+    ) -> SimulationError | None:
         """What diverges first in rows of a run; None if nothing does."""
-        shares = np.abs(states) / self._size
+        shares = np.abs(values) / self._size
         largest = shares.max(axis=1, initial=0.0)
         if largest[-1] <= 10.0 and not largest.max() > BEYOND:
             self._since = times[-1]
@@ -217,12 +243,12 @@ class _States:
         if not beyond.size:
             return None
         worst = int(np.argmax(shares[row]))
-        signal, state = self._signals[worst], states[row]
+        signal = self._signals[worst]
         return _diverged(
-            f"{_amount(signal, state[worst])}, {shares[row, worst]:.2g} times the "
+            f"{_amount(signal, values[row, worst])}, {shares[row, worst]:.2g} times the "
             f"{_quantity(self._size[worst], signal)} that it is large in use",
             (self._since, float(times[row])),
-            state,
+            states[row],
         )
 
 

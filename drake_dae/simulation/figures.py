@@ -1,4 +1,4 @@
-"""The figures of a run as numbers, each under a name that a table of many runs can have."""
+"""The figures of a run as numbers, under names for tables of many runs."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     Args:
         record: A record with tracking_error, constraint_force, control, constraint_residual and
             state; an empty one has no figures.
-        limits: What the robot can take.
+        limits: The limits of the robot.
     """
     if not record.time.size:
         return {}
@@ -39,7 +39,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
         **{
             _label("margin of", signal): room
             for signal, room in margins(record, limits)
-            if _label("least", signal) not in found  # Which is the same.
+            if _label("least", signal) not in found  # They are equal.
         },
         "largest residual": float(residual),
         "end [s]": float(record.time[-1]),
@@ -47,7 +47,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
 
 
 def _late_size(times: FloatArray, values: FloatArray) -> float:
-    """The root mean square over the second half of values that are straight between their times."""
+    """The root mean square over the second half of a piecewise linear signal."""
     middle = 0.5 * (times[0] + times[-1])
     late = times > middle
     if not late.any():
@@ -59,10 +59,10 @@ def _late_size(times: FloatArray, values: FloatArray) -> float:
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
-    """How far each signal that has a limit stayed away from it, in its unit; negative beyond it.
+    """The distance of each signal from its limit, in its unit; negative beyond it.
 
-    The limit of a control is on |u|; that of a force that can only push is zero; positions and
-    velocities have a lowest and a highest value. A start may be on a limit by round-off.
+    The limit of a control is on |u|, that of a unilateral force is zero, and positions and
+    velocities have a lower and an upper limit. A start may be on a limit, up to round-off.
     """
     found = []
     for index, (signal, values) in enumerate(_columns(record, "control")):
@@ -80,7 +80,7 @@ def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
 
 
 def exceeded(record: Record, limits: Limits) -> list[str]:
-    """Names of the signals that left their limits; a force that pulls is one."""
+    """Names of the signals beyond their limits, including negative unilateral forces."""
     if not record.time.size:
         return []
     return [signal.name for signal, room in margins(record, limits) if room < 0.0]

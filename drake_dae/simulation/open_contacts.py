@@ -1,4 +1,4 @@
-"""What a record tells of contacts that open and close, in words and as spans of time."""
+"""Opening contacts in a record, in words and as intervals of time."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from drake_dae.simulation.records.record import Record
 
 
 def contact_notes(record: Record) -> list[tuple[str, str]]:
-    """What contacts did that open and close, as labels and texts; none where none can."""
+    """The behavior of opening contacts, as labels and texts; empty if there are none."""
     if "mode" not in record.signals:
         return []
     hits = impacts(record.events)
@@ -25,12 +25,12 @@ def contact_notes(record: Record) -> list[tuple[str, str]]:
     notes = [("contacts", text)]
     modes, gaps, taken = record["mode"], record["gap"], np.diff(record.time, prepend=record.time[0])
     for column, signal in enumerate(record.signals["gap"].signals):
-        # A sample tells of the step that it ends.
+        # A sample describes the step before it.
         is_open = modes[:, column] == 0.0
         is_open[0] = False
         name, away = signal.name.removesuffix(".gap"), gaps[is_open, column]
         if not away.size:
-            notes.append((name, "closed all the time"))
+            notes.append((name, "always closed"))
             continue
         first = record.time[int(np.argmax(is_open)) - 1]
         notes.append(
@@ -44,7 +44,7 @@ def contact_notes(record: Record) -> list[tuple[str, str]]:
 
 
 def open_spans(record: Record) -> list[tuple[float, float]]:
-    """From when to when some contact was open, in s."""
+    """The intervals in which some contact was open, in s."""
     if "mode" not in record.signals or record.time.size < 2:
         return []
     is_open = np.concatenate([[False], (record["mode"][1:] == 0.0).any(axis=1), [False]])

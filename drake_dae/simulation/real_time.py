@@ -1,4 +1,4 @@
-"""How fast a diagram runs here, before a run that shall keep up with the clock."""
+"""The speed of a diagram on this machine, before a run in real time."""
 
 import time
 from copy import deepcopy
@@ -9,25 +9,25 @@ from pydrake.systems.framework import Context, System
 from drake_dae.errors import DrakeDaeError
 
 TRIAL = 0.3
-"""How long a trial takes at most, in s."""
+"""The longest duration of a trial, in s."""
 
 FIRST, PIECE = 0.02, 1.0 / 32.0
-"""What is simulated before the clock counts, and then at a time, in s."""
+"""The simulated time before the measurement, and per measurement, in s."""
 
 
 def attainable_rate(
     diagram: System, context: Context, duration: float, config: SimulatorConfig
 ) -> float | None:
-    """How many seconds are simulated in one second here, at the start of a run.
+    """The simulated seconds per second on this machine, at the start of a run.
 
     Args:
         diagram: The system.
         context: Its context with the start state; not changed.
-        duration: How long the run lasts, in s.
-        config: Its settings; it begins at their start_time.
+        duration: The duration of the run, in s.
+        config: Its settings; it starts at their start_time.
 
     Returns:
-        The rate; None where the run is too short, or fails at once.
+        The rate; None if the run is too short, or fails immediately.
     """
     free = deepcopy(config)
     free.target_realtime_rate = 0.0
@@ -44,7 +44,7 @@ def attainable_rate(
             now += PIECE
             trial.AdvanceTo(now)
     except (DrakeDaeError, RuntimeError):
-        return None  # The run itself says why.
+        return None  # The run itself reports the reason.
     if now <= start + FIRST:
         return None
     return (now - start - FIRST) / (time.perf_counter() - counted)

@@ -1,4 +1,4 @@
-"""What a run should say of the surfaces that a robot touched, and of how it ended."""
+"""Remarks of a run on contact surfaces, and on its end."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -16,7 +16,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 def surface_remarks(model: RobotModel, record: Record) -> list[str]:
-    """What of the surfaces is approximate, and where the robot left what is given of them.
+    """The approximations of the surfaces, and where the robot left their defined range.
 
     Args:
         model: The robot.
@@ -28,13 +28,13 @@ def surface_remarks(model: RobotModel, record: Record) -> list[str]:
 
 
 def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
-    """When a point is first beyond the edge of its surface; empty if it never is."""
+    """The first time a point is beyond the edge of its surface; empty if there is none."""
     extent, dae = constraint.extent, model.dae
     if extent is None:
         return ""
     coordinates = constraint.coordinates(model.links)
     if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
-        return ""  # Where a surface that moves has been the record does not say.
+        return ""  # The record does not contain the position of a moving surface.
     inputs = {"q": model.links.q, "parameters": dae.parameter_symbol}
     function = TracedFunction("coordinates", inputs, {"coordinates": coordinates})
     positions = record["state"][:, : model.links.q.numel()]
@@ -45,15 +45,16 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
     first = record.time[int(np.argmax(beyond > 0.0))]
     return (
         f"{constraint.name}: the robot is beyond the edge of the data by up to "
-        f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there a plane goes on"
+        f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there the surface "
+        "continues as a plane"
     )
 
 
 def ball_remarks(radius: float | None) -> list[str]:
-    """What the ball of Drake's own contact does that a point does not.
+    """The effect of the ball of Drake's own contact, compared to a point.
 
     Args:
-        radius: The radius of the ball in m; None where there is none.
+        radius: The radius of the ball in m; None without a ball.
     """
     if radius is None:
         return []
@@ -65,10 +66,10 @@ def ball_remarks(radius: float | None) -> list[str]:
 
 
 def reference_remarks(references: Mapping[str, Any]) -> list[str]:
-    """What of the references is approximate.
+    """The approximations of the references.
 
     Args:
-        references: What holds references, in lists, mappings and data classes, by name.
+        references: Objects with references, in lists, mappings and data classes, by name.
     """
     return list(dict.fromkeys(_told(references)))
 
@@ -89,11 +90,11 @@ def _told(one: Any, name: str = "") -> Iterator[str]:
 
 
 def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:
-    """That a task has ended its run, where it has; no failure and no signal did.
+    """A remark if a task has ended its run early, without failure or signal.
 
     Args:
-        statistics: What the run took; None where it failed.
-        duration: How long it should have lasted, in s.
+        statistics: The statistics of the run; None if it failed.
+        duration: Its requested duration, in s.
     """
     if statistics is None or statistics.interrupted:
         return []

@@ -1,4 +1,4 @@
-"""Running a diagram: progress, clean interruption, and what it took."""
+"""Running a diagram: progress, clean interruption, and statistics."""
 
 import os
 import signal
@@ -33,24 +33,24 @@ from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
-"""The time between updates of the progress bar, or between lines where it has no terminal, in s."""
+"""The time between updates of the progress bar, or between lines without a terminal, in s."""
 
 MANY_STEPS = 1e7
-"""More than these take over an hour, and gigabytes for their log: hardly anyone wants them."""
+"""The number of steps that takes over an hour, and gigabytes for the log."""
 
 TYPICAL_STEP = 5e-4
-"""What a step of a robot with seven joints takes, in s: five evaluations of its closed loop."""
+"""The time of a step of a robot with seven joints, in s: five evaluations of its closed loop."""
 
 
 @dataclass(frozen=True)
 class RunStatistics:
-    """What a run took.
+    """The statistics of a run.
 
     Attributes:
-        simulated_time: How far it came, in s.
-        wall_time: How long it took, in s.
-        steps: How many steps the integrator took.
-        interrupted: The signal that ended it early, SIGINT for Ctrl-C; None if none did.
+        simulated_time: The simulated time, in s.
+        wall_time: The elapsed time, in s.
+        steps: The number of steps of the integrator.
+        interrupted: The signal that ended it early, SIGINT for Ctrl-C; None otherwise.
     """
 
     simulated_time: float
@@ -76,28 +76,28 @@ def simulate(
 ) -> RunStatistics:
     """Runs a diagram from a context; the context is the end state afterwards, on the manifold.
 
-    A run of a `Plant` that diverges ends, with what grew and since when: see `DivergenceWatch`.
+    A diverging run of a `Plant` ends with the reason and its start: see `DivergenceWatch`.
 
-    A run that goes on from the end of another one, with that as its start_time, adds to its logs.
-    One that begins earlier is a new one, and clears them.
+    A run that continues another one, with its end as start_time, appends to the logs. A run that
+    starts earlier clears them.
 
-    Ctrl-C, SIGTERM and SIGHUP end the run after the current step, a second one at once with a
-    KeyboardInterrupt. Logs keep what they have, as they do when the run fails with an exception.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second one ends it immediately
+    with a KeyboardInterrupt. Logs are kept, also if the run fails with an exception.
 
     Args:
         diagram: The system.
         context: Its context with the start state; changed in place.
-        duration: How long to simulate, in s.
-        config: Drake's integrator settings; its defaults if None. The run begins at its start_time.
+        duration: The duration to simulate, in s.
+        config: Drake's integrator settings; its defaults if None. The run starts at its start_time.
         progress: Shows simulated time and speed on stderr.
         after_step: Called with the context after each step, such as `RecordWriter.update`.
-        may_diverge: Whether a run that diverges goes on.
+        may_diverge: Whether a diverging run continues.
 
     Warns:
         UserWarning: The largest step allowed is so small that the run takes hours.
 
     Raises:
-        ModelError: The duration or the settings make no sense.
+        ModelError: The duration or the settings are not valid.
         InconsistentStateError: The start state is not on the manifold.
         SimulationError: The run cannot go on, or diverges; the exception has time and state.
     """
@@ -140,7 +140,7 @@ def simulate(
             if not may_diverge:
                 found = DivergenceWatch(diagram, context, duration)
                 watch = found if found.sees else None
-            # A monitor in Python takes a tenth of a short step: without need there is none.
+            # A monitor in Python takes 10 % of a short step, so it is set only if needed.
             is_needed = progress or watch is not None or after_step is not None
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
@@ -172,7 +172,7 @@ def simulate(
 
 
 def _forget_later(system: System, context: Context, start: float) -> None:
-    """Clears the logs that hold what is later than the start of a run, in s."""
+    """Clears the logs with samples later than the start of a run, in s."""
     if isinstance(system, Diagram):
         for part in system.GetSystems():
             _forget_later(part, context, start)
@@ -183,7 +183,7 @@ def _forget_later(system: System, context: Context, start: float) -> None:
 
 
 def _longest_step(system: System, max_step_size: float) -> tuple[str, float]:
-    """What limits steps most, in words, and the longest step in s: it ends at each sample."""
+    """The longest step in s, which ends at each sample, and its cause in words."""
     least = "max_step_size", max_step_size
     if isinstance(system, Diagram):
         for part in system.GetSystems():
@@ -222,7 +222,7 @@ def check_duration(duration: float) -> None:
 
 
 def _check_times(start: float, duration: float) -> None:
-    """Refuses times that floating-point numbers cannot tell apart."""
+    """Refuses times that floating-point numbers cannot resolve."""
     if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
         raise ModelError(
             f"start_time must be a time from which {duration:g} s can be counted, got {start:g} s"
@@ -231,7 +231,7 @@ def _check_times(start: float, duration: float) -> None:
 
 @cache
 def _schemes() -> tuple[str, ...]:
-    """Of Drake's schemes all but CENIC, which simulates a MultibodyPlant alone."""
+    """All of Drake's schemes except CENIC, which simulates only a MultibodyPlant."""
     return tuple(name for name in GetIntegrationSchemes() if name != "cenic")
 
 
@@ -243,10 +243,10 @@ def _has_error_control(scheme: str) -> bool:
 
 
 def check_config(config: SimulatorConfig) -> None:
-    """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
+    """Refuses settings that Drake accepts but that hang, fail late, or are ignored.
 
     Raises:
-        ModelError: A setting does not fit; the message names it, and what would.
+        ModelError: A setting is not valid; the message names it and valid ones.
     """
     scheme = config.integration_scheme
     schemes = _schemes()
@@ -274,7 +274,7 @@ def check_config(config: SimulatorConfig) -> None:
 
 
 class _Progress:
-    """Simulated time and speed on stderr: a bar on a terminal, elsewhere a line now and then."""
+    """Simulated time and speed on stderr: a bar on a terminal, otherwise periodic lines."""
 
     def __init__(self, duration: float, enabled: bool) -> None:
         self._duration = duration
@@ -303,19 +303,19 @@ class _Progress:
             self._bar.close()
 
     def update(self, simulated: float) -> None:
-        """Shows the simulated time in s, if it is time to."""
+        """Shows the simulated time in s, if an update is due."""
         if self._enabled and time.perf_counter() - self._shown >= self._period:
             self._show(simulated)
 
     def finish(self, simulated: float) -> None:
-        """Shows where the run ended; lines are for runs that last."""
+        """Shows the end of the run; as a line only for long runs."""
         if self._terminal or self._shown > self._began:
             self._show(simulated)
 
     def _show(self, simulated: float) -> None:
         self._shown = time.perf_counter()
         speed = f"{simulated / (self._shown - self._began):.1f} x real time"
-        # A terminal that is closed, or a reader that has enough, ends no run.
+        # A closed terminal or pipe must not end the run.
         with suppress(OSError):
             if self._terminal:
                 self._bar.set_postfix_str(speed, refresh=False)
@@ -327,7 +327,7 @@ class _Progress:
 
 
 def default_size() -> dict[str, int]:
-    """The size for tqdm where the terminal says that it has no columns, as in some containers."""
+    """The size for tqdm if the terminal reports no columns, as in some containers."""
     try:
         known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except OSError:

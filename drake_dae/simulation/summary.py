@@ -24,18 +24,18 @@ _WIDTH = 100
 """The width of a paragraph, in characters."""
 
 SLACK = 1e-9
-"""How far a value must be beyond a joint limit to count, in its unit: a start may be on it."""
+"""The excess over a joint limit that counts, in its unit: a start may be on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What a robot can take; None where it has no limits.
+    """The limits of a robot; None without limits.
 
     Attributes:
         control: The largest |u|, shape (p,).
         state: The lowest and the highest (q, v), shape (nq + nv,) each.
         loops: The same of the joints that close loops, (c, c').
-        pushing: Names of the constraint forces that can only push; None if that is all of them.
+        pushing: Names of the unilateral constraint forces; None if all are unilateral.
     """
 
     control: FloatArray | None = None
@@ -49,7 +49,7 @@ class Limits:
 
     @classmethod
     def of(cls, model: RobotModel) -> Self:
-        """The limits of a robot: of what drives it, of its joints, and of what it touches."""
+        """The limits of a robot: of its drives, joints and contacts."""
         pairs = zip(model.links.position_limits, model.links.velocity_limits, strict=True)
         lower, upper = (np.concatenate(pair) for pair in pairs)
         state = (lower, upper) if np.any(np.isfinite([lower, upper])) else None
@@ -75,26 +75,26 @@ def summary(
     reasons: Sequence[str] = (),
     behind: Sequence[LinkBehind | Collision] = (),
 ) -> str:
-    """What a run did, in plain text, and whether that is as theory predicts.
+    """The results of a run in plain text, compared with the prediction.
 
-    Numbers that are round-off beside others with their unit are 0.
+    Numbers that are round-off relative to others of the same unit are shown as 0.
 
     Args:
         record: A record with state, desired_output, tracking_error, constraint_residual,
-            constraint_force and control; and "mode" and "gap" where contacts open and close.
+            constraint_force and control; and "mode" and "gap" with opening contacts.
         predicted: The tracking error by theory, shape (k, p).
-        limits: What the robot can take.
-        run: What it took; None for a run that failed.
-        failure: Why it failed.
+        limits: The limits of the robot.
+        run: Its statistics; None for a failed run.
+        failure: The reason of the failure.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
-        reasons: Why a run may be off its prediction, such as "the law is sampled".
-        behind: Links that went behind a surface, or collided.
+        reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
+        behind: Links that moved behind a surface, or collided.
     """
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    # Drake's own contact gives way, and is not projected.
-    kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
+    # Drake's own contact is compliant, and the state is not projected.
+    kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += _identified(record)
@@ -140,8 +140,8 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
             ],
             left=2,
         ).lines(),
-        "off prediction by: the largest distance from the error that theory predicts, which decays",
-        "from its start by the gains alone",
+        "off prediction by: the largest deviation from the predicted error, which decays",
+        "from its initial value by the gains alone",
     ]
 
 
@@ -172,7 +172,7 @@ def _controls(record: Record, limits: Limits) -> list[str]:
         return []
     sizes = unit_sizes(record)
     largest = _largest_controls(record, limits)
-    # A sample tells of the step that it ends.
+    # A sample describes the step before it.
     excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
     cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
     columns = zip(controls.signals, controls.values.T, largest, cut_off, strict=True)
@@ -198,7 +198,7 @@ def _controls(record: Record, limits: Limits) -> list[str]:
 
 
 def _identified(record: Record) -> list[str]:
-    """What an observer has found of friction at the end."""
+    """The friction identified by an observer at the end."""
     if "friction" not in record.signals:
         return []
     found = record.signals["friction"]
@@ -208,7 +208,7 @@ def _identified(record: Record) -> list[str]:
 
 
 def _number(value: float, size: float, digits: int) -> str:
-    """A number, which is 0 where it is but round-off of numbers of some size."""
+    """A number, or 0 if it is round-off of numbers of a given size."""
     return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
 
 
@@ -222,11 +222,11 @@ def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
 
 
 def shortfalls(record: Record, limits: Limits) -> list[str]:
-    """What a robot would not do that tracks as well as this, each in words.
+    """Violations of limits by a run that tracks well, each in words.
 
     Args:
         record: A record with constraint_force and control.
-        limits: What the robot can take.
+        limits: The limits of the robot.
     """
     forces, controls = record.signals["constraint_force"], record.signals["control"]
     pulling = [
@@ -238,16 +238,16 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
     found = []
     if pulling:
-        found.append(f"{', '.join(pulling)} would have to pull, and a contact cannot")
+        found.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
     if beyond:
-        found.append(f"{', '.join(beyond)} would have to give more than the limit")
+        found.append(f"{', '.join(beyond)} would exceed the limits")
     if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
         found.append(f"{', '.join(joints)} would leave the joint limits")
     return found
 
 
 def _beyond(record: Record, limits: Limits) -> list[str]:
-    """Positions and velocities that leave their limits."""
+    """Positions and velocities beyond their limits."""
     rows: list[tuple[Signal, FloatArray, float, float]] = []
     for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and key in record.signals:

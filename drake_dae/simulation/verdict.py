@@ -1,4 +1,4 @@
-"""Whether a run went as theory predicts, as a value, as data and in words."""
+"""The comparison of a run with its prediction, as a value, as data and in words."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Record
 
 ROUND_OFF = 1e-13
-"""Beside the size of what it is a part of, a smaller number is round-off."""
+"""A number below this, relative to the size of its terms, is round-off."""
 
 CLOSE, NEAR = 1e-5, 1e-2
-"""Errors that are off their prediction by less than these shares of their outputs' sizes are as
-predicted, and nearly as predicted."""
+"""Deviations from the prediction, as fractions of the outputs' sizes, below which a run is as
+predicted, or nearly as predicted."""
 
 SLACK = 10.0
-"""How many times the accuracy of a step a whole run may be off."""
+"""The allowed deviation of a run, as a multiple of the accuracy of a step."""
 
 
 class Tracking(Enum):
-    """How the errors of a run compare with the predicted ones; the values begin the sentence."""
+    """The errors of a run compared with the predicted ones; the values start the sentence."""
 
     AS_PREDICTED = "Tracked as predicted"
     NEARLY = "Tracked nearly as predicted"
@@ -33,15 +33,15 @@ class Tracking(Enum):
 
 @dataclass(frozen=True)
 class RunVerdict:
-    """How a run compares with theory.
+    """The comparison of a run with its prediction.
 
     Attributes:
-        tracking: How good it was.
-        worst: The output that is farthest off, beside its size; None where there are no outputs.
-        off: By how much its error is off the predicted one, at most, in its unit.
-        time: When, in s; where it is not as predicted, since when.
-        share: The same beside the output's size.
-        settled: The largest share in the second half of the run.
+        tracking: The quality of tracking.
+        worst: The output with the largest relative deviation; None without outputs.
+        off: The largest deviation of its error from the predicted one, in its unit.
+        time: The time of it, in s; if not as predicted, the time since when.
+        share: The same relative to the output's size.
+        settled: The largest relative deviation in the second half of the run.
     """
 
     tracking: Tracking
@@ -53,10 +53,10 @@ class RunVerdict:
 
 
 def unit_sizes(record: Record) -> dict[str, float]:
-    """Unit -> the largest number that a record has in it; angles and pure numbers are one at least.
+    """Unit -> the largest number of it in a record; at least one for angles and pure numbers.
 
     Args:
-        record: A record; what it has of state, control, constraint_force and desired_output counts.
+        record: A record with any of state, control, constraint_force and desired_output.
     """
     found = {"": 1.0, "rad": 1.0}
     for name in ("state", "control", "constraint_force", "desired_output"):
@@ -68,11 +68,11 @@ def unit_sizes(record: Record) -> dict[str, float]:
 
 
 def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
-    """How large the outputs of a run are, shape (p,), positive.
+    """The sizes of the outputs of a run, shape (p,), positive.
 
-    It is the largest value that a reference or a predicted error has in the unit of an output, so
-    that one that is held at zero is compared with those that move. Where all are zero it is the
-    largest value of the record in that unit, or one.
+    The size is the largest value of references and predicted errors in the unit of an output, so
+    that an output held at zero is compared with moving ones. If all are zero it is the largest
+    value of the record in that unit, or one.
 
     Args:
         record: A record with desired_output.
@@ -92,7 +92,7 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
 
 
 def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> RunVerdict:
-    """How a run compares with theory.
+    """The comparison of a run with its prediction.
 
     Args:
         record: A record with desired_output and tracking_error.
@@ -118,11 +118,11 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
 
 
 def is_missed(verdict: RunVerdict, reasons: Sequence[str] = ()) -> bool:
-    """Whether a run missed its task: it is off, and stays so or has no reason to be.
+    """Whether a run missed its task: it deviates, and permanently or without a known reason.
 
     Args:
         verdict: The verdict.
-        reasons: Why a run is not as predicted, as in `in_words`.
+        reasons: Reasons for a deviation, as in `in_words`.
     """
     is_off = verdict.tracking is Tracking.OFF
     return is_off and not (reasons and verdict.settled <= NEAR)
@@ -133,7 +133,7 @@ def as_data(verdict: RunVerdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
 
     Args:
         verdict: The verdict.
-        reasons: Why a run is not as predicted, as in `in_words`.
+        reasons: Reasons for a deviation, as in `in_words`.
     """
     worst = verdict.worst
     return {
@@ -164,7 +164,7 @@ def in_words(
         verdict: The verdict.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
         reasons: Why a run is not as predicted, such as "the drives were cut off".
-        ended: How the run ended, such as "The run failed at 2.1 s"; empty where it is complete.
+        ended: The end of the run, such as "The run failed at 2.1 s"; empty if it is complete.
     """
     head = f"{ended}; up to there: " if ended else ""
     if verdict.worst is None:

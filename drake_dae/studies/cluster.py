@@ -10,7 +10,7 @@ from drake_dae.errors import ModelError
 from drake_dae.studies.runs import Batch, Outcome, RunResult, run_batch
 
 WAIT = 30.0
-"""How long a scheduler may take to answer, in s."""
+"""The longest time to wait for a scheduler, in s."""
 
 
 class Cluster:
@@ -48,7 +48,7 @@ class Cluster:
     ) -> Generator[list[RunResult], None, None]:
         """The results of all runs, as their batches come.
 
-        A batch whose worker dies is given out again; where several die of it, its runs one by one.
+        A batch whose worker dies is submitted again; after several failures, run by run.
 
         Args:
             settings: The arguments of `Runner`, as plain data.
@@ -90,7 +90,7 @@ class Cluster:
             yield found
 
     def close(self) -> None:
-        """Gives up what is not yet simulated."""
+        """Cancels runs that are not yet simulated."""
         self._client.close()
 
     def __enter__(self) -> "Cluster":

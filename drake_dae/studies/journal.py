@@ -1,8 +1,8 @@
-"""The file of a study: a first line that tells which study, then one line for each finished run.
+"""The file of a study: a first line with its identity, then one line for each finished run.
 
-Lines are only ever appended, each synced to the disk before the next run counts as done. A process
-that was killed at any moment leaves whole lines and at most one that is cut off, which goes away
-when the study continues.
+Lines are only appended, each synced to the disk before the next run counts as done. A killed
+process leaves whole lines and at most one incomplete line, which is removed when the study
+continues.
 """
 
 import errno
@@ -43,8 +43,8 @@ class Journal:
 
     Attributes:
         path: The file.
-        results: Number of a run -> its result, of all that are in the file: the first final one, or
-            else the last one.
+        results: Number of a run -> its result in the file: the first final one, otherwise the last
+            one.
     """
 
     def __init__(self, path: Path, file: int, results: dict[int, RunResult]) -> None:
@@ -53,7 +53,7 @@ class Journal:
         self._file = file
 
     def append(self, results: Iterable[RunResult]) -> None:
-        """Adds runs, and returns when they are on the disk.
+        """Appends runs, and returns when they are on the disk.
 
         Raises:
             ModelError: They cannot be written, as on a full disk.
@@ -72,15 +72,15 @@ class Journal:
 
 @contextmanager
 def open_journal(path: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
-    """Opens the file of a study, new or to continue it, and keeps others from writing to it.
+    """Opens the file of a study, new or to continue it, and locks it.
 
     Args:
         path: The file; its folder is made.
         head: What `study_head` returns.
 
     Raises:
-        ModelError: The file belongs to another study, which differs as the message tells; or is
-            no file of a study; or another process writes to it; or it cannot be written.
+        ModelError: The file belongs to another study, with the differences in the message; it is
+            not the file of a study; another process writes to it; or it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def open_journal(path: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
 def _open(path: Path, head: Mapping[str, Any]) -> int:
     """The locked file, which has its first line."""
     if not path.exists():
-        # Whole, or not there at all.
+        # Created completely or not at all.
         part = path.with_name(f".{path.name}.{os.getpid()}")
         new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
@@ -126,7 +126,7 @@ def _open(path: Path, head: Mapping[str, Any]) -> int:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes a new name in a folder last, too."""
+    """Syncs a folder, so that a new file name is kept."""
     entry = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(entry)
@@ -135,7 +135,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunResult]:
-    """The runs that a file has; a last line that is cut off is removed."""
+    """The runs in a file; an incomplete last line is removed."""
     first, *lines = path.read_bytes().split(b"\n")
     try:
         found = json.loads(first)
@@ -144,10 +144,10 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
         raise ModelError(f"'{path}' is no file of a study; choose another name") from None
     if known != FORMAT:
         raise ModelError(f"'{path}' has format {brief(known)}, this version writes {FORMAT}")
-    told = differences(found, json.loads(_line(head)))
-    if told:
+    differing = differences(found, json.loads(_line(head)))
+    if differing:
         raise ModelError(
-            f"'{path}' belongs to another study: {'; '.join(told)}. Choose another folder, or "
+            f"'{path}' belongs to another study: {'; '.join(differing)}. Choose another folder, or "
             "remove it"
         )
     rest = lines.pop() if lines else b""
@@ -159,7 +159,7 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
                 raise LookupError(result.run)
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             is_json = not isinstance(error, (json.JSONDecodeError, UnicodeDecodeError))
-            if place == len(lines) + 1 and not is_json:  # Zeros, where a machine lost its power.
+            if place == len(lines) + 1 and not is_json:  # Zeros after a power failure.
                 rest = line + b"\n" + rest
                 break
             raise ModelError(
@@ -174,20 +174,22 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """What two heads of studies have different, a few of it, in words."""
-    told = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
-    told += list(_different("rollout", there.get("rollout", False), here.get("rollout", False)))
-    told += list(_different("", there.get("scenario"), here.get("scenario")))
+    """Some differences of the heads of two studies, in words."""
+    differing = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
+    differing += list(
+        _different("rollout", there.get("rollout", False), here.get("rollout", False))
+    )
+    differing += list(_different("", there.get("scenario"), here.get("scenario")))
     old, new = there.get("variations", []), here["variations"]
     if len(old) != len(new):
-        told.append(f"{len(old)} runs there, {len(new)} here")
+        differing.append(f"{len(old)} runs there, {len(new)} here")
     pairs = enumerate(zip(old, new, strict=False))
     other = next(((i, a, b) for i, (a, b) in pairs if a != b), None)
     if other is not None:
         number, a, b = other
         first = next(iter(_different("", a, b)))
-        told.append(f"run {number} has {first}")
-    return told if len(told) <= 6 else [*told[:6], f"and {len(told) - 6} more"]
+        differing.append(f"run {number} has {first}")
+    return differing if len(differing) <= 6 else [*differing[:6], f"and {len(differing) - 6} more"]
 
 
 def _different(key: str, there: Any, here: Any) -> Iterator[str]:

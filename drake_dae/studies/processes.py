@@ -1,8 +1,8 @@
 """Processes of this machine that simulate the runs of a study.
 
-They are processes of their own rather than those of `concurrent.futures`: one that dies, as Drake's
-C++ may, is the outcome of the run that it had, and not the end of all; and no script needs a guard
-for its main module. Tasks and results are lines of JSON.
+They are used instead of `concurrent.futures`, where a dying process ends all others: here a crash,
+as in Drake's C++, is the outcome of one run, and scripts need no guard for their main module. Tasks
+and results are lines of JSON.
 """
 
 import json
@@ -24,22 +24,22 @@ from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 from drake_dae.studies.runs import Batch, Outcome, Runner, RunResult
 
 BUILDS = 200
-"""A process that has built so many loops is replaced: Drake does not free all of each."""
+"""The number of loops after which a process is replaced, since Drake does not free all memory."""
 
 PERIOD = 0.02
-"""Results are told this often, in s: those of short runs are synced to the disk together."""
+"""The period of reporting results, in s: those of short runs are synced to the disk together."""
 
 STARTING = 300.0
-"""So long a process may take until it is ready, in s."""
+"""The longest start of a process, in s."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _ENDED = {128 + signal.SIGINT, *(-number for number in ENDING_SIGNALS)}
-"""Exit codes of a process that was asked to end."""
+"""Exit codes of a process that was ended by a signal."""
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -51,13 +51,13 @@ def run_in_processes(
     workers: int,
     time_limit: float = float("inf"),
 ) -> Generator[list[RunResult], None, None]:
-    """The results of all runs, as they come, whoever is first.
+    """The results of all runs, in the order in which they end.
 
     Args:
         settings: The arguments of `Runner`, as plain data.
         batches: The runs.
-        workers: How many processes.
-        time_limit: How long a run may take, in s; a process that takes longer is ended.
+        workers: The number of processes.
+        time_limit: The time limit of a run, in s; a process that exceeds it is ended.
 
     Raises:
         ModelError: A process does not start.
@@ -65,7 +65,7 @@ def run_in_processes(
     waiting, workers = deque(batches), min(workers, len(batches))
     running: list[_Worker] = []
     found: list[RunResult] = []
-    told = -PERIOD
+    last_report = -PERIOD
     with selectors.DefaultSelector() as selector:
         try:
             while waiting or running:
@@ -75,7 +75,7 @@ def run_in_processes(
                     selector.register(worker.output, selectors.EVENT_READ, worker)
                 now = time.monotonic()
                 due = min(worker.due(time_limit) for worker in running) - now
-                due = min(due, told + PERIOD - now) if found else due
+                due = min(due, last_report + PERIOD - now) if found else due
                 for key, _ in selector.select(max(0.0, due) if isfinite(due) else None):
                     worker = key.data
                     is_open = worker.read()
@@ -93,9 +93,9 @@ def run_in_processes(
                         worker.dismiss()
                 for worker in running:
                     if time.monotonic() >= worker.due(time_limit):
-                        worker.stop(time_limit)  # What it is about is told when its output ends.
-                if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
-                    told = time.monotonic()
+                        worker.stop(time_limit)  # Its run is reported when its output ends.
+                if found and (time.monotonic() >= last_report + PERIOD or not (waiting or running)):
+                    last_report = time.monotonic()
                     yield found
                     found = []
         finally:
@@ -104,18 +104,18 @@ def run_in_processes(
 
 
 class _Worker:
-    """A process, and what it is about.
+    """A worker process and its runs.
 
     Attributes:
-        output: Where its results come from.
-        left: The runs that it was given and has not told of.
+        output: The pipe of its results.
+        left: Its runs without a result.
         is_idle: Whether it waits for runs.
-        builds: How many loops it has built.
-        began: When it began what it does, by the monotonic clock in s; infinite while it is idle.
+        builds: The number of loops that it has built.
+        began: The start of its present run, by the monotonic clock in s; infinite while it is idle.
     """
 
     def __init__(self, settings: Sequence[Any]) -> None:
-        # What is loaded stays: the garbage collector need not look through it, then or later.
+        # Loaded modules are permanent, so the garbage collector need not examine them.
         code = (
             f"import gc, sys; gc.disable(); sys.path[:] = {sys.path!r}; "
             f"from {__name__} import serve; gc.freeze(); gc.enable(); sys.exit(serve())"
@@ -127,7 +127,7 @@ class _Worker:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**dict.fromkeys(_THREADS, "1"), **os.environ},
-            start_new_session=True,  # Ctrl-C is for the study, which ends them.
+            start_new_session=True,  # Ctrl-C is handled by the study, which ends them.
         )
         self.output: IO[bytes] = self._process.stdout  # type: ignore[assignment]
         self.left: Batch = []
@@ -152,25 +152,25 @@ class _Worker:
             self._process.stdin.close()  # type: ignore[union-attr]
 
     def read(self) -> bool:
-        """Takes what it has told; False if nothing comes any more."""
+        """Reads its results; False at the end of its output."""
         data = os.read(self.output.fileno(), 1 << 16)
         *lines, self._text = (self._text + data).split(b"\n")
         for line in lines:
-            told = json.loads(line)
-            if "builds" in told:
+            line_data = json.loads(line)
+            if "builds" in line_data:
                 self._is_ready = self.is_idle = True
-                self.began, self.builds = float("inf"), told["builds"]
+                self.began, self.builds = float("inf"), line_data["builds"]
             else:
-                self._results.append(RunResult.from_dict(told))
+                self._results.append(RunResult.from_dict(line_data))
                 self.left, self.began = self.left[1:], time.monotonic()
         return bool(data)
 
     def due(self, limit: float) -> float:
-        """When it has taken longer than a run may, by the monotonic clock in s."""
+        """The time at which its run exceeds the limit, by the monotonic clock in s."""
         return self.began + (limit if self._is_ready else max(limit, STARTING))
 
     def stop(self, limit: float) -> None:
-        """Ends it, since its run takes longer than a limit in s; `read` and `close` tell it."""
+        """Ends it, since its run exceeds a limit in s; `read` and `close` report it."""
         if self._limit is None:
             self._limit = limit
             self._process.kill()
@@ -182,11 +182,11 @@ class _Worker:
         return found
 
     def close(self) -> RunResult | None:
-        """Ends it; the outcome of the run that it has not ended, if it died.
+        """Closes it, and returns the outcome of its unfinished run if it died.
 
         Raises:
-            ModelError: It has never begun.
-            KeyboardInterrupt: It was asked to end, as all are when a machine goes down.
+            ModelError: It did not start.
+            KeyboardInterrupt: It was ended by a signal, as at a shutdown.
         """
         code = self._process.wait()
         self._errors.seek(0)
@@ -209,13 +209,13 @@ class _Worker:
         return RunResult(number, outcome, reason)
 
     def kill(self) -> None:
-        """Ends it at once."""
+        """Kills it."""
         self._process.kill()
         self._process.wait()
         self._close()
 
     def _send(self, data: Any) -> None:
-        with suppress(OSError):  # A process that is gone is found out by reading.
+        with suppress(OSError):  # A process that has ended is noticed by reading.
             self._process.stdin.write(json.dumps(data).encode() + b"\n")  # type: ignore[union-attr]
             self._process.stdin.flush()  # type: ignore[union-attr]
 
@@ -227,12 +227,12 @@ class _Worker:
 
 
 def serve() -> int:
-    """What a process does: it reads the scenario, then runs, and tells of each when it has ended.
+    """The main function of a process: it reads the scenario, then runs, and reports each result.
 
-    After each batch, and at first, it tells how many loops it has built.
+    After each batch, and at the start, it reports the number of loops it has built.
     """
     results = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # Whatever else prints does not get between.
+    os.dup2(2, 1)  # Other output is redirected to stderr.
 
     def tell(data: Mapping[str, Any]) -> None:
         results.write(json.dumps(data).encode() + b"\n")

@@ -1,4 +1,4 @@
-"""One run of a study after the other, in one process: what each comes to."""
+"""The runs of a study in one process, and their results."""
 
 import json
 import time
@@ -41,33 +41,33 @@ class Outcome(StrEnum):
 
     FINISHED = "finished"
     FAILED = "failed"
-    """On the way; the figures are those up to there."""
+    """During the run; figures are up to the failure."""
     NO_START = "no start"
-    """No state on the constraints has what the start asks for."""
+    """No consistent state satisfies the start."""
     REFUSED = "refused"
-    """The scenario does not fit together, or violates an assumption."""
+    """The scenario is inconsistent, or violates an assumption."""
     CRASHED = "crashed"
-    """The process ended, or failed in a way that it should not."""
+    """The process ended, or failed unexpectedly."""
     TIMED_OUT = "timed out"
-    """The process was ended, since the run took longer than it may."""
+    """The process was ended, since the run exceeded its time limit."""
 
     @property
     def is_final(self) -> bool:
-        """Whether it tells of the run itself: one whose process was ended may be tried again."""
+        """Whether it is a property of the run itself; otherwise it may be tried again."""
         return self not in (Outcome.CRASHED, Outcome.TIMED_OUT)
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run of a study came to.
+    """The result of a run of a study.
 
     Attributes:
         run: Its number in the study.
         outcome: How it ended.
-        reason: Why, if not by finishing.
+        reason: The reason, if it did not finish.
         figures: Name with unit -> value, as `run_figures` has them.
-        exceeded: Names of the signals that left their limits.
-        seconds: How long it took, building included.
+        exceeded: Names of the signals beyond their limits.
+        seconds: The elapsed time, including the build.
     """
 
     run: int
@@ -110,29 +110,29 @@ Batch = Sequence[tuple[int, Variation]]
 
 
 def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
-    """Text that is equal for scenarios which one closed loop simulates.
+    """Text that is equal for scenarios that the same closed loop can simulate.
 
-    They differ in what a context holds: start, parameters of the plant, numbers of gains that
-    couple no outputs, the seed; or in how they are run.
+    They may differ in the data of a context: start, parameters of the plant, uncoupled gains, seed;
+    or in the settings of the run.
     """
     return json.dumps(_built(data, base), sort_keys=True)
 
 
 def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's data where all that a context holds is as in the base of the study.
+    """A scenario's data with the data of a context taken from the base of the study.
 
-    So what is built does not depend on which run comes first.
+    So the loop does not depend on which run comes first.
     """
     own = dict(data)
     for key in ("description", "plant_parameters", "duration", "integrator", "write"):
         own[key] = base[key]
-    if plant_kind(own["plant"]).carries:  # It is built with its numbers.
+    if plant_kind(own["plant"]).carries:  # It is built with its own parameters.
         own["plant_parameters"] = data["plant_parameters"]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
     own["start"] = {**first, "positions": positions}
-    # Without any they are advised, by what is built; and a task is built with its numbers.
+    # Default gains depend on the built loop; and a task is built with its numbers.
     if own["gains"] and base["gains"] and not own["task"]:
         tag = own["gains"].get(TAG, "!Poles")
         if tag == base["gains"][TAG] != "!Matrices":
@@ -145,15 +145,15 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Runner:
-    """Simulates runs of a study, and keeps the closed loop as long as their structure is the same.
+    """Simulates runs of a study, and reuses the closed loop for equal structures.
 
     Attributes:
-        builds: How many loops it has built; Drake does not free all of each.
+        builds: The number of loops it has built; Drake does not free all of their memory.
 
     Args:
         base: The plain data of the study's scenario.
-        lasting: How long runs of one structure last together, in s, if they are rollouts; None if
-            Drake's Simulator runs them.
+        lasting: The total duration of runs of one structure, in s, for rollouts; None for Drake's
+            Simulator.
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
@@ -176,7 +176,9 @@ class Runner:
             self.builds += 1
             try:
                 if self._lasting is not None and built["task"]:
-                    raise ScenarioError(("task", "rollouts know no tasks: run it by Drake"))
+                    raise ScenarioError(
+                        ("task", ("rollouts do not support tasks: run it without --rollout"))
+                    )
                 self._built = build_completed(read_scenario(built))[1]
             except DrakeDaeError as error:
                 self._built = error
@@ -186,9 +188,9 @@ class Runner:
         return cast(ClosedLoop, self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
-        """What is wrong with the words of a variation; None if nothing is.
+        """The problem with the keys and values of a variation; None if there is none.
 
-        That a start is out of reach, or an assumption fails, is an outcome of a run.
+        A start out of reach or a violated assumption is an outcome of a run.
         """
         try:
             data = varied_data(self._base, variation)
@@ -208,12 +210,12 @@ class Runner:
         return None
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
-        """Simulates runs; each is told when it has ended."""
+        """Simulates runs; yields each result."""
         for number, variation in batch:
             began = time.perf_counter()
             try:
                 result = self._run(number, variation)
-            except Exception as error:  # A study of thousands goes on.
+            except Exception as error:  # A study of thousands of runs continues.
                 text = f"{type(error).__name__}: {brief(str(error))}"
                 result = RunResult(number, Outcome.CRASHED, text)
             yield RunResult(**{**vars(result), "seconds": time.perf_counter() - began})
@@ -223,7 +225,7 @@ class Runner:
             data = varied_data(self._base, variation)
             scenario = read_scenario(data)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # Each worker would tell the same.
+                warnings.simplefilter("ignore")  # Each worker would report the same.
                 loop = self.loop(data)
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
@@ -231,7 +233,7 @@ class Runner:
 
 
 def _is_about_states(error: BaseException | None) -> bool:
-    """Whether an error comes from states or assumptions, rather than from what a file says."""
+    """Whether an error comes from states or assumptions rather than from the file."""
     while error is not None:
         if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
             return True
@@ -242,7 +244,7 @@ def _is_about_states(error: BaseException | None) -> bool:
 def _simulated(
     number: int, scenario: Scenario, loop: ClosedLoop, lasting: float | None
 ) -> RunResult:
-    """What a run comes to, from a new context of the loop."""
+    """The result of a run, from a new context of the loop."""
     try:
         context = start_scenario(scenario, loop)
         with warnings.catch_warnings():
@@ -267,7 +269,7 @@ def _simulated(
 def _stepped(
     scenario: Scenario, loop: ClosedLoop, context: Context
 ) -> tuple[Record, int, SimulationError | None]:
-    """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
+    """A run by Drake's Simulator: its record, number of steps, and reason of failure."""
     steps, failure = 0, None
     try:
         run = simulate(
@@ -286,7 +288,7 @@ def _stepped(
 
 
 _ALONE = Lock()
-"""Threads of one process share what is built."""
+"""Threads of one process share the built loop."""
 
 
 def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
@@ -306,7 +308,7 @@ def _runner(base: str) -> Runner:
 
 
 def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
-    """How long the runs of one structure last together on average, in s of their time.
+    """The mean total duration of the runs of one structure, in s of simulated time.
 
     Args:
         base: The plain data of the study's scenario.
@@ -323,12 +325,12 @@ def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
 def batches(
     base: Mapping[str, Any], runs: Iterable[tuple[int, Variation]], workers: int
 ) -> list[Batch]:
-    """The runs by structure, in portions: a worker builds a loop once for each portion at most.
+    """The runs by structure, in portions: a worker builds at most one loop per portion.
 
     Args:
         base: The plain data of the study's scenario.
         runs: The runs.
-        workers: Among how many they are shared.
+        workers: The number of workers.
     """
     groups: dict[str, list[tuple[int, Variation]]] = {}
     for number, variation in runs:

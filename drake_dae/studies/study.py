@@ -1,4 +1,4 @@
-"""What the runs of a study came to, as a table and in words."""
+"""The results of a study, as a table and in words."""
 
 import csv
 import json
@@ -18,20 +18,20 @@ from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.studies.variations import Variation
 
 FILES = ("runs.csv", "summary.txt", "histograms.png", "map.png")
-"""What `Study.save` writes."""
+"""The files of `Study.save`."""
 
 MOST_REASONS = 5
-"""So many reasons of runs that did not finish are told."""
+"""The largest number of listed reasons of unfinished runs."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A study: its variations, and what each of them came to.
+    """A study: its variations and their results.
 
     Attributes:
         variations: For each run, dotted key of the scenario -> value.
-        results: For each run its outcome, its figures and the signals that left their limits.
+        results: For each run its outcome, its figures and the signals beyond their limits.
     """
 
     variations: tuple[Variation, ...]
@@ -61,7 +61,7 @@ class Study:
         return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
 
     def values(self, figure: str) -> FloatArray:
-        """A figure of every run, shape (number of runs,); nan where a run has none.
+        """A figure of every run, shape (number of runs,); nan if a run has none.
 
         Raises:
             ModelError: There is no such figure.
@@ -71,11 +71,11 @@ class Study:
         return np.array([result.figures.get(figure, np.nan) for result in self.results])
 
     def table(self) -> dict[str, list[Any]]:
-        """The whole study: name of a column -> its entries; None where a run has none.
+        """The whole study: name of a column -> its entries; None if a run has none.
 
         Columns are the number of the run, the keys that vary, the outcome with its reason, the
-        signals that left their limits, and the figures. It is the same whoever ran it, and however
-        often it was interrupted.
+        signals beyond their limits, and the figures. It does not depend on who ran it or on
+        interruptions.
         """
         return {
             "run": [result.run for result in self.results],
@@ -128,8 +128,8 @@ class Study:
             parts.append([*shown, f"and {more} more, see runs.csv"] if more else shown)
         beyond = Counter(name for result in self.results for name in result.exceeded)
         if beyond:
-            told = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
-            parts.append([f"beyond their limits: {', '.join(told)}"])
+            counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
+            parts.append([f"beyond their limits: {', '.join(counted)}"])
         if self.figures:
             head = ["figure", "least", "at run", "median", "largest", "at run"]
             parts.append(Table(head, [self._row(name) for name in self.figures]))
@@ -154,5 +154,5 @@ def _counts(results: Sequence[RunResult]) -> str:
 
 
 def _cell(entry: Any) -> Any:
-    """Lists and tags as JSON, all else as it is."""
+    """Lists and tags as JSON, other values unchanged."""
     return json.dumps(entry) if isinstance(entry, (dict, list)) else entry

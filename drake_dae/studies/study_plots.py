@@ -1,4 +1,4 @@
-"""Pictures of a study: how its figures are spread, and how they depend on two keys."""
+"""Plots of a study: the distribution of its figures, and their dependence on two keys."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.studies.runs import Outcome
 
 MOST_PLOTS = 24
-"""A picture has no more figures than these, the first ones that vary."""
+"""The largest number of figures in a plot, the first ones that vary."""
 
 
 def save_study_plots(

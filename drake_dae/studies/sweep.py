@@ -27,7 +27,7 @@ from drake_dae.studies.study import Study
 from drake_dae.studies.variations import MOST_RUNS, Variation, plain
 
 MOST_PROBLEMS = 10
-"""So many wrong values are told at once."""
+"""The largest number of wrong values that are reported together."""
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -74,7 +74,7 @@ def sweep(
         ModelError: The file belongs to another study, or cannot be written; processes or cluster
             cannot be used.
     """
-    with suppress(ScenarioError):  # Each run tells it, or has other values.
+    with suppress(ScenarioError):  # It is reported by each run, which may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
     chosen = [{key: plain(key, value) for key, value in changes.items()} for changes in variations]

@@ -80,8 +80,8 @@ def listed_variations(values: Mapping[str, Any]) -> list[Variation]:
     columns = {key: _values(key, given) for key, given in values.items()}
     counts = {key: len(column) for key, column in columns.items()}
     if len(set(counts.values())) > 1:
-        told = ", ".join(f"{key} has {count}" for key, count in counts.items())
-        raise _error(f"keys that vary together need as many values each; {told}")
+        counted = ", ".join(f"{key} has {count}" for key, count in counts.items())
+        raise _error(f"keys that vary together need as many values each; {counted}")
     return [
         dict(zip(columns, chosen, strict=True)) for chosen in zip(*columns.values(), strict=True)
     ]

@@ -69,7 +69,7 @@ def open_cache(create: bool = False) -> Path | None:
             return None
         raise MachineCodeError(_told(folder, error)) from None
     if not stat.S_ISDIR(found.st_mode):
-        raise MachineCodeError(f"the cache {folder} is no folder; take it away")
+        raise MachineCodeError(f"the cache {folder} is no folder; remove it")
     if found.st_uid != os.getuid():
         raise MachineCodeError(
             f"the cache {folder} belongs to another user (id {found.st_uid}), whose code is not "

@@ -145,8 +145,8 @@ def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
     """
     if any(word.startswith(("-march", "-mcpu")) for word in command):
         return (), ""
-    told = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
-    return ((NATIVE,), told.stdout) if told.returncode == 0 else ((), "")
+    answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
+    return ((NATIVE,), answer.stdout) if answer.returncode == 0 else ((), "")
 
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":

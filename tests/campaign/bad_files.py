@@ -429,7 +429,7 @@ SETTINGS = (
     *("gains={all: [-2000]}", "sampling={period: 0.002, delay: 0.003}", "compiled=false"),
     *("constraints.0.rpy=[1.0e+9, 0, 0]", "constraints.0.name=link1", "robot.base={weld: world}"),
     *("outputs.0.frame=world", "outputs=[{joints: [joint1, joint1]}]", "tool_axis=free"),
-    *("plant_pushes=[{frame: tool, force: [1.0e+300, 0, 0], start_time: 2, end_time: 1}]",),
+    *("plant_disturbances=[{frame: tool, force: [1.0e+300, 0, 0], start_time: 2, end_time: 1}]",),
     *("plant_payloads=[{frame: tool, mass: -1}]", "force=!MeasuredForce {seed: -1}"),
     *("tolerances={outputs: {tool.z: 1.0e-300}}", "integral=[wall.force]", "compliances={}"),
     *(

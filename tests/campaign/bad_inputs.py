@@ -107,8 +107,9 @@ def attempt(seed: int, folder: Path) -> Outcome:
 
 
 def _is_exact(scenario: Scenario) -> bool:
-    """Whether the plant is what the law's model says, so that (30) and (31) hold."""
-    return not (scenario.plant_parameters or scenario.force_feedback.is_measured)
+    """Whether the plant is what the law's model says, at all times, so that (30) and (31) hold."""
+    measured = scenario.force_feedback.is_measured or scenario.sampling is not None
+    return not (scenario.plant_parameters or measured)
 
 
 # One mistake each, and why what it makes may run.
@@ -165,7 +166,7 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     return ""
 
 
-_OR_NOTHING = ("gains", "integral", "observer", "task", "forces", "effort_limit")
+_OR_NOTHING = ("gains", "integral", "observer", "task", "forces", "effort_limit", "friction")
 """Keys that may hold nothing."""
 
 

@@ -23,7 +23,7 @@ from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The default scenario, as `make demo` runs it but for its length."""
+    """The default scenario, as `make demo` runs it except for its length."""
     folder = tmp_path_factory.mktemp("demo") / "run"
     process = command("simulate", "--out", folder, "--set", "duration=2")
     out, err = process.communicate(timeout=60)
@@ -178,7 +178,7 @@ def test_open_shows_the_animation_at_the_end(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert main([*short, *QUICK, "--out", str(tmp_path), "--open"]) == 1
     assert error_line(capsys) == (
-        "error: write.animation: --open shows the animation: leave it true"
+        "error: write.animation: --open shows the animation, so write.animation must be true"
     )
     assert len(opened) == 1
 
@@ -305,7 +305,7 @@ def test_a_reader_that_has_enough():
 
 
 @pytest.mark.slow
-def test_meshcat_tells_where_and_asks_drake_for_real_time(tmp_path, capsys):
+def test_meshcat_reports_where_and_asks_drake_for_real_time(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
     assert main([*arguments, "--set", "duration=0.1"]) == 0
     captured = capsys.readouterr()

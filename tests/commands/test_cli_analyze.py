@@ -127,7 +127,7 @@ def test_a_reference_that_leaves_the_workspace(capsys):
     found = find_feasibility(scenario("two_link_wall", move)).analysis.motion
     assert found.ending.time == pytest.approx(when, abs=1e-4)
     assert found.times[-1] < when < found.times[-1] + 0.01
-    # On the way there, what is beyond the limits is told as well.
+    # On the way there, exceeded limits are reported as well.
     assert re.search(r"PROBLEM  joint2_w goes from .* its limits are -3 and 3, left at 0\.0", text)
 
 
@@ -166,7 +166,7 @@ def test_times_follow_a_reference_that_even_times_would_not_see(periods):
 
 
 @pytest.mark.slow
-def test_times_that_do_not_suffice_are_told():
+def test_times_that_do_not_suffice_are_reported():
     wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
     times, is_resolved = module.sample_times(wanted, 0.0, 100.0)
     assert not is_resolved
@@ -302,7 +302,7 @@ def test_states_have_units(capsys):
     )
 
 
-def test_help_tells_the_exit_codes(capsys):
+def test_help_reports_the_exit_codes(capsys):
     with pytest.raises(SystemExit) as caught:
         main(["analyze", "--help"])
     assert caught.value.code == 0

@@ -47,7 +47,7 @@ MISSED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reason", MISSED)
-def test_a_run_that_missed_its_task_is_told_by_code_and_json(reason, tmp_path, capsys):
+def test_a_run_that_missed_its_task_is_reported_by_code_and_json(reason, tmp_path, capsys):
     run = ["simulate", "two_link_wall", "--json", *BARE, *MISSED[reason]]
     code, found = told([*run, "--check", f"--out={tmp_path / 'one'}"], capsys)
     assert (code, found["missed"]) == (2, True)
@@ -58,7 +58,7 @@ def test_a_run_that_missed_its_task_is_told_by_code_and_json(reason, tmp_path, c
     assert (code, again["missed"]) == (0, True)
 
 
-def test_a_run_that_did_its_task_is_told_with_figures_and_files(tmp_path, capsys):
+def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--json", "--check", *QUICK, f"--out={tmp_path}"]
     code, found = told(arguments, capsys)
     assert code == 0

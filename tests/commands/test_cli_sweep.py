@@ -47,7 +47,7 @@ def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsy
         (["--vary", "plant_parameters.a=1"], "plant_parameters: two_link_arm: no parameter 'a'"),
     ],
 )
-def test_what_is_wrong_is_told_before_anything_runs(options, line, tmp_path, capsys):
+def test_errors_are_reported_before_anything_runs(options, line, tmp_path, capsys):
     folder = tmp_path / "out"
     assert main(["sweep", "two_link_wall", *options, *SHORT, "--out", str(folder)]) == 1
     (said,) = capsys.readouterr().err.splitlines()

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -15,7 +16,7 @@ from runs import run_scenario, scenario
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands.run_folder import FILES, PART
-from drake_dae.running.rollout.course import Course
+from drake_dae.running.rollout.stepping.course import Course
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
@@ -195,3 +196,28 @@ def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys)
     assert 1 < part.time.size < whole.time.size
     for name in whole.signals:
         np.testing.assert_allclose(part[name], whole[name][: part.time.size], rtol=0.0, atol=1e-12)
+
+
+LOADING = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name.startswith("pydrake.common."):
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.{sent})
+
+sys.meta_path.insert(0, Interrupting())
+from drake_dae.cli import main
+assert "pydrake" not in sys.modules
+sys.exit(main(["film", "nowhere"]))
+"""
+
+
+@pytest.mark.usefixtures("signals_of_a_shell")
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
+def test_a_signal_waits_while_drake_is_loaded(sent):
+    """Its modules make an ImportError of a KeyboardInterrupt, and the command ended with that."""
+    words = [sys.executable, "-c", LOADING.format(sent=sent)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (128 + signal.Signals[sent], "interrupted\n")

@@ -23,7 +23,7 @@ def test_two_runs_into_one_folder(tmp_path):
     with run_folder(tmp_path / "run"):
         (tmp_path / "run" / SCENARIO).write_text(f"{MARK}\nof the first")
         with (
-            pytest.raises(ModelError, match=r"another run writes to .*run'; wait"),
+            pytest.raises(ModelError, match="another run"),
             run_folder(tmp_path / "run"),
         ):
             pass
@@ -88,7 +88,7 @@ def test_an_empty_scenario_is_no_proof_of_an_earlier_run(tmp_path):
     with run_folder(tmp_path):
         pass
     (tmp_path / "controls.png").write_text("mine")
-    refused = pytest.raises(ModelError, match=r"holds scenario\.yaml, controls\.png, not from")
+    refused = pytest.raises(ModelError, match=r"controls\.png")
     with refused, run_folder(tmp_path):
         pass
     assert (tmp_path / "controls.png").read_text() == "mine"

@@ -13,7 +13,7 @@ from drake_dae.compiler.compile import compile_diagram
 
 @pytest.mark.parametrize("leads_to", ["row", "rate", "update"])
 @pytest.mark.parametrize(("u", "is_of_use"), [(0.5, True), (-0.5, False)])
-def test_what_is_of_no_use_is_told_wherever_it_leads(leads_to, u, is_of_use):
+def test_useless_values_are_reported_wherever_they_lead(leads_to, u, is_of_use):
     """To an output, a derivative or an update, through a block that takes it twice."""
     builder = DiagramBuilder()
     guarded, adder = builder.AddSystem(Guarded()), builder.AddSystem(Adder(2, 1))

@@ -263,7 +263,9 @@ def test_the_inverse_holds_no_unknown_whose_slope_cancels():
 
 
 @pytest.mark.parametrize("angle", [1.0, 0.3, -1e-3, 1e-13, 0.0])
-def test_the_inverse_tells_where_constraint_inputs_that_no_control_moves_are_not_determined(angle):
+def test_the_inverse_reports_where_constraint_inputs_that_no_control_moves_are_not_determined(
+    angle,
+):
     """A has the columns (1, 0) and (cos a, sin a): its pivot is |sin a|. v is of the state alone,
 
     v_2 = -w_2 / sin a and v_1 = -w_1 - cos a v_2, and u = wanted - v_1 - 2 v_2 needs it.

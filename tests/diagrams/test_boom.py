@@ -84,7 +84,7 @@ def test_the_actuator_pushes_as_lagrange_says_and_the_prediction_is_kept():
 
 
 @pytest.mark.slow
-def test_limits_of_the_actuator_are_told_before_it_runs():
+def test_limits_of_the_actuator_are_reported_before_it_runs():
     report = find_feasibility(scenario(NAME, "constraints.0.upper=1.05", "duration=6"))
     assert any("actuator.travel goes from" in problem for problem in report.problems)
     assert not find_feasibility(scenario(NAME, "duration=6")).problems
@@ -117,7 +117,7 @@ def test_its_loop_state_has_gradients():
 
 
 def test_without_a_motor_nothing_drives_it():
-    with pytest.raises(ScenarioError, match=r"no joint of .* is driven"):
+    with pytest.raises(ScenarioError, match="driven"):
         build_scenario(
             scenario(NAME, "constraints.0.motor=false", "constraints.0.effort_limit=null")
         )

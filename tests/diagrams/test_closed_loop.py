@@ -57,7 +57,7 @@ def test_references_come_in_order_by_name_or_from_a_system(references):
     np.testing.assert_allclose(loop.reference.reference(0.7), wanted, rtol=1e-14)
 
 
-def test_a_system_that_needs_more_than_the_time_is_told_where_it_goes():
+def test_a_system_that_needs_more_than_the_time_is_reported_where_it_goes():
     plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
     for planner in (Integrator(4), [Integrator(4)]):
         with pytest.raises((ReferenceSignalError, WiringError), match="reference"):

@@ -338,7 +338,7 @@ def test_what_is_free_moves_in_the_animation(name, body):
         ),
     ],
 )
-def test_what_does_not_fit_is_told_with_its_key(name, setting, words):
+def test_what_does_not_fit_is_reported_with_its_key(name, setting, words):
     with pytest.raises(ScenarioError) as caught:
         build_scenario(scenario(name, setting))
     message = str(caught.value)

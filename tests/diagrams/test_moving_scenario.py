@@ -80,6 +80,6 @@ def test_the_analysis_knows_what_moves():
         ),
     ],
 )
-def test_wrong_signals_are_told_with_their_key(setting, message):
+def test_wrong_signals_are_reported_with_their_key(setting, message):
     with pytest.raises(ScenarioError, match=message):
         build_scenario(scenario(setting))

@@ -90,7 +90,7 @@ def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summar
         main(["simulate", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "run"), *options])
         == 0
     )
-    told = "wall: HeightMap 'bump.csv': the surface is off the data by "
+    told = "wall: HeightMap 'bump.csv': the largest and rms distances"
     assert told in capsys.readouterr().out
     text = (tmp_path / "run" / "summary.txt").read_text()
     assert told in text
@@ -103,7 +103,7 @@ def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summar
     assert load_scenario(tmp_path / "run" / "again.yaml") == again
 
 
-def test_where_the_robot_leaves_the_data_is_told(tmp_path):
+def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     """The tool starts 5 cm above its reference z = 0.3, and this map ends at z = 0.34."""
     bump(tmp_path)
     file = json.dumps(str(tmp_path / "bump.csv"))
@@ -112,7 +112,7 @@ def test_where_the_robot_leaves_the_data_is_told(tmp_path):
     loop, _, record = run_scenario(scenario("two_link_wall", surface, *SHORT, "duration=0.02"))
     _, told = surface_remarks(loop.plant.model, record)
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
-    assert "1 mm, first at 0 s; there a plane goes on" in told
+    assert "1 mm, first at 0 s; there the surface continues as a plane" in told
 
 
 def test_a_mesh_in_a_scenario(tmp_path):
@@ -143,7 +143,7 @@ def test_a_mesh_in_a_scenario(tmp_path):
         ("!MeshSurface {file: a.obj, normal: up}", ".normal", "expected 3 numbers"),
     ],
 )
-def test_wrong_surfaces_are_told_at_their_key(surface, key, words):
+def test_wrong_surfaces_are_reported_at_their_key(surface, key, words):
     with pytest.raises(ScenarioError) as caught:
         scenario("two_link_wall", f"constraints.0.surface={surface}")
     ((found, _),) = [p for p in caught.value.problems if words in p[1]]
@@ -152,7 +152,7 @@ def test_wrong_surfaces_are_told_at_their_key(surface, key, words):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scale", "is_told"), [(1.0, True), (1e-3, False), (1e-2, False)])
-def test_a_mesh_that_seems_to_be_in_millimetres_is_told(scale, is_told, tmp_path):
+def test_a_mesh_that_seems_to_be_in_millimetres_is_reported(scale, is_told, tmp_path):
     """A sheet of 400 by 400 units, and an arm of 1.5 m."""
     rows = [f"v {x} {y} 0" for x in (0, 400) for y in (0, 400)]
     (tmp_path / "sheet.obj").write_text("\n".join([*rows, "f 1 3 4", "f 1 4 2\n"]))

@@ -54,7 +54,7 @@ def left_behind(force):
 
 
 @PLANTS
-def test_push_leaves_the_error_of_statics(plant):
+def test_a_disturbance_leaves_the_error_of_statics(plant):
     """A push of 5 N up the wall; second order in the error, 4e-3 m beside a metre, is left out.
 
     It is smooth over 10 ms, and 0.5 s later the poles at -25 1/s have left 5e-5 of it.
@@ -102,7 +102,7 @@ def test_contact_has_the_masses_of_its_own():
 
 
 def test_surface_may_be_tilted():
-    """The force is along the normal that is turned, where nothing rubs."""
+    """The force is along the normal that is turned, where there is no friction."""
     turned = [0.0, 0.05, 0.0]
     found = two_link(
         *CONTACT,
@@ -116,7 +116,7 @@ def test_surface_may_be_tilted():
     assert_allclose(force / np.linalg.norm(force), normal, atol=1e-9)
 
 
-def test_push_grows_and_fades_smoothly():
+def test_a_disturbance_grows_and_fades_smoothly():
     push = DisturbanceForce("tool", (0.0, 0.0, 10.0), 1.0, 2.0, 0.2)
     rows = push.reference.derivatives([0, 0, 0])
     for time, share in ((0.0, 0.0), (1.05, 3 / 16 - 2 / 64), (1.1, 0.5), (1.5, 1.0), (2.1, 0.5)):
@@ -176,6 +176,6 @@ def test_rollouts_have_what_the_law_does_not_know(unknown):
     assert_allclose(found["state"][-1], record["state"][-1], atol=1e-6)
 
 
-def test_push_that_ends_before_it_begins_is_refused():
-    with pytest.raises(ModelError, match="must end after it begins"):
+def test_a_disturbance_that_ends_before_it_begins_is_refused():
+    with pytest.raises(ModelError, match="end_time"):
         DisturbanceForce("tool", (1.0, 0.0, 0.0), 2.0, 1.0)

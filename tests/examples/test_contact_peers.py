@@ -75,7 +75,7 @@ def test_goals_in_joints_are_the_task(robot):
     # Differences of second order of functions with derivatives of about one.
     assert_allclose((after.q - before.q) / 2e-4, now.v, atol=1e-7)
     assert_allclose((after.v - before.v) / 2e-4, now.acceleration_of_joints, atol=1e-7)
-    # The wall pushes back and rubs against the motion.
+    # The wall pushes back, with friction against the motion.
     assert_allclose(now.contact @ NORMAL, now.force, rtol=1e-12)
     along = now.velocity[1:3] / np.linalg.norm(now.velocity[1:3])
     assert_allclose(now.contact[1:], -FRICTION * now.force * along, rtol=1e-3)
@@ -151,7 +151,7 @@ def _name(law: type) -> str:
     return next(name for name, one in LAWS.items() if one is law)
 
 
-def test_table_tells_what_is_lost_and_what_is_better():
+def test_table_reports_what_is_lost_and_what_is_better():
     good, bad = Figures(0.01, 0.02, 0.3, 0.0), Figures(0.5, 0.004, 0.2, 0.0)
     titles = [condition.title for condition in CONDITIONS]
     rows = [

@@ -67,7 +67,7 @@ def test_projection_is_that_of_drakes_camera():
     assert middle[1, 1] < middle[0, 1]  # What is higher is seen higher: rows count down.
 
 
-def test_what_cannot_be_filmed_is_told(tmp_path, capsys):
+def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
     with pytest.raises(ModelError, match=r"a \.gif, a strip of pictures a \.png, got 'x\.mp4'"):
         save_film(*recorded("two_link_wall", "duration=0.01"), "x.mp4")
     assert main(["film", str(tmp_path)]) == 1

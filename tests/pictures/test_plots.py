@@ -237,7 +237,7 @@ def test_a_single_moment_can_be_drawn(tmp_path):
 
 
 def test_the_moment_of_a_change_shows_the_phase_before_it():
-    """As a sample there does: the phase that begins is told from the next one on."""
+    """As a sample there does: the phase that begins is known from the next one on."""
     names = ("0 Approach", "1 Press", "2 Release")
     run = Record(
         np.arange(6.0),

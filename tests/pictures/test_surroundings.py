@@ -1,10 +1,14 @@
 """What robots touch, as it is drawn: once, around the whole run, with all of the robot in sight."""
 
+import re
+import shutil
+import subprocess
 from functools import cache
 
 import numpy as np
 import pytest
 
+from drake_dae.pictures.animation import animate
 from drake_dae.pictures.course import contact_paths, follow, run_extent
 from drake_dae.pictures.plots import plot_paths
 from drake_dae.pictures.surroundings import surroundings
@@ -82,3 +86,20 @@ def test_paths_are_seen_from_the_free_side(name):
     axis = plot_paths([path]).axes[0]
     to_pixels = axis.transData.transform(path.actual)[:, 0]
     assert np.sign(to_pixels[-1] - to_pixels[0]) == np.sign(across[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs a browser")
+@pytest.mark.parametrize("size", ["1200,800", "500,360"])
+def test_the_title_of_a_page_is_above_the_scene_and_not_on_it(size, tmp_path):
+    run, loop = course("two_link_wall", "duration=0.1")
+    page = tmp_path / "page.html"
+    page.write_text(animate(run, loop.scene_graph, 8 * "a long title ", []))
+    words = "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run"
+    command = ["chromium", *words.split(), f"--window-size={size}", "--virtual-time-budget=3000"]
+    command += [f"--user-data-dir={tmp_path}/user", "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    (style,) = re.findall(r'id="meshcat-pane"[^>]*style="([^"]*)"', done.stdout)
+    (top,) = re.findall(r"top: (\d+)px", style)
+    assert int(top) > 60  # Three lines or more.

@@ -76,7 +76,7 @@ def test_a_force_acts_as_drake_applies_it():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("actuation", [(), (FlexibleJoints(5000.0, inertia=0.5),)])
-def test_a_law_that_knows_a_push_is_not_moved_by_it(actuation):
+def test_a_law_that_knows_a_force_compensates_it(actuation):
     """Errors off (30) by the accuracy of 1e-10; a law that does not know it is 1 cm off."""
     push = ExpressionReference(lambda t: [20 * t**5 / (1 + t**5), 0, 10 * t**5 / (1 + t**5)])
     model = pushed(["push.force"], actuation=actuation)

@@ -5,10 +5,20 @@ import pytest
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from runs import scenario
 
-from drake_dae import Cylinder, JointPositions, Plane, PointOnSurface, RobotModel, Sphere
-from drake_dae.robots.clearances import links_behind
+from drake_dae import (
+    Cylinder,
+    JointPositions,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    Sphere,
+    shipped_model,
+)
+from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.shapes import LinkShapes, collisions
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 BASE, LENGTH, RADIUS = 0.3, 0.5, 0.06
 JOINTS = 4
@@ -159,3 +169,22 @@ def test_a_robot_without_shapes_has_none():
     bare = LinkShapes(model, None)
     assert not bare
     assert collisions(bare, np.zeros(1), np.zeros((1, 8))) == ()
+
+
+@pytest.mark.slow
+def test_analyze_tells_of_shapes_before_a_run(tmp_path):
+    """The first link ends at cos 1.2 or so, before a wall at 1.2 m; its ball is 0.95 m large."""
+    text = shipped_model("two_link_arm.urdf").read_text()
+    ball = (
+        '<collision><origin xyz="1 0 0"/><geometry><sphere radius="0.95"/></geometry></collision>'
+    )
+    (tmp_path / "ball.urdf").write_text(
+        text.replace('<link name="link1">', f'<link name="link1">{ball}')
+    )
+    robot = f"robot={{file: {tmp_path / 'ball.urdf'}}}"
+    found = find_feasibility(scenario("two_link_wall", robot, "duration=0.5"))
+    (told,) = [one for one in found.behind if isinstance(one, LinkBehind)]
+    elbow = np.cos(found.analysis.motion.states[:, 0]).max()
+    assert told.link == "link1"
+    assert told.depth == pytest.approx(elbow + 0.95 - 1.2, abs=1e-3)
+    assert any("link1 is behind the surface of 'wall'" in text for text in found.problems)

@@ -34,7 +34,7 @@ def chosen(found: Scenario) -> Scenario:
     return build_completed(found)[0].scenario
 
 
-def test_what_is_left_out_is_advised_and_told():
+def test_what_is_left_out_is_advised_and_reported():
     found = two_link("constraints.0.friction=0.0")
     completed, loop = build_completed(found)
     assert len(completed.notes) == 1
@@ -73,14 +73,14 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
 
 
 @pytest.mark.slow
-def test_run_tells_its_advice_and_what_it_identified(tmp_path, capsys):
+def test_run_reports_its_advice_and_what_it_identified(tmp_path, capsys):
     out = tmp_path / "run"
     write = "write={record: false, plots: false, animation: false}"
     command = ["simulate", "wall_point_contact", "--out", str(out)]
     assert main([*command, "--set", "duration=0.01", "--set", write]) == 0
-    assert "advised for a contact of 1e+05 N/m" in capsys.readouterr().out
+    assert "recommended for a contact of 1e+05 N/m" in capsys.readouterr().out
     told = (out / "summary.txt").read_text()
-    assert "advised for a contact of 1e+05 N/m" in told
+    assert "recommended for a contact of 1e+05 N/m" in told
     assert "identified           wall.friction = " in told
     assert load_scenario(out / "scenario.yaml").observer.identify_friction == ["wall"]
 
@@ -101,9 +101,7 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
 
 def test_nothing_is_advised_behind_springs():
     found = two_link("actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]")
-    with pytest.raises(
-        ScenarioError, match=r"gains: behind springs, .* nothing is advised"
-    ) as told:
+    with pytest.raises(ScenarioError, match=r"gains: .* springs") as told:
         build_completed(found)
     assert "wall_flexible_contact" in str(told.value)
 

@@ -294,7 +294,7 @@ def test_refused_with_key_value_and_remedy(settings, words):
     assert [word for word in words if word not in message] == [], message
 
 
-def test_all_problems_are_told_at_once():
+def test_all_problems_are_reported_at_once():
     """Also below a wrong key, in several entries of a list, and beside a missing key."""
     message = refusal(
         "outputs.0.axs=z",

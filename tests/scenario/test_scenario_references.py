@@ -118,14 +118,14 @@ def refusal(form):
         ),
     ],
 )
-def test_what_is_wrong_is_told_with_its_key(form, message):
+def test_what_is_wrong_is_reported_with_its_key(form, message):
     found = refusal(form)
     assert found.startswith("references.tool.z")
     assert message in found
 
 
 @pytest.mark.slow
-def test_a_robot_follows_what_a_file_tells(tmp_path):
+def test_a_robot_follows_the_reference_of_a_file(tmp_path):
     """The file lies beside the scenario. The law's model is exact: accuracy 1e-8 leaves 1e-7."""
     times = np.arange(0.0, 1.01, 0.05)
     lines = [f"{t},{0.3 + 0.1 * np.sin(2 * t)},{20 + 5 * t}" for t in times]
@@ -145,7 +145,7 @@ def test_a_robot_follows_what_a_file_tells(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_writing_arm_writes_a_letter_and_presses_as_told():
+def test_the_writing_arm_writes_a_letter_with_the_given_force():
     """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
 
     Double poles at -4 leave 0.1 of 0.03 m when it begins at 1.5 s, and 0.2 mm 1.5 s later.

@@ -14,6 +14,6 @@ def test_a_model_is_found_by_its_name():
     assert plant.GetModelInstanceName(arm) == "two_link_arm"
 
 
-def test_a_name_that_is_none_is_told_with_those_that_are():
+def test_a_name_that_is_none_is_reported_with_those_that_are():
     with pytest.raises(ModelError, match=r"did you mean 'two_link_arm\.urdf'\? .*biped\.urdf"):
         shipped_model("two_link_arm")

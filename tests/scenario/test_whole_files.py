@@ -179,7 +179,7 @@ def test_a_loop_that_cannot_be_cut_says_what_to_do(tmp_path):
     model = f'<sdf version="1.8"><model name="m">{links}{joints}</model></sdf>'
     (tmp_path / "press.sdf").write_text(model)
     (tmp_path / "mine.yaml").write_text(PRESS)
-    with pytest.raises(ScenarioError, match="joint 'three' closes a loop, and neither turns nor"):
+    with pytest.raises(ScenarioError, match="'three' closes a loop"):
         scenario_model(load_scenario(tmp_path / "mine.yaml"))
 
 

@@ -11,6 +11,7 @@ from drake_dae.arrays import show_state
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.simulation.divergence import RecordWatch
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
 
@@ -64,7 +65,7 @@ def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings,
     assert grew in text
     assert "may_diverge" in text
     assert "gains" in text
-    # Far before numbers end: what is told can be read.
+    # Far before numbers end: the reported numbers can be read.
     assert np.isfinite(caught.value.state).all()
     assert caught.value.time < 1.0
 
@@ -169,6 +170,35 @@ def test_a_start_far_away_is_no_divergence():
     assert state == pytest.approx(1.0, abs=1e-5)
 
 
-def test_a_state_that_left_all_measure_is_told_by_its_size():
+def test_a_diverged_state_is_reported_by_its_size():
     assert show_state([1.0, -0.25]) == "[ 1.  , -0.25]"
     assert show_state([1.0, -3e192, np.inf]) == "grown to 3e+192"
+
+
+def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
+    """z = x_1 is held while x_2 = tan t: just before pi / 2 it is 1e3, and u = -x_2^4 is -1e12."""
+    system = DaeSystem.from_functions(
+        ["a", "b"],
+        f=lambda x: [x[1] ** 4, x[1] ** 2 + 1.0],
+        h=lambda x: [1, 0],
+        l=lambda x: [x[0]],
+        state_scale=[1.0, 1e3],
+        name="escape",
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonMinimumPhaseWarning)
+        law = TrackingLaw(system, poles(-2.0))
+        loop = make_closed_loop(DaePlant(system), law, {"z0": 1.0})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [1.0, 0.0])
+    duration = np.pi / 2 - 1e-3
+    with pytest.raises(SimulationError, match=r"the run diverges: at t = .* u0 is .* large in use"):
+        simulate(loop.diagram, context, duration)
+    loop.set_state(context, [1.0, 0.0])
+    simulate(loop.diagram, context, duration, may_diverge=True)
+    record = loop.record(context)
+    assert np.max(np.abs(record["tracking_error"])) < 10.0
+    with pytest.raises(SimulationError, match="u0 is") as caught:
+        RecordWatch(loop.plant, duration).look(record)
+    first = np.argmax(np.abs(record["control"]) > 1e9)
+    assert caught.value.time == record.time[first]

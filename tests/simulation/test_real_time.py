@@ -1,4 +1,4 @@
-"""What is told before a run that cannot keep up with the clock."""
+"""The warning before a run that cannot keep up with the clock."""
 
 import time
 
@@ -52,7 +52,7 @@ def test_a_run_that_fails_or_is_too_short_has_none(fails, duration):
 
 
 @pytest.mark.slow
-def test_it_is_told_before_the_run(tmp_path, monkeypatch, capsys):
+def test_it_is_reported_before_the_run(tmp_path, monkeypatch, capsys):
     wanted = ["--set", "integrator.target_realtime_rate=2", "--set", "duration=0.1"]
     writes = [w for key in ("plots", "animation") for w in ("--set", f"write.{key}=false")]
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *wanted, *writes]

@@ -62,7 +62,7 @@ def test_every_figure():
         ["tool.z", "m", "0.05", "0.0625", "0.001", "0.00025"],
         ["axis.y", "1", "0", "0", "0", "0"],
     ]
-    assert "off prediction by: the largest distance from the error that theory predicts" in text
+    assert "off prediction by: the largest deviation from the predicted error" in text
     assert table(text, "constraint force  unit") == [["wall.force", "N", "15.25", "25"]]
     assert table(text, "control") == [
         ["motor1", "N", "m", "-7.25", "2.5", "10"],
@@ -215,8 +215,8 @@ def test_what_no_robot_would_do_is_in_the_verdict():
     pulling = ([[20.0], [-0.5], [15.25]], [("wall.force", "N")])
     limits = Limits(np.array([7.0, 40.0]), (np.array([-1.0, -2.0]), np.array([0.4, 3.0])))
     text = verdict(summary(record(constraint_force=pulling, **EXACT), PREDICTED, limits))
-    assert "But wall.force would have to pull, and a contact cannot; motor1 would" in text
-    assert text.endswith("give more than the limit; q would leave the joint limits.")
+    assert "But wall.force would have to pull, which a contact cannot; motor1 would" in text
+    assert text.endswith("exceed the limits; q would leave the joint limits.")
 
 
 def test_without_contact():
@@ -243,7 +243,7 @@ def test_limits_of_a_robot():
     np.testing.assert_array_equal(limits.state[1], [3.1416, 2.7925, 3.0, 3.0])
 
 
-def test_what_can_only_push_is_told_by_the_constraints():
+def test_constraints_determine_which_forces_are_unilateral():
     wall, grasp = (Limits.of(model) for model in (arm("two_link").model, two_arms()))
     (force,) = arm("two_link").model.dae.constraint_input_signals
     assert not wall.can_pull(force)
@@ -260,7 +260,7 @@ def test_limits_of_a_textbook_robot():
     assert limits.state is None
 
 
-def test_a_contact_that_is_open_before_the_run_begins_is_told_by_its_first_step():
+def test_a_contact_that_is_open_before_the_run_begins_is_reported_by_its_first_step():
     """The mode of a sample is that of the step that it ends; the first one ends none."""
     run = record(
         mode=([[0.0], [0.0], [1.0]], [("wall.mode", "")]),
@@ -274,5 +274,5 @@ def test_a_contact_that_is_open_before_the_run_begins_is_told_by_its_first_step(
         mode=([[0.0], [1.0], [1.0]], [("wall.mode", "")]),
         gap=([[0.0], [0.0], [0.0]], [("wall.gap", "m")]),
     )
-    assert contact_notes(closed)[1] == ("wall", "closed all the time")
+    assert contact_notes(closed)[1] == ("wall", "always closed")
     assert open_spans(closed) == []

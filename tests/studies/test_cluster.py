@@ -45,5 +45,5 @@ def test_where_no_scheduler_answers_it_says_so(address, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("drake_dae.studies.cluster.WAIT", 0.2)
     chosen = scenario("two_link_wall", "duration=0.5", "compiled=false")
-    with pytest.raises(ModelError, match="no Dask scheduler answers at"):
+    with pytest.raises(ModelError, match="Dask scheduler"):
         dd.sweep(chosen, [{}], tmp_path / "runs.jsonl", cluster=address)

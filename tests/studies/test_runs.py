@@ -161,7 +161,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
 TOLERANCES = "tolerances={outputs: {tool.z: 1.0}}"
 
 
-def test_what_no_rollout_has_is_told_with_a_remedy():
+def test_what_no_rollout_has_is_reported_with_a_remedy():
     base = scenario_data(scenario("two_link_wall", *SHORT, TOLERANCES))
     assert Runner(base).why_not({}) is None
     assert "run the loop by simulate" in str(Runner(base, 1.0).why_not({}))

@@ -251,7 +251,7 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
         ([{"plant_parameters.wall.position": [1.0, 2.0]}], "wall.position' has 3 entries"),
     ],
 )
-def test_what_cannot_be_is_told_before_anything_runs(variations, words, tmp_path):
+def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_path):
     file = tmp_path / "new" / "runs.jsonl"
     with pytest.raises(ScenarioError, match=words):
         dd.sweep(chosen(), variations, file)

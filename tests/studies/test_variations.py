@@ -59,9 +59,9 @@ def test_random_values_are_even():
 @pytest.mark.parametrize("low", [-1e308, -9e307])
 def test_a_range_that_no_number_measures_is_refused(low):
     for text, count in ((f"start.errors.tool.z={low}..{-low}:3", None), (f"a={low}..{-low}", 5)):
-        with pytest.raises(ScenarioError, match="is wider than the largest number"):
+        with pytest.raises(ScenarioError, match="wider"):
             parse_variations([text], scenario("two_link_wall"), count, 0, False)
-    with pytest.raises(ScenarioError, match="is wider than the largest number"):
+    with pytest.raises(ScenarioError, match="wider"):
         random_variations({"a": (low, -low)}, 5)
 
 
@@ -69,7 +69,7 @@ def test_ranges_of_more_whole_numbers_than_there_are_runs_are_refused():
     for values in (range(10**7), range(10**300)):
         with pytest.raises(ScenarioError, match=r"at most 1000000 runs|more values than a study"):
             grid_variations({"a": values})
-    with pytest.raises(ScenarioError, match="more whole numbers than can be drawn from"):
+    with pytest.raises(ScenarioError, match="whole numbers"):
         random_variations({"a": range(10**300)}, 5)
 
 
@@ -156,7 +156,7 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         (["duration=1..2:900000000"], {}, "at most 1000000 runs"),
     ],
 )
-def test_what_cannot_be_read_is_told(texts, options, words):
+def test_what_cannot_be_read_is_reported(texts, options, words):
     with pytest.raises(ScenarioError, match=words):
         parsed(*texts, **options)
 

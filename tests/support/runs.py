@@ -29,7 +29,7 @@ DEAR = (
 
 
 def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
-    """The shipped scenarios but for some: all slow but the first one, the dear ones thorough."""
+    """The shipped scenarios except for some: all slow but the first one, the dear ones thorough."""
     marks = {
         "two_link_wall": [],
         **{name: [pytest.mark.slow, pytest.mark.thorough] for name in DEAR},

@@ -61,7 +61,7 @@ def runs_interpreted(match: str) -> None:
     assert not function.is_machine_code
     for one, two in zip(values, made(False)(X, P), strict=True):
         np.testing.assert_array_equal(one, two)
-    function(X, P)  # Warnings are errors: it is told once.
+    function(X, P)  # Warnings are errors: it warns once.
 
 
 # What it computes.
@@ -80,7 +80,7 @@ def runs_interpreted(match: str) -> None:
         ([1.0, 1e31, np.nan], [1.0, -np.inf]),
     ],
 )
-def test_values_that_are_not_finite_are_told_alike(x, p, cache):
+def test_values_that_are_not_finite_are_reported_alike(x, p, cache):
     code, interpreted = made(True), made(False)
     for one, two in zip(code(x, p), interpreted(x, p), strict=True):
         np.testing.assert_array_equal(one, two)
@@ -311,7 +311,7 @@ def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
         before = asked.read_text()
         runs_interpreted(rf"the C compiler '.*{name}' takes longer than 1 s")
         assert asked.read_text() == before
-        with pytest.raises(MachineCodeError, match="takes longer than 1 s"):
+        with pytest.raises(MachineCodeError, match="1 s"):
             find_compiler()
 
 
@@ -325,7 +325,7 @@ def test_a_compiler_that_makes_nonsense(cache, monkeypatch, tmp_path):
 def test_a_cache_that_cannot_be_written(cache, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "file"))
-    runs_interpreted("file is no folder; take it away")
+    runs_interpreted("file is no folder")
     monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "file" / "code"))
     runs_interpreted("file/code cannot be used: Not a directory")
     monkeypatch.setenv("DRAKE_DAE_CACHE", "/proc/nobody/code")
@@ -355,7 +355,7 @@ def test_a_cache_of_another_user(cache, monkeypatch):
     made(True)(X, P)
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     runs_interpreted("belongs to another user .*, whose code is not loaded")
-    with pytest.raises(MachineCodeError, match="belongs to another user"):
+    with pytest.raises(MachineCodeError, match="another user"):
         clear()
 
 
@@ -425,7 +425,7 @@ def test_where_it_is_kept(monkeypatch, tmp_path):
 
 
 @needs_compiler
-def test_a_compiler_that_is_told_to_be_careless_is_not(cache, monkeypatch):
+def test_a_compiler_that_is_reported_to_be_careless_is_not(cache, monkeypatch):
     """With -ffast-math, which CC asks for here, nan would pass for a number."""
     command = " ".join(find_compiler().command)
     monkeypatch.setenv("CC", f"{command} -ffast-math -O3")
@@ -491,7 +491,7 @@ def test_processes_share_the_cache(cache):
 
 @needs_compiler
 def test_auto_looks_without_a_word(cache, monkeypatch):
-    """Nothing is lost yet: what keeps from compiling is told when it would pay."""
+    """Nothing is lost yet: what keeps from compiling is reported when it would pay."""
     cache.mkdir(parents=True)
     cache.chmod(0o777)
     function = made("auto")

@@ -74,7 +74,7 @@ def test_wrong_arguments_are_refused_by_name():
         function.evaluate(X)
 
 
-def test_finite_outputs_are_told_from_others():
+def test_finite_outputs_are_reported_from_others():
     function = traced(
         y=lambda x, p: ca.sqrt(x), z=lambda x, p: 1 / p, none=lambda x, p: ca.SX(0, 1)
     )

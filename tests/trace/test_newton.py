@@ -73,7 +73,7 @@ def test_the_equations_may_be_in_any_units(scales):
     np.testing.assert_allclose(found, [x, x**3], rtol=1e-13)
 
 
-def test_a_missing_root_is_told():
+def test_a_missing_root_is_reported():
     """x^2 + 1; and a double root, which is found, but is not regular."""
     _, converged = solve(lambda x: x**2 + 1, lambda x: np.array([2 * x]), [0.7])
     assert not converged

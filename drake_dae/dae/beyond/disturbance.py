@@ -251,8 +251,8 @@ def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
     for name in names:
         if name not in (*found, DISTURBANCE):
             raise ModelError(
-                f"{system.name}: '{name}' moves and is no coefficient of friction of one contact; "
-                "an observer tells a disturbance and coefficients of friction"
+                f"{system.name}: '{name}' varies and is not the coefficient of friction of one "
+                "contact; an observer estimates a disturbance and coefficients of friction"
             )
     return {name: found[name] for name in names if name in found}
 
@@ -268,8 +268,8 @@ def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
         if i in rows or not own or ca.sparsify(others[i, :]).nnz():
             name = system.state_signals[i].name
             raise ModelError(
-                f"{system.name}: the mass of what a disturbance moves depends on '{name}', whose "
-                "rate is no function of the state alone"
+                f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "
+                "whose rate is no function of the state alone"
             )
         rate[i] = system.f[i]
     return rate

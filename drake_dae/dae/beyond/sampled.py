@@ -185,8 +185,8 @@ def _check(law: TrackingLaw) -> None:
     if law.integral.outputs or law.control_takes_force:
         what = "integrals" if law.integral.outputs else "a measured force in its control"
         raise ModelError(
-            f"{law.system.name}: a law with {what} has a state of its own in the loop, of which "
-            "nothing is predicted here; take the law without, or run it"
+            f"{law.system.name}: a law with {what} has a state in the loop that the prediction "
+            "does not include; use the law without it, or simulate the loop"
         )
 
 

@@ -46,7 +46,7 @@ class LinearModel:
         try:
             moved = np.linalg.solve(pencil / rows[:, None] / columns, self.B / rows[:, None])
         except np.linalg.LinAlgError:
-            raise ModelError(f"s = {s:g} is a pole; ask for the response beside it") from None
+            raise ModelError(f"s = {s:g} is a pole; evaluate the response at another s") from None
         return np.asarray(self.C @ (moved / columns[:, None]) + self.D, dtype=complex)
 
 

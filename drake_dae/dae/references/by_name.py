@@ -119,7 +119,7 @@ def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Ref
     left = [name for place, name in enumerate(outputs) if place not in rows]
     if left:
         raise ReferenceSignalError(
-            f"left without one: {', '.join(left)}; needed for {', '.join(outputs)}"
+            f"missing: {', '.join(left)}; references are needed for {', '.join(outputs)}"
         )
     return list(_runs([rows[place] for place in range(len(outputs))]))
 

@@ -129,10 +129,10 @@ class CsvReference(SplineReference):
     def remark(self) -> str:
         """The deviation from the rows, as text."""
         pairs = zip(self.columns, self.deviation, strict=True)
-        told = ", ".join(f"{column} by {off:.2g}" for column, off in pairs)
+        distances = ", ".join(f"{off:.2g} in {column}" for column, off in pairs)
         return (
-            f"CsvReference '{Path(self.file).name}': smoothed over {self.spline.step:.3g} s, it is "
-            f"off its rows at most in {told}"
+            f"CsvReference '{Path(self.file).name}': smoothed over {self.spline.step:.3g} s, its "
+            f"largest distances from its rows are {distances}"
         )
 
     def _off(self, spline: TimeSpline) -> FloatArray:

@@ -50,7 +50,7 @@ class PathReference(FormulaReference):
             ReferenceSignalError: The reference has no limits, since it never rests.
         """
         if self.limits is None:
-            raise ReferenceSignalError("this reference has no limits: it moves all the time")
+            raise ReferenceSignalError("this reference is periodic and has no limits")
         travel = rest_to_rest(self.length, self.limits, self.order)
         time = ca.SX.sym("t")
         _, *derivatives = self._derivatives(travel.derivatives(time, 3))
@@ -180,7 +180,7 @@ class CircleReference(PathReference):
         check_order(self.order)
         if (self.period is None) == (self.limits is None):
             raise ReferenceSignalError(
-                "a circle takes either a period, for one that goes on, or limits, for one from "
+                "a circle takes either a period, for periodic motion, or limits, for motion from "
                 f"rest to rest, got {'none' if self.period is None else 'both'}"
             )
         if self.period == 0.0 or self.turns == 0.0:

@@ -24,25 +24,25 @@ class Cause(Enum):
         "The constraint then binds the control instead of the state. Take that control out, or add "
         "an actuator state in front of it"
     )
-    NO_FORCE = "It is redundant, or no constraint input keeps it"
+    NO_FORCE = "It is redundant, or no constraint input enforces it"
     NO_CONTROL = "Choose another output"
     CONSTRAINT_RANK = (
         "Their gradients are independent there, but the constraint inputs cannot act on them "
         "independently. Keep away from this state, or change how the constraint inputs enter"
     )
     REDUNDANT = (
-        "The constraints are redundant at every state: how the forces split among them is not "
-        "determined. Remove a redundant constraint with its constraint input, as drop_constraints "
-        "does, or have the forces shared by least squares: share_forces, or `compliances` of a "
-        "robot or a scenario"
+        "The constraints are redundant at every state: the distribution of the forces among them "
+        "is not determined. Remove a redundant constraint with its constraint input, as "
+        "drop_constraints does, or have the forces shared by least squares: share_forces, or "
+        "`compliances` of a robot or a scenario"
     )
     SINGULAR_CONFIGURATION = (
-        "This is a singular configuration: the constraints are redundant there, and not around it, "
-        "so that forces are not determined, and motions on N* may branch. A plant that starts "
-        "elsewhere passes it where its velocity leads across, no law does, and smaller steps do "
-        "not help. Choose a nominal state away from it, and for a law motions that keep away; or "
-        "write other constraints that stay independent there; a spring or a clearance in one of "
-        "them makes the forces determined"
+        "This is a singular configuration: the constraints are redundant there, and not around "
+        "it, so that forces are not determined, and motions on N* may branch. A plant that "
+        "starts elsewhere passes through it if its velocity leads across; a law cannot, and "
+        "smaller steps do not help. Choose a nominal state away from it, and for a law motions "
+        "that keep away; or write other constraints that stay independent there; a spring or a "
+        "clearance in one of them makes the forces determined"
     )
     HIDDEN_DEGREE = (
         "No constraint is redundant, but the system is not in the class as it is written: such a "
@@ -50,11 +50,11 @@ class Cause(Enum):
         "relative degree. Write this difference in place of the constraint: N* stays the same"
     )
     NUMBERS = (
-        "The structure must be the same for all numbers that the system may have. Give such a "
-        "parameter or signal another default, or say between which values it stays, by "
-        "`DaeSystem.with_bounds`; bounds of one value hold it at its default"
+        "The structure must be the same for all values of parameters and signals. Give such a "
+        "parameter or signal another default, or give its range by `DaeSystem.with_bounds`; "
+        "equal bounds fix it at its default"
     )
-    BOUNDS = "Give narrower bounds, which hold no such value"
+    BOUNDS = "Give narrower bounds, which exclude this value"
     CONTROL_RANK = (
         "An output may repeat a constraint or another output; choose other outputs, keep away from "
         "this state, or see whether `dynamic_extension` finds integrators that help"
@@ -99,7 +99,10 @@ class Violation:
             Cause.NO_CONTROL: "the control acts",
         }
         regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
-        return f"{text}. This depends on numbers: {acts.get(self.cause, regular)} {self.deciding}"
+        return (
+            f"{text}. This depends on parameter values: {acts.get(self.cause, regular)} "
+            f"{self.deciding}"
+        )
 
     def error(self) -> AssumptionError:
         """The exception for this violation."""

@@ -221,10 +221,10 @@ class Passage:
         ends = np.cumsum(structure.constraint_degrees) - 1
         c = structure.manifold.residual_expression[ends.tolist()]
         # x'' of rows like q' = N v; of the others n^T C is zero.
-        told = [i for i in range(system.num_states) if _is_plain(system.mass_matrix, i)]
-        told = [i for i in told if not (system.g[i, :].nnz() or system.h[i, :].nnz())]
+        plain = [i for i in range(system.num_states) if _is_plain(system.mass_matrix, i)]
+        plain = [i for i in plain if not (system.g[i, :].nnz() or system.h[i, :].nnz())]
         second = ca.SX(system.num_states, 1)
-        second[told] = ca.jtimes(system.f[told], x, rate)
+        second[plain] = ca.jtimes(system.f[plain], x, rate)
         c_rate = ca.jtimes(c, x, rate)
         c_second = ca.jtimes(c_rate, x, rate) + ca.jtimes(c_rate, rate, ca.densify(second))
         turning = ca.jtimes(ca.vec(ca.densify(system.g)), x, rate)

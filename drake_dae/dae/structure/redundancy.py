@@ -174,15 +174,15 @@ def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
     for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
         if _rank(gradient[kept]) < _rank(gradient):
             raise ModelError(
-                f"{system.name}: {gone} cannot be left out: the gradients of the constraints that "
-                "stay do not hold that of each one that goes"
+                f"{system.name}: {gone} cannot be left out: its gradients are no combinations of "
+                "the gradients of the remaining constraints"
             )
         both = np.hstack([gradient, moved])
         if _rank(both[kept]) < _rank(both):
             names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: where the exogenous signals {names} "
-                "move, the constraints that go move apart from those that stay"
+                "move, the constraints left out are no longer implied by the remaining ones"
             )
         if _rank(fields["g"].T[kept]) < _rank(fields["g"].T):
             raise ModelError(

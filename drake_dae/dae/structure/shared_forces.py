@@ -150,9 +150,10 @@ def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, .
         ]
         if bad:
             raise ModelError(
-                f"{system.name}: the output {', '.join(bad)} is not determined: how redundant "
-                "constraints share their forces does not change the motion, and no control steers "
-                "it. Choose other outputs; what the redundant forces sum up to is determined"
+                f"{system.name}: the output {', '.join(bad)} is not determined: the distribution "
+                "of forces among redundant constraints does not affect the motion, and no "
+                "control affects it. Choose other outputs; sums of the redundant forces are "
+                "determined"
             )
     signals = system.constraint_input_signals
     return tuple(signal.name for signal, is_free in zip(signals, free, strict=True) if is_free)

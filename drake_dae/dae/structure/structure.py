@@ -216,7 +216,7 @@ def why_no_law(system: DaeSystem) -> str:
     """Why a system has no law (28), by its numbers of inputs and outputs; empty if it may have."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
-        return "there is no control input, so there is nothing to steer"
+        return "there is no control input, so no output can be controlled"
     if q == 0 or p < q:
         return (
             f"there are {q} controlled outputs and {p} controls; the law (28) inverts B(x), so it "
@@ -234,7 +234,7 @@ def why_no_law(system: DaeSystem) -> str:
 def _check_counts(system: DaeSystem) -> None:
     why = why_no_law(system)
     if why:
-        raise ModelError(f"{system.name}: {why}. To simulate it, `DaePlant` needs neither")
+        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
 
 
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
@@ -249,7 +249,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
     elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs.chains)
-    # Rows of n* that are zero but for round-off are no feedthrough.
+    # Rows of n* that are zero except for round-off are no feedthrough.
     n_star = [
         ca.SX(1, samples.system.num_controls) if degree else elimination.n_star[i, :]
         for i, degree in enumerate(degrees)

@@ -46,11 +46,13 @@ class PainleveOutcome(Enum):
     """The number of motions in a Painleve paradox; the value describes it."""
 
     INCONSISTENT = (
-        "inconsistent: no force that pushes keeps the contact, and without a force it would be "
-        "pierced"
+        "inconsistent: no compressive force maintains the contact, and without a force there "
+        "would be penetration"
     )
-    INDETERMINATE = "indeterminate: the contact can be kept by a force, and it can open as well"
-    OPENING = "opening: without a force the contact opens, and no force that pushes keeps it"
+    INDETERMINATE = (
+        "indeterminate: a compressive force maintains the contact, and it can open as well"
+    )
+    OPENING = "opening: without a force the contact opens, and no compressive force maintains it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +82,9 @@ class Contacts:
     def __post_init__(self) -> None:
         if len(self.rows) > MOST:
             raise ModelError(
-                f"{self.owner}: {len(self.rows)} forces can only push, and one of them rubs; with "
-                f"friction there may be {MOST}, since all sets of them are examined. Take the "
-                "friction away, or some contacts"
+                f"{self.owner}: {len(self.rows)} unilateral forces, one of them with friction; "
+                f"with friction at most {MOST} are possible, since all their subsets are "
+                "examined. Remove the friction, or some contacts"
             )
 
     def __bool__(self) -> bool:

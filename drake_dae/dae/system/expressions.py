@@ -66,7 +66,7 @@ def as_functions(
     shapes |= {"mass_matrix": (n, n), "control_metric": (p, p), "free_control": (p, 1)}
     known = ca.vertcat(state, parameters)
     if len(ca.symvar(known)) != known.numel():
-        raise ModelError(f"{owner}: a symbol stands twice among the states and parameters")
+        raise ModelError(f"{owner}: a symbol occurs twice among the states and parameters")
     for key, value in values.items():
         shape = shapes[key]
         if value.numel() == 0 and 0 in shape:
@@ -116,7 +116,7 @@ def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
     """Refuses names that occur twice.
 
     Raises:
-        ModelError: A name stands twice.
+        ModelError: A name occurs twice.
     """
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
@@ -183,8 +183,8 @@ def _explained(error: Exception, function: Callable[..., Any], arguments: Sequen
     if "truth value" in text:
         return (
             "it asks whether a condition on the state is true, as in if, max or min. Conditions "
-            "are not smooth, and the theory differentiates: write the side on which the state "
-            "stays, or a smooth function"
+            "are not smooth, and the theory differentiates: write the branch in which the state "
+            "remains, or a smooth function"
         )
     if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
         return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"

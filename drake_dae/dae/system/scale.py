@@ -163,10 +163,10 @@ def _alike(comparisons: list[_Comparison]) -> FloatArray:
                 break
         largest = np.zeros(unknowns.shape[1])
         np.maximum.at(largest, equation, left)
-        tells = left > largest[equation] + NEGLIGIBLE
-        if np.array_equal(tells, kept):
+        significant = left > largest[equation] + NEGLIGIBLE
+        if np.array_equal(significant, kept):
             break
-        kept = tells
+        kept = significant
     return found
 
 

@@ -209,10 +209,10 @@ def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> 
     if lost is None:
         return
     warnings.warn(
-        f"{advice} is outside of the range in which the advice is right: a contact of "
-        f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, "
-        f"does not come to rest with it. The contact swings by {swing:.3g} rad in a sample: sample "
-        "more often, make it softer, or choose the gains yourself",
+        f"{advice} is outside of the range in which the recommendation is valid: a contact of "
+        f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, is "
+        f"unstable with it. The contact oscillates by {swing:.3g} rad in a sample: sample more "
+        "often, make it softer, or choose the gains yourself",
         AdviceWarning,
         stacklevel=4,
     )

@@ -54,7 +54,8 @@ class FeedbackGains:
         for name, degree, row in zip(self.names, self.degrees, matrix, strict=True):
             if degree == 0 and row.any():
                 raise GainError(
-                    f"output '{name}' has degree 0 and takes no gain: it is met at once"
+                    f"output '{name}' has degree 0 and takes no gain: the law attains it without "
+                    "delay"
                 )
         matrix.setflags(write=False)
         object.__setattr__(self, "matrix", matrix)
@@ -243,7 +244,7 @@ def _per_output(
             for text, found in (
                 ("unknown outputs", unknown),
                 ("no gains for", missing),
-                ("met at once and without gains", useless),
+                ("degree 0, no gains", useless),
             )
             if found
         ]

@@ -56,12 +56,12 @@ class IntegralAction:
                 raise GainError(f"integral: {unknown_name('output', name, known)}")
             i = known.index(name)
             if i in found:
-                raise GainError(f"integral: '{name}' stands twice")
+                raise GainError(f"integral: '{name}' occurs twice")
             if degrees[i] == 0 and (measured is None or i not in measured.inputs):
                 raise GainError(
-                    f"integral: by the model the law meets '{name}' at once, and there is no error "
-                    "to integrate; make it with measured_force=True, and integrate what is a "
-                    "constraint input"
+                    f"integral: by the model the law attains '{name}' without delay, so there is "
+                    "no error to integrate; make the law with measured_force=True, and integrate "
+                    "a constraint input"
                 )
             found.append(i)
         chosen = tuple(sorted(found))

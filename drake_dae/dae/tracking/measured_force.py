@@ -47,17 +47,18 @@ class ForceMeasurement:
         """
         if system.sharing is not None:
             raise ModelError(
-                f"{system.name}: measured_force does not know how redundant constraints share "
-                "their forces; leave them out with `drop_constraints`, or use the law's own force"
+                f"{system.name}: measured_force is not supported for redundant constraints that "
+                "share their forces; leave them out with `drop_constraints`, or use the law's "
+                "own force"
             )
         inputs = _force_outputs(system)
         matrix = force_gain(gain, system.num_constraints)
         for i, j in inputs.items():
             if layout.degrees[i] and matrix[j].any():
                 raise GainError(
-                    f"force_gain is for outputs that the law meets at once; "
-                    f"'{system.output_signals[i].name}' has degree {layout.degrees[i]} and takes "
-                    "the measured force itself. Leave it 0"
+                    f"force_gain is for outputs of degree 0; '{system.output_signals[i].name}' "
+                    f"has degree {layout.degrees[i]} and takes the measured force itself. Leave "
+                    "it 0"
                 )
         return cls(layout, inputs, matrix, ca.SX.sym("v", system.num_constraints))
 

@@ -107,7 +107,7 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
             course.behavior, verdict
         )
         if course.behavior not in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
-            reason += f"; what leaves it {course}"
+            reason += f"; motions that leave it: {course}"
     else:
         count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
         verdict = Verdict.UNDECIDED
@@ -143,6 +143,6 @@ def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> Sta
     if behavior is Behavior.WANDERS:
         reason += f"; the motion {behavior.value}"
     elif verdict is Verdict.UNDECIDED:
-        reason += "; that is not long enough to tell"
+        reason += "; that is too short to decide"
     none = np.zeros(0, dtype=complex)
     return StabilityAlong(verdict, period, none, exponents, None, reason)

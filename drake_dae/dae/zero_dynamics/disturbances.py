@@ -28,6 +28,10 @@ ACCURACY = 1e-9
 MOST_STEPS = 5000
 """The largest number of steps in one interval."""
 
+LATE, HARDLY = 200, 1e-5
+"""So many steps that together lead through less than this share of a section, and do not double the
+state either, end a motion: it would take millions of them."""
+
 SECTIONS = 16
 """The number of parts of an interval; after each, the state is projected onto Z(R) and bases are
 renewed."""
@@ -217,10 +221,17 @@ class Flow:
                 rate, begin, y, end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
             )
         )
+        marks = [(begin, np.max(np.abs(y[:n])))]
         while solver.status == "running":
             quietly(solver.step)
-            if not np.max(np.abs(solver.y[:n])) <= bound:
+            largest = np.max(np.abs(solver.y[:n]))
+            if not largest <= bound:
                 raise Lost(EndCause.UNBOUNDED)
+            marks.append((solver.t, largest))
+            if len(marks) > LATE:
+                before, size = marks[-1 - LATE]
+                if solver.t - before < HARDLY * (end - begin) and largest < 2.0 * size:
+                    raise Lost(EndCause.TOO_FAST)
             if solver.status == "failed":
                 raise Lost(EndCause.TOO_FAST)
             yield solver.t, *split(solver.y)

@@ -107,8 +107,8 @@ class Equilibria:
                 f"{names[i]}' = {self._clocks[i]:g}" for i in self._clocks.nonzero()[0]
             )
             raise InconsistentStateError(
-                f"{pinned.system.name}: no state is at rest, since {running} at all of them, like "
-                "a clock that nothing steers: time is no state. Take it out of the state, as an "
+                f"{pinned.system.name}: no state is an equilibrium, since {running} at all of "
+                "them, as for a clock: time must not be a state. Take it out of the state, as an "
                 "exogenous signal, or judge the zero dynamics along a motion",
                 self._clocks,
             )
@@ -142,7 +142,7 @@ class Equilibria:
         point = pinned.point(state, reference, parameters)
         unrest: Unrest | str | None = self.unrest(point, reference, parameters)
         if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
-            unrest = "it runs away from all states that are known"
+            unrest = "it grows without bound"
         if converged and not unrest:
             if isolation(pinned, state, reference, parameters):
                 return state

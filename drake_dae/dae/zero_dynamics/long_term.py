@@ -46,7 +46,7 @@ class Behavior(Enum):
     SETTLES = "converges to another stable motion"
     CIRCLES = "converges to a limit cycle"
     LEAVES = "approaches an unstable periodic motion"
-    WANDERS = "attracts its neighbours but did not return: it may drift"
+    WANDERS = "attracts nearby motions but did not return: it may drift"
     SPREADS = "is unstable: small disturbances grow exponentially"
     UNCLEAR = "was not followed long enough to decide"
 

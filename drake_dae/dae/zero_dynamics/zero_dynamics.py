@@ -103,8 +103,8 @@ class ZeroDynamics:
 
         Raises:
             ReferenceSignalError: An exogenous signal is not smooth enough.
-            ModelError: A shape is wrong, or the times do not increase. Any other failure is told by
-                the motion that comes back; see `PinnedMotion.ending`.
+            ModelError: A shape is wrong, or the times do not increase. Other failures are in
+                the returned motion; see `PinnedMotion.ending`.
         """
         grid = self._vector("times", times)
         if grid.size == 0 or np.any(np.diff(grid) <= 0.0):

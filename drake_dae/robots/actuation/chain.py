@@ -63,7 +63,7 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         return _rigid_joints(links)
     if not links.actuator_signals:
         raise ModelError(
-            f"{type(stages[0]).__name__} drives actuators of the links; there are none"
+            f"{type(stages[0]).__name__} needs actuators of the links, and there are none"
         )
     position, velocity = _actuated(links)
     p = position.numel()

@@ -126,8 +126,8 @@ class ConstraintSet:
             frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
             where = "at several points of" if found else "not on"
             raise ModelError(
-                f"constraint '{name}' acts {where} '{frame}', but on it at one point is needed; "
-                f"it acts on {frames or 'no frame that is known'}"
+                f"constraint '{name}' acts {where} '{frame}', and exactly one point on it is "
+                f"needed; it acts on {frames or 'no frame that is known'}"
             )
         sign = 1.0 if frame == found[0].frame_b else -1.0
         return found[0].point, sign * found[0].force(constraint_force[part])

@@ -53,8 +53,8 @@ def compare_with_plant(
         for name, other in theirs.items():
             if not np.all(np.isfinite(other)):
                 raise ModelError(
-                    f"the plant's own {name} is not finite at q = {state[0]}: a joint moves no "
-                    "mass; give each moving link mass and inertia, or weld it"
+                    f"the plant's own {name} is not finite at q = {state[0]}: a joint has no mass "
+                    "to move; give each moving link mass and inertia, or weld it"
                 )
             scale = max(np.abs(other).max(), 1.0 if name == "velocity map" else size)
             error = np.abs(ours[name] - other).max() / scale

@@ -69,12 +69,12 @@ class _Map(Surface):
         points = places + self.relief.heights(x, y)[..., None] * np.array(self.normal)
         return Picture(mesh_of_grid(points), RigidTransform())
 
-    def _told(self, source: str) -> str:
+    def _remark_of(self, source: str) -> str:
         width = max(bells.width for bells in self.relief.bells)
         return (
-            f"{source}: the surface is off the data by {_millimetres(self.relief.largest)} at most "
-            f"and {_millimetres(self.relief.rms)} rms; what is finer than {_millimetres(width)} is "
-            "smoothed away"
+            f"{source}: the largest and rms distances of the surface from the data are "
+            f"{_millimetres(self.relief.largest)} and {_millimetres(self.relief.rms)}; details "
+            f"finer than {_millimetres(width)} are smoothed away"
         )
 
 
@@ -127,7 +127,7 @@ class HeightMap(_Map):
 
     @property
     def remark(self) -> str:
-        return self._told(f"HeightMap '{Path(self.file).name}'" if self.file else "HeightMap")
+        return self._remark_of(f"HeightMap '{Path(self.file).name}'" if self.file else "HeightMap")
 
 
 @checked(ModelError)
@@ -171,7 +171,7 @@ class MeshSurface(_Map):
 
     @property
     def remark(self) -> str:
-        return self._told(f"MeshSurface '{Path(self.file).name}'")
+        return self._remark_of(f"MeshSurface '{Path(self.file).name}'")
 
 
 def _check(surface: Any) -> None:

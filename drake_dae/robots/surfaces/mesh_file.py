@@ -147,8 +147,8 @@ def heights_of_mesh(
         highest - lowest > 1e-6 * extent,
         x,
         y,
-        "the mesh lies over itself and has no single height; choose another normal, or a rectangle "
-        "without the overhang, by middle and size",
+        "the mesh overlaps itself and has no unique height; choose another normal, or a "
+        "rectangle without the overhang, by middle and size",
     )
     return highest
 

@@ -22,8 +22,8 @@ class Parts:
     Attributes:
         plant, controller: The blocks.
         diagram: The diagram.
-        compiled: Its functions; None where something in it cannot be traced, or changes at moments
-            that a run has to find.
+        compiled: Its functions; None where something in it cannot be traced, is stepped by Drake,
+            or changes at moments that a run has to find.
     """
 
     plant: Any
@@ -60,7 +60,7 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
             compiled = program_of(loop).compiled
         except ModelError:
             compiled = None
-        if compiled is not None and compiled.changes:
+        if compiled is not None and (compiled.changes or compiled.has_stepped):
             compiled = None
         return Parts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)
@@ -69,6 +69,12 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
         raise ModelError(
             f"'{names}' changes at moments that a run has to find, as where a contact opens: no "
             "export knows it, and a rollout does"
+        )
+    if compiled.has_stepped:
+        name = compiled.stepped[1].system.get_name()
+        raise ModelError(
+            f"'{name}' has Drake's own contact, which no export knows; a rollout does. Export a "
+            "diagram with an ideal plant"
         )
     plants = [each for each, block in compiled.blocks.items() if block.check_start is not None]
     laws = [each for each, block in compiled.blocks.items() if block.under is not None]

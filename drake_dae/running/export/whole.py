@@ -6,7 +6,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compiled import CompiledDiagram, Place
+from drake_dae.compiler.compiled import CompiledDiagram
+from drake_dae.compiler.rates import Place
 from drake_dae.dae.system.signals import Signal
 from drake_dae.running.export.text import Call, Vector
 from drake_dae.trace.functions import TracedFunction

@@ -10,8 +10,8 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.fused import Fused, Seen
 from drake_dae.running.rollout.run import Ending, Problem, Run, Tableau
+from drake_dae.running.rollout.stepping.fused import Fused, Seen
 from drake_dae.systems.blocks.trials import SLOWEST
 
 WINDOW = 1e-13

@@ -15,14 +15,15 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.rollout import interpreted, machine
+from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.fused import Fused
 from drake_dae.running.rollout.problems import checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
+from drake_dae.running.rollout.stepping import interpreted, machine
+from drake_dae.running.rollout.stepping.fused import Fused
 from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
@@ -78,7 +79,9 @@ def rollout(
     states before their projection; under error control steps are those of DOP853 (Hairer, Norsett
     and Wanner, 1993), a thousandth of the accuracy each, and rows between them are on N*. Where a C
     compiler is found the whole diagram is machine code; otherwise a step is one call of CasADi.
-    Where plant and law have the same numbers, the motion follows from what the law wants.
+    Where plant and law have the same numbers, the motion follows from what the law wants. A
+    `ContactPlant` is stepped by Drake, and all else of a sample is one call; the record is that of
+    `simulate`.
 
     Args:
         loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it, or any diagram
@@ -162,14 +165,16 @@ def _runs(
     code: machine.Library | None,
 ) -> list[Run]:
     """What runs come to, by machine code if there is any."""
-    if code is None or program.compiled.changes:
+    if code is None or program.compiled.changes or program.compiled.has_stepped:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
     if code is not None:
         run = partial(machine.run, code, program, settings=settings)
     if program.compiled.changes:
         run = partial(run_with_changes, fused, run, settings.tableau)
-    if code is None or len(problems) == 1:
+    if program.compiled.has_stepped:
+        run = partial(run_beside, fused, code, settings=settings)
+    if code is None or len(problems) == 1 or program.compiled.has_stepped:
         return [run(problem) for problem in problems]
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:

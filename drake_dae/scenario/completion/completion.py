@@ -250,10 +250,9 @@ def _found(
     raise ScenarioError(
         (
             "references" if len(rows) else "constraints",
-            "the robot cannot start there within its joint limits; the nearest that was found "
-            f" leaves this: {'; '.join(missed) or 'nothing, but at a limit'}. Change the "
-            "first values of the references, start.errors or where the surface stands, or give "
-            "start.positions",
+            "the robot cannot start there within its joint limits; the nearest start found has: "
+            f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
+            "references, start.errors or the surface's place, or give start.positions",
         )
     )
 

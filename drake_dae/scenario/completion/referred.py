@@ -59,7 +59,7 @@ class ReferredRows:
             raise ScenarioError(("references", text))
         left = [candidates.signals[row].name for row in range(given) if row not in named]
         if left:
-            raise ScenarioError(("references", f"left without one: {', '.join(left)}"))
+            raise ScenarioError(("references", f"missing: {', '.join(left)}"))
         self.rows = [*range(given), *beside]
 
     def _named(self, name: str) -> list[int | None]:

@@ -1,10 +1,11 @@
-"""Whether a robot can do what its scenario asks for, before it is simulated."""
+"""Feasibility of a scenario, before it is simulated."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
@@ -15,6 +16,7 @@ from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -25,39 +27,41 @@ from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
 SAMPLES = 1001
-"""How many times along a reference are examined, at least."""
+"""The smallest number of examined times along a reference."""
 
 MOST_SAMPLES = 20_000
-"""How many times along a reference that varies fast are examined, at most."""
+"""The largest number of examined times along a reference that varies fast."""
 
 _STRAIGHT = 0.01
-"""How far a reference may be off a straight line between two times, relative to its range."""
+"""The allowed deviation of a reference from a straight line between two times, relative to its
+range."""
 
 _SLACK = 1e-9
-"""How far a value must be beyond its limit to count, in its unit: a start may be on the limit."""
+"""The excess over a limit that counts, in its unit: a start may be on the limit."""
 
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
-    """Analyzes the robot of a scenario, and what its reference takes.
+    """Analyzes the robot of a scenario, and the requirements of its reference.
 
-    The figures are those of the law's model without errors: the least that the scenario asks for.
+    The figures are those of the law's model without errors: the minimum requirements.
 
     Args:
         scenario: What `load_scenario` returns.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key. A violated assumption is
-            no error: the analysis tells it.
+            not an error: the analysis reports it.
     """
-    completed, model = completed_model(scenario)
+    scene_graph = SceneGraph()
+    completed, model = completed_model(scenario, scene_graph)
     scenario = completed.scenario
     try:
         structure = scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    if scenario.task is not None:  # What a task takes depends on when it touches.
+    if scenario.task is not None:  # The requirements of a task depend on the times of contact.
         return Feasibility(analyze(model.dae), scenario.duration)
-    # The law's model alone, without what it does not know of the plant.
+    # The law's model alone, without differences of the plant.
     ideal = replace(
         scenario,
         plant=IdealConstraints(),
@@ -84,9 +88,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         model.dae, reference=reference, times=times, start=start, exogenous=exogenous
     )
     motion = analysis.motion
-    behind: tuple[LinkBehind, ...] = ()
+    behind: tuple[LinkBehind | Collision, ...] = ()
     if motion is not None:
-        behind = links_behind(model, motion.times, motion.states, motion.parameters)
+        shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
+        behind = links_behind(model, *along, motion.parameters, shapes)
+        behind += collisions(shapes, *along)
     return Feasibility(
         analysis,
         scenario.duration,
@@ -101,8 +107,8 @@ def sample_times(
 ) -> tuple[FloatArray, bool]:
     """Times between which a reference is nearly straight.
 
-    Even times alone would see a sinusoid stand still whose period fits between them. Each interval
-    is tried at a random place, until a whole round finds nothing new.
+    Equidistant times alone would miss a sinusoid whose period fits between them. Each interval is
+    tested at a random time, until a whole round finds nothing new.
 
     Args:
         reference: The function t -> R(t).
@@ -119,7 +125,7 @@ def sample_times(
         tried = times[:-1] + share * np.diff(times)
         found = np.array([reference(time) for time in tried])
         known = np.concatenate([values, found])
-        # A constant varies by its round-off.
+        # A constant varies by round-off.
         allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
         off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
         new = np.flatnonzero(np.any(off > allowed, axis=1))
@@ -195,7 +201,7 @@ def _along(model: RobotModel, expression: ca.SX, states: FloatArray) -> FloatArr
 def _range(
     signal: Signal, times: FloatArray, values: FloatArray, low: float, high: float
 ) -> SignalRange:
-    """Where a signal goes between its limits, and when."""
+    """The range of a signal within its limits, with times."""
     least, largest = int(np.argmin(values)), int(np.argmax(values))
     beyond = (values < low - _SLACK) | (values > high + _SLACK)
     return SignalRange(

@@ -1,4 +1,4 @@
-"""What a scenario's reference takes: values, tables, and what is wrong."""
+"""The requirements of a scenario's reference: values, tables, and problems."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -10,11 +10,15 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.clearances import LinkBehind
+from drake_dae.robots.shapes import Collision
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
 )
-"""What to do about a link behind a surface."""
+"""The remedy for a link behind a surface."""
+
+IN_EACH_OTHER = ": begin in another configuration, by start.positions, or choose another path"
+"""What to do about links that collide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +29,8 @@ class SignalRange:
         signal: Name and unit.
         least, least_time: The lowest value, and when in s.
         largest, largest_time: The highest value, and when in s.
-        low, high: What is allowed; infinite where all is.
-        beyond_time: When it first leaves what is allowed, in s; None if never.
+        low, high: The limits; infinite without a limit.
+        beyond_time: The first time beyond a limit, in s; None if there is none.
     """
 
     signal: Signal
@@ -40,7 +44,7 @@ class SignalRange:
 
     @property
     def peak(self) -> tuple[float, float]:
-        """The value of largest size, and when."""
+        """The value of largest magnitude, and its time."""
         if abs(self.least) > abs(self.largest):
             return self.least, self.least_time
         return self.largest, self.largest_time
@@ -60,21 +64,22 @@ class SignalRange:
 
 @dataclass(frozen=True, eq=False)
 class Feasibility:
-    """The analysis of a scenario's robot, and what its reference takes.
+    """The analysis of a scenario's robot, and the requirements of its reference.
 
     The figures are those of the law's model without errors: the least that the scenario asks for.
 
     Attributes:
-        analysis: What `analyze` says of the robot, around the start and along the reference.
-        duration: How long the scenario lasts, in s.
-        controls: u, with what the actuators can do as limits.
-        joint_forces: What the actuation puts on the joints, with their effort limits; empty with
-            rigid joints, where that is u.
-        constraint_forces: lambda; zero is the lower limit where a constraint can only push.
+        analysis: The result of `analyze`, around the start and along the reference.
+        duration: The duration of the scenario, in s.
+        controls: u, with the limits of the actuators.
+        joint_forces: The joint forces of the actuation, with their effort limits; empty with rigid
+            joints, where they are u.
+        constraint_forces: lambda; zero is the lower limit of unilateral constraints.
         joints: Positions and velocities of the joints that have limits.
-        is_resolved: Whether the times follow the reference; if not, it varies faster than they do,
-            and the values between them are not known.
-        behind: Links that go behind a surface that the robot touches; see `links_behind`.
+        is_resolved: Whether the times resolve the reference; otherwise values between them are not
+            known.
+        behind: Links that move behind a contact surface, and links that collide; see `links_behind`
+            and `collisions`.
     """
 
     analysis: Analysis
@@ -84,16 +89,19 @@ class Feasibility:
     constraint_forces: tuple[SignalRange, ...] = ()
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
-    behind: tuple[LinkBehind, ...] = ()
+    behind: tuple[LinkBehind | Collision, ...] = ()
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface."""
-        return tuple(f"{one}{WRONG_SIDE}" for one in self.behind)
+        """The problems with links behind a surface, or in each other."""
+        return tuple(
+            f"{one}{IN_EACH_OTHER if isinstance(one, Collision) else WRONG_SIDE}"
+            for one in self.behind
+        )
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is violated, exceeded or out of reach, one text each; empty if nothing is."""
+        """The problems, one text each; empty if there are none."""
         return (
             *self.analysis.problems,
             *map(_exceeded, _beyond((*self.controls, *self.joint_forces))),
@@ -179,7 +187,7 @@ def _joint_row(r: SignalRange) -> list[str]:
 
 
 def _when(r: SignalRange, time: float) -> str:
-    """When, in words; nothing for a constant, whose extremes are round-off."""
+    """The time in words; empty for a constant, whose extremes are round-off."""
     size = max(abs(r.least), abs(r.largest))
     return f"{time:.4g} s" if r.largest - r.least > 1e-9 * size else ""
 

@@ -1,4 +1,4 @@
-"""What docstrings say of classes and of their attributes, for those who never see the code."""
+"""Texts of classes and attributes from their docstrings, for users of scenarios."""
 
 import inspect
 import re
@@ -15,7 +15,7 @@ def introduction(docstring: str) -> str:
 
 
 def attribute_texts(source: type) -> dict[str, str]:
-    """Name of an attribute -> what the docstring of the class, or of one of its bases, says."""
+    """Name of an attribute -> its text in the docstring of the class or of one of its bases."""
     return {
         name: text
         for cls in reversed(source.__mro__)

@@ -1,7 +1,7 @@
-"""Dataclasses as forms of plain data: checked by pydantic, all that is wrong told at once.
+"""Dataclasses as forms of plain data, checked by pydantic with all problems at once.
 
-A dataclass is its own form: its fields, defaults and checks are those that data must keep. A type
-that is no data is `written` as another one; a member of a family is chosen by a tag.
+A dataclass is its own form: its fields, defaults and checks apply to the data. A type that is not
+plain data is `written` as another one; a member of a family is chosen by a tag.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +18,7 @@ from drake_dae.scenario.forms.typed_yaml import TAG
 T = TypeVar("T")
 
 PLAIN = {str: "text", float: "a number"}
-"""What stands for plain values where tags choose."""
+"""The name of plain values among choices by tag."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class Form:
     Attributes:
         written: Annotation of a field -> the type that stands for it in data.
         defaults: Name of a field -> value where data leave it out, if not that of the class.
-        tag: The tag by which data choose the class, "!Sphere"; empty if there is no choice.
+        tag: The tag that chooses the class, "!Sphere"; empty if there is no choice.
         needs_tag: Whether data without a tag mean another class.
-        texts: Name of a field -> what it means, where the docstring of the class does not say it.
+        texts: Name of a field -> its text, if the docstring of the class has none.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
@@ -87,7 +87,7 @@ class Form:
             yield name, hint, self.defaults.get(name, default)
 
     def _type_in_data(self, hint: Any) -> Any:
-        """What stands in data for a field with an annotation."""
+        """The type in data of a field with an annotation."""
         if is_dataclass(hint):
             return Annotated[hint, Form(self.written)]
         members = _members(hint)
@@ -100,7 +100,7 @@ class Form:
 
 @dataclass(frozen=True)
 class _Explained:
-    """Puts what a field means before what the JSON Schema says of its type, and its default."""
+    """Adds the text of a field, and its default, to the JSON Schema of its type."""
 
     text: str
     default: Any
@@ -109,8 +109,8 @@ class _Explained:
         self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
     ) -> dict[str, Any]:
         schema = dict(handler(source))
-        told = "\n\n".join(filter(None, (self.text, schema.get("description"))))
-        schema.update({"description": told} if told else {})
+        combined = "\n\n".join(filter(None, (self.text, schema.get("description"))))
+        schema.update({"description": combined} if combined else {})
         schema.update({"default": self.default} if _is_plain(self.default) else {})
         return schema
 

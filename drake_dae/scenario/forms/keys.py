@@ -1,4 +1,4 @@
-"""The key of the scenario before whatever goes wrong, and remedies that a scenario has."""
+"""The scenario's key in errors, and remedies for users of scenarios."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ S = TypeVar("S")
 
 @contextmanager
 def at(key: str) -> Iterator[None]:
-    """Puts the key of the scenario before whatever goes wrong."""
+    """Adds the key of the scenario to errors in the block."""
     try:
         yield
     except ScenarioError:
@@ -23,7 +23,7 @@ def at(key: str) -> Iterator[None]:
 
 
 def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
-    """What is made of each item; an error bears the key and the item's index."""
+    """The results for each item; errors get the key and the item's index."""
     results = []
     for index, item in enumerate(items):
         with at(f"{key}.{index}"):
@@ -42,22 +42,22 @@ _REMEDIES = {
         "robot.actuators, or add a stage under actuation"
     ),
     Cause.REDUNDANT: (
-        "The constraints are redundant at every state: how the forces split among them is not "
-        "determined. Take a redundant one out, or write compliances: {}, which has the forces "
-        "shared by least squares"
+        "The constraints are redundant at every state: the distribution of the forces among them "
+        "is not determined. Take a redundant one out, or write compliances: {}, which has the "
+        "forces shared by least squares"
     ),
     Cause.NUMBERS: (
-        "The structure must be the same for all numbers that the robot may have. Give such a "
+        "The structure must be the same for all parameter values of the robot. Give such a "
         "number another value where it is written, away from the one at which it changes, or "
-        "say under bounds between which values it stays; or choose another output or constraint"
+        "give its range under bounds; or choose another output or constraint"
     ),
     Cause.CONTROL_RANK: (
-        "An output may repeat a constraint or another output; choose others. Or the robot is in a "
-        "singular configuration there, as an arm is that is stretched: give start.positions from "
-        "which it starts in another one"
+        "An output may repeat a constraint or another output; choose others. Or the robot is in "
+        "a singular configuration, such as a stretched arm: give start.positions of another "
+        "configuration"
     ),
 }
-"""What to do about a violation where that is not the same as in Python."""
+"""The remedies of violations that differ from those in Python."""
 
 
 def violated(error: AssumptionError) -> ScenarioError:

@@ -1,4 +1,4 @@
-"""What is wrong with plain data, in the words of whoever wrote it."""
+"""Problems of plain data, in the terms of the scenario file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from drake_dae.scenario.forms.values import shown
 
 
 def problem(schema: Mapping[str, Any], details: ErrorDetails, data: Any) -> tuple[str, str]:
-    """The dotted key and the text of what pydantic finds in data of a schema."""
+    """The dotted key and the text of a problem that pydantic finds."""
     kind, loc, value = details["type"], details["loc"], details["input"]
     if TAG in loc:
         place = _place(loc[: loc.index(TAG)], schema, data)
@@ -42,11 +42,11 @@ class _Place:
 
 
 _PARTS = {"oneOf", "items", "properties", "additionalProperties"}
-"""What schemas have of data with parts."""
+"""The schema entries of data with parts."""
 
 
 def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
-    """Where pydantic's location is, in which a chosen tag is a part."""
+    """The place of pydantic's location, in which a chosen tag is a part."""
     keys: list[str] = []
     tag = tags = ""
     for part in loc:
@@ -65,13 +65,13 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
 
 
 def with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What there may be or nothing, if it has parts; else the schema itself."""
+    """The schema of an optional value with parts; otherwise the schema itself."""
     inside = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
     return inside[0] if len(inside) == 1 and not _PARTS.isdisjoint(inside[0]) else schema
 
 
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
-    """What is wrong with a key that is missing or should not be there."""
+    """The text for a key that is missing or unknown."""
     names = [name for name in place.schema["properties"] if name != TAG]
     title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
     if is_missing:
@@ -85,7 +85,7 @@ def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
 
 
 def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
-    """What a schema expects instead of a value."""
+    """The text for a value: what the schema expects instead."""
     if "oneOf" in schema:
         expected = f"one of {_tags(schema)}"
     elif "properties" in schema:
@@ -112,7 +112,7 @@ _IN_WORDS = {
 
 
 def _in_words(schema: Mapping[str, Any]) -> str:
-    """What a plain value must be."""
+    """The description of a plain value."""
     if "anyOf" in schema:
         return " or ".join(map(_in_words, schema["anyOf"]))
     if "oneOf" in schema:

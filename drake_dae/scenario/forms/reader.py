@@ -1,4 +1,4 @@
-"""Reads dataclasses from plain data, and writes them as such; all that is wrong told at once."""
+"""Reads dataclasses from plain data and writes them, with all problems at once."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Reader(Generic[T]):
-    """Reads a dataclass from plain data, and writes it as such."""
+    """Reads a dataclass from plain data, and writes it."""
 
     def __init__(self, form: type[T]) -> None:
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
@@ -28,10 +28,11 @@ class Reader(Generic[T]):
 
         Args:
             data: The plain data.
-            folder: Where relative names of files start; None for the working directory.
+            folder: The folder of relative file names; None for the working directory.
 
         Raises:
-            ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
+            ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
+                listed.
         """
         # What repr shows as it is has no such letter, and most data have none.
         suspicious = "\\ud" in repr(data)
@@ -42,14 +43,14 @@ class Reader(Generic[T]):
         try:
             return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
-            # Each member of a Union says the same.
+            # Each member of a Union reports the same.
             problems = dict.fromkeys(
                 problem(self.schema, details, data) for details in error.errors()
             )
             raise ScenarioError(*problems) from None
 
     def write(self, value: T) -> Any:
-        """The plain data of which `read` makes the same value."""
+        """The plain data of a value, the inverse of `read`."""
         return self._adapter.dump_python(value, mode="json")
 
 

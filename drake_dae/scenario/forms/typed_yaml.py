@@ -16,12 +16,12 @@ TAG = "_tag"
 _READ_HERE = ("int", "float", "timestamp")
 
 MOST_VALUES, MOST_TEXT, MOST_LEVELS = 100_000, 1_000_000, 50
-"""Of a file, with each alias counted as often as it is used: the shipped ones have 200 values in
-4,000 characters, and what is larger takes longer to read than to simulate."""
+"""Limits of a file, with each alias counted as often as it is used. The shipped scenarios have 200
+values in 4,000 characters."""
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.1, but numbers are those of JSON, keys are text and stand once, and tags are kept."""
+    """YAML 1.1 with numbers as in JSON, unique text keys, and tags."""
 
     yaml_implicit_resolvers: ClassVar = {
         first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _READ_HERE]
@@ -47,7 +47,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _check_size(self, node: yaml.Node, known: dict[int, int]) -> int:
-        """How many values a node stands for."""
+        """The number of values of a node."""
         if id(node) not in known:
             known[id(node)] = MOST_VALUES  # Of an alias inside of itself.
             parts = node.value if isinstance(node, yaml.CollectionNode) else []
@@ -88,7 +88,7 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_multi_constructor("!", _Loader.construct_tagged)
-# YAML 1.1 has also 1_000, 010 for eight and 1:30 for ninety. These are text.
+# YAML 1.1 also has 1_000, 010 for eight and 1:30 for ninety. Here these are text.
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:int", re.compile(r"[-+]?(0|[1-9][0-9]*)$"), list("-+0123456789")
 )
@@ -118,10 +118,10 @@ def load_yaml(text: str, name: str) -> Any:
 
     Args:
         text: A text in YAML.
-        name: What messages call the text.
+        name: The name of the text in messages.
 
     Raises:
-        ScenarioError: The YAML is broken, or a key is no text or given twice; the message has the
+        ScenarioError: The YAML is broken, or a key is not text or occurs twice; the message has the
             line.
     """
     if len(text) > MOST_TEXT:
@@ -207,7 +207,7 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
 
 
 def _name_length(data: Any, parts: list[str]) -> int:
-    """How many parts are the name: all, but for what is inside of an entry that is there."""
+    """The number of parts of the name: all, except keys inside an existing entry."""
     for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
         name = ".".join(parts[:count])
         if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):

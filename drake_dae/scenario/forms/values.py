@@ -1,4 +1,4 @@
-"""Values in plain data that are no dataclasses: numbers, names of files, vectors."""
+"""Values in plain data without a dataclass: numbers, file names, vectors."""
 
 from pathlib import Path
 from sys import float_info
@@ -51,7 +51,7 @@ Numbers = Annotated[
 
 
 def _file(value: Any, info: pydantic.ValidationInfo) -> Path:
-    """A file, where a relative path starts in the folder that the reader was given."""
+    """A file; relative paths are in the reader's folder."""
     if not isinstance(value, (str, Path)) or not str(value):
         raise ValueError(f"expected the name of a file, got {shown(value)}")
     try:

@@ -1,4 +1,4 @@
-"""All keys of a scenario: what they mean, take and default to, read from its forms."""
+"""All keys of a scenario: meaning, values and defaults, read from its forms."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -35,11 +35,10 @@ class Key:
 
     Attributes:
         name: The key.
-        text: What it means.
-        takes: Which values it takes, in words.
+        text: Its meaning.
+        takes: The values that it takes, in words.
         unit: The unit of its numbers; empty for none.
-        default: Its value where it is left out, as plain data, `OWN`, or `NOTHING` if it must be
-            given.
+        default: Its default as plain data, `OWN`, or `NOTHING` if it must be given.
         is_number: Whether it takes numbers.
     """
 
@@ -57,8 +56,8 @@ class Entry:
 
     Attributes:
         title: Its tag, or its name where it has none.
-        where: Its dotted key in the scenario where it stands first; "*" is any name or number.
-        text: What it means.
+        where: Its first dotted key in the scenario; "*" is any name or number.
+        text: Its meaning.
         keys: Its keys.
         examples: Examples, which have all of its keys together.
         data: A scenario as plain data around it.
@@ -132,7 +131,7 @@ def _entries(
 
 
 def unit_of(text: str) -> str:
-    """The unit that a text tells, "in N m" or "..., m, ..."; empty where it tells none."""
+    """The unit in a text, "in N m" or "..., m, ..."; empty if there is none."""
     found = _UNIT.search(text)
     return (found[1] or found[2]) if found else ""
 
@@ -159,7 +158,7 @@ _WORDS = {
 
 
 def _takes(schema: Mapping[str, Any]) -> str:
-    """Which values a schema allows, in words."""
+    """The values that a schema allows, in words."""
     if "oneOf" in schema:
         tags = (one["properties"][TAG]["const"] for one in schema["oneOf"] if "properties" in one)
         texts = (_takes(one) for one in schema["oneOf"] if "properties" not in one)

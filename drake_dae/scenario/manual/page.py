@@ -10,7 +10,7 @@ from drake_dae.scenario.manual.schema import custom_tags
 _HEAD = """# The keys of a scenario
 
 A scenario is a YAML file. `drake-dae show NAME` prints one to begin with, and all wrong keys and
-values of a file are told at once. Where several forms fit, a tag chooses one, as in
+values of a file are reported together. Where several forms fit, a tag chooses one, as in
 `surface: !Sphere`; the first in a list of tags is meant without a tag.
 
 An editor with a YAML language server completes the keys: write `drake-dae schema > scenario.json`,
@@ -32,7 +32,7 @@ def keys_page() -> str:
 def _section(entry: Entry) -> str:
     where = f"At `{entry.where}`. " if entry.where else ""
     paragraphs = entry.text.split("\n\n")
-    # What is told by a formula is for readers of the code.
+    # Formulas are for readers of the code.
     end = next((i for i, one in enumerate(paragraphs) if one.endswith((":", ","))), None)
     text = _one_line(" ".join(paragraphs if end is None else paragraphs[: max(end, 1)]))
     text = text.rstrip(":,.") + "."

@@ -1,4 +1,4 @@
-"""The JSON Schema of a scenario for editors, which see keys, but no tags."""
+"""The JSON Schema of a scenario for editors, which see keys but not tags."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from drake_dae.scenario.scenario import scenario_schema
 def editor_schema() -> dict[str, Any]:
     """`scenario_schema` without the entries "_tag", so that editors complete and check keys.
 
-    An editor passes on what stands behind a tag, so that any form fits where a tag chooses.
+    An editor passes the value after a tag, so any form fits where a tag chooses.
     """
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

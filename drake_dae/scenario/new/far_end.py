@@ -1,4 +1,4 @@
-"""The far end of the last link of a chain, where a file has no frame."""
+"""The far end of the last link of a chain, if a file has no frame there."""
 
 import warnings
 from collections.abc import Iterator
@@ -20,20 +20,20 @@ from drake_dae.scenario.robot_file.robot import Robot
 def far_end(robot: Robot, body: RigidBody, last: Joint, size: float) -> Vector | None:
     """The point of a link that is farthest from the joint that moves it, m in the link's frame.
 
-    It is in the middle of a face of a box around a geometry of the link; without geometry it is
-    beyond the centre of mass, where the end of a rod would be.
+    It is the center of a face of a bounding box of the link's geometry; without geometry it is
+    beyond the center of mass, at the end of an equivalent rod.
 
     Args:
-        robot: What the scenario has under `robot`.
+        robot: The value of the scenario's key `robot`.
         body: The link, of a finalized plant of that robot.
         last: The joint of the same plant that moves it.
-        size: The size of the robot, m: what is less than a hundredth of it away is at the joint.
+        size: The size of the robot, m: points within a hundredth of it count as at the joint.
 
     Returns:
         The point; None if there is none off the axis of the joint.
     """
     scene_graph = SceneGraph()
-    with warnings.catch_warnings():  # The run tells them.
+    with warnings.catch_warnings():  # They are repeated by the run.
         warnings.simplefilter("ignore", GeometryWarning)
         warnings.simplefilter("ignore", RobotFileWarning)
         plant, _ = read_robot(robot, scene_graph)

@@ -1,4 +1,4 @@
-"""A scenario for a robot of which nothing but its file is known."""
+"""A scenario for a robot, from its file alone."""
 
 import warnings
 from dataclasses import replace
@@ -29,12 +29,12 @@ from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 
 _SHARES = (1.0, 0.5, 0.2)
-"""Of the usual circle and force, what is tried at each place."""
+"""The fractions of the usual circle and force that are tried at each place."""
 
 _BESIDE = "B(x) is singular beside the reference, not along it: `drake-dae analyze` says where"
 
 _PLACES = 4
-"""So many places are tried."""
+"""The number of places that are tried."""
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -45,22 +45,22 @@ def new_scenario(
     point: Vector = (0.0, 0.0, 0.0),
     folder: str | Path = "",
 ) -> tuple[Scenario, str]:
-    """A scenario in which a robot circles on a surface within its limits, and presses on it.
+    """A scenario in which a robot presses on a surface and moves in a circle, within its limits.
 
-    The base is what nothing in the file holds; the chain of joints is the longest that neither
-    mimics nor grasps nor rolls, or that to `tip`; all other joints are locked. The surface stands
-    where the tip reaches it with its axis along the normal and the task's directions are most
-    independent. A tip that its own joint does not move is the far end of its link. Outputs and
-    start are those of `complete_scenario`. Circle and force leave room to the joints' limits, and
-    `find_feasibility` finds no problem, or none but states beside the reference where B(x) is
+    The base is the free root body of the file. The chain is the longest without mimic joints,
+    grippers and wheels, or that to `tip`; all other joints are locked. The surface is placed where
+    the tip reaches it with its axis along the normal, with the best independence of the task's
+    directions. If its joint does not move the tip, the far end of the link is used. Outputs and
+    start are those of `complete_scenario`. Circle and force keep a margin to the joints' limits,
+    and `find_feasibility` finds no problem, except possibly states off the reference where B(x) is
     singular; the text then says so.
 
     Args:
         file: The robot's file, as a scenario has it.
-        surface: What it works on: "plane", "cylinder" or "sphere".
-        tip: The frame that touches; found if empty.
+        surface: The surface: "plane", "cylinder" or "sphere".
+        tip: The frame in contact; found if empty.
         point: The point in that frame, m, shape (3,).
-        folder: Where the text will be written: a robot's file below is named relative to it.
+        folder: The folder of the text: a robot's file below it gets a relative name.
 
     Returns:
         The scenario, and its text with a comment to each choice; `load_scenario` makes the same
@@ -80,11 +80,12 @@ def new_scenario(
         task = circle(place, surface, share)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RobotFileWarning)  # It is told of the links.
+                warnings.simplefilter("ignore", RobotFileWarning)  # The links are reported.
                 whole = complete_scenario(_scenario(robot, task, links)).scenario
                 found = find_feasibility(whole)
             problems = found.problems
-            if usable is None and not set(problems) - {*_beside(found), *found.wrong_sides}:
+            deeper = usable is not None and _depth(found) >= _depth(usable[2])
+            if not deeper and not set(problems) - {*_beside(found), *found.wrong_sides}:
                 usable = whole, task, found
         except DrakeDaeError as error:
             problems = (str(error),)
@@ -110,8 +111,13 @@ def new_scenario(
     )
 
 
+def _depth(found: Feasibility) -> float:
+    """How far links are behind surfaces or in each other, all together, in m."""
+    return sum(one.depth for one in found.behind)
+
+
 def _beside(found: Feasibility) -> tuple[str, ...]:
-    """The problems with states near the start to which the reference does not lead."""
+    """The problems with states near the start but off the reference."""
     analysis = found.analysis
     if analysis.structure is None or analysis.motion is None or analysis.motion.ending:
         return ()
@@ -130,7 +136,7 @@ def _scenario(robot: NewRobot, task: NewTask, links: Links) -> Scenario:
         description=f"{stem} draws a {task.path} on a {task.name} and presses on it",
         robot=robot.robot,
         constraints=[touching],
-        # On a surface that bends much, an axis that stays normal to it hinders the way along.
+        # On a strongly curved surface an axis fixed to the normal hinders motion along it.
         tool_axis="normal" if isinstance(task.surface, Plane) else "fixed",
         outputs=[PointCoordinates(robot.tip, along, robot.point)],
         gains=parts.Poles(all=[-4.0]),

@@ -1,4 +1,4 @@
-"""Where a robot can work: places for a surface that its tip reaches well."""
+"""Places for a surface that the tip of a robot reaches well."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from drake_dae.scenario.completion.search import near_posture
 from drake_dae.scenario.completion.tool_axis import tool_axis
 from drake_dae.trace.functions import TracedFunction
 
-# A table, walls around, and a ceiling: axis of the normal, its sign, and how much they are liked.
+# A table, walls around, and a ceiling: axis of the normal, its sign, and the preference.
 _NORMALS = (
     (2, 1.0, 1.0),
     (0, -1.0, 0.8),
@@ -28,16 +28,16 @@ _NORMALS = (
 )
 
 _TRIES = 40
-"""So many postures are tried for each normal."""
+"""The number of postures that are tried for each normal."""
 
 _PATIENCE = 8
-"""After so many tries without a tool that is normal to the surface it is given up."""
+"""The number of tries without a tool normal to the surface before the normal is given up."""
 
 _SLANTED = 0.3
-"""How much a posture counts in which the tool is not normal to the surface."""
+"""The weight of a posture with a tool that is not normal to the surface."""
 
 _SLOW = 0.3
-"""The part of the joints' speed limits that a path may take, and of effort limits a force."""
+"""The fraction of speed limits for a path, and of effort limits for a force."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +45,15 @@ class TipPlace:
     """A place for a surface.
 
     Attributes:
-        point: Where the tip touches, m, shape (3,).
-        axis: Which axis of the world the normal is along.
-        sign: 1 or -1: to which side.
+        point: The contact point of the tip, m, shape (3,).
+        axis: The axis of the world of the normal.
+        sign: The sign of the normal along it.
         q: A posture there, shape (nq,).
-        quality: How independently the task's directions can be moved there, from 0 to 1, less near
-            limits.
-        ways: Which axes of the world along the surface it can be moved along, one or two.
-        directions: How many of the normal, the two ways along, and the two angles these are.
-        speed: How fast the tip may move along, m/s, for the joints to stay below their limits.
-        force: How hard it may press, N, likewise; infinite without limits.
+        quality: The independence of the task's directions, from 0 to 1, reduced near limits.
+        ways: The axes of the world along the surface in which it can move, one or two.
+        directions: The number of directions: of the normal, two along the surface, and two angles.
+        speed: The largest speed of the tip along the surface, m/s, within the joints' limits.
+        force: The largest force, N, likewise; infinite without limits.
         size: The size of the robot, m.
     """
 
@@ -78,7 +77,7 @@ class TipPlace:
 
 
 def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
-    """The best place for each direction of a surface, the most liked first.
+    """The best place for each direction of a surface, in order of preference.
 
     Each is the best of some postures with the tool normal to the surface, where that can be had: by
     the independence of the task's directions, off joint limits, with bodies on the free side, the
@@ -86,7 +85,7 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
 
     Args:
         links: The robot.
-        tip: The frame that touches.
+        tip: The frame in contact.
         point: The point in it, m.
     """
     search = _Search(links, tip, point)
@@ -97,7 +96,7 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
 
 
 class _Search:
-    """Postures of a robot beside surfaces that are not there yet."""
+    """Postures of a robot for surfaces that are not yet placed."""
 
     def __init__(self, links: Links, tip: str, point: Vector) -> None:
         self._links = links
@@ -132,12 +131,12 @@ class _Search:
         self._guesses = self._postures.guesses(_TRIES)
 
     def best(self, axis: int, sign: float) -> TipPlace | None:
-        """The best place for a surface with a normal, None if none is any good."""
+        """The best place for a surface with a normal; None if there is none."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
         aligned: list[Posture] = []
         for count, guess in enumerate(self._guesses):
             if count == _PATIENCE and not aligned:
-                break  # A robot that moves in a plane never turns its tool some ways.
+                break  # A planar robot cannot rotate its tool about some axes.
             posture = near_posture(self._postures, tilts, np.zeros(2), guess)
             aligned += [] if posture is None else [posture]
         slanted = [self._postures.at(guess) for guess in self._guesses]
@@ -147,7 +146,7 @@ class _Search:
         return max(good, key=lambda one: one.quality * one.directions, default=None)
 
     def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> TipPlace | None:
-        """The place of a posture, None where the tip cannot move along the surface."""
+        """The place of a posture; None if the tip cannot move along the surface."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
         first = [k for k in range(3) if k != axis]
         rows = first_independent(posture, [], [axis, *first, *tilts], posture.q.size)
@@ -170,7 +169,7 @@ class _Search:
         )
 
     def _surroundings(self, posture: Posture, axis: int, sign: float) -> float:
-        """A factor of 0.1 for whatever speaks against a posture."""
+        """A factor of 0.1 for each disadvantage of a posture."""
         outward, moving, still, weight = self._function(posture.q, self._values)
         place, size = posture.rows[:3], self._postures.size
         behind = sign * (moving.reshape(3, -1)[axis] - place[axis])
@@ -190,13 +189,13 @@ class _Search:
         return float(0.1 ** sum(doubts))
 
     def _speed(self, posture: Posture, rows: list[int], ways: int) -> float:
-        """How fast the tip may move along any way: they are the rows after that of the normal."""
+        """The largest speed of the tip in all directions along the surface."""
         inverse = np.linalg.pinv(posture.gradients[rows])[:, 1 : 1 + ways]
         fastest = np.max(np.abs(inverse) / self._speeds[:, None], initial=0.0)
         return float(_SLOW / fastest) if fastest > 0.0 else np.inf
 
     def _force(self, posture: Posture, axis: int) -> float:
-        """How hard the tip may press."""
+        """The largest force of the tip."""
         lever = np.abs(posture.gradients[axis])
         share = np.max(lever / self._efforts, initial=0.0)
         return float(_SLOW / 2 / share) if share > 0.0 else np.inf

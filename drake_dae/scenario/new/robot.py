@@ -1,4 +1,4 @@
-"""The robot of a new scenario: its base, the chain that works, its tip, and what is locked."""
+"""The robot of a new scenario: its base, working chain, tip, and locked joints."""
 
 import re
 import warnings
@@ -32,31 +32,31 @@ from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Base, LeftOut, Robot
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
-"""What grasps or rolls: joints with such names are locked, if others are left."""
+"""Names of grippers and wheels: such joints are locked, if others are left."""
 
 # A hand may be the link that the last joint of an arm turns, a finger not.
 _FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
 
 _LEFT_OUT: tuple[LeftOut, ...] = ("joint_friction", "inertia", "empty_limits")
-"""What must be left out of a file is found by trying."""
+"""Parts that must be left out of a file are found by trying."""
 
 _TOOLS = [
     re.compile(word, re.IGNORECASE)
     for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
 ]
-"""How vendors name the frame at the end of an arm, the best names first."""
+"""Vendors' names of the frame at the end of an arm, the best first."""
 
 
 @dataclass(frozen=True)
 class NewRobot:
-    """A robot with a chain of joints that works, and everything else locked.
+    """A robot with a working chain of joints, all others locked.
 
     Attributes:
         robot: What the scenario has under `robot`.
         chain: The joints that move, from the base to the tip.
         tip: The frame at the end of the chain.
         point: The point in it that touches, m, shape (3,).
-        remarks: Key under `robot`, or "tip" -> why it is so.
+        remarks: Key under `robot`, or "tip" -> the reason.
     """
 
     robot: Robot
@@ -67,7 +67,7 @@ class NewRobot:
 
 
 def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewRobot:
-    """Finds what a scenario must say of a robot whose file does not say it.
+    """Finds the data of a robot that its file does not contain but a scenario needs.
 
     The chain is the longest of joints that turn or slide, without those that mimic others, grasp or
     roll; or that which leads to a tip that is given.
@@ -126,7 +126,7 @@ def _read(file: str) -> tuple[Tree, Robot]:
     def left_out(*kinds: LeftOut) -> Robot:
         return replace(everything, leave_out=list(kinds))
 
-    with warnings.catch_warnings():  # The scenario's own robot tells it.
+    with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
         try:
             tree = Tree(_finished(left_out()))
@@ -167,8 +167,8 @@ def _finished(robot: Robot) -> MultibodyPlant:
 
 
 def _folders_above(file: str) -> dict[str, str]:
-    """Packages that are found nowhere else -> folders of that name above the file or beside it."""
-    with suppress(RuntimeError, ValueError, OSError):  # Whoever reads the file tells it.
+    """Unknown packages -> folders of that name above the file or beside it."""
+    with suppress(RuntimeError, ValueError, OSError):  # The reader of the file reports it.
         _, missing = find_packages(file, PackageMap())
         above = list(Path(file).resolve().parents)
         return {
@@ -201,7 +201,7 @@ def _check_reach(tree: Tree, chain: Sequence[Joint], tip: str, point: Vector) ->
 
 
 def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
-    """The robot with a base that the world holds, and remarks."""
+    """The robot with its base fixed to the world, and remarks."""
     remarks: dict[str, str] = {}
     if robot.packages:
         remarks["packages"] = "where package://<name>/ leads"
@@ -231,7 +231,7 @@ def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
 
 
 def _chain(tree: Tree, tip: str) -> tuple[list[Joint], str]:
-    """The joints that work, and the name of the frame at their end."""
+    """The joints of the chain, and the name of the frame at its end."""
     if tip:
         try:
             body = GetScopedFrameByName(tree.plant, tip).body()
@@ -263,7 +263,7 @@ def _chain(tree: Tree, tip: str) -> tuple[list[Joint], str]:
 
 
 def _why_none(tree: Tree) -> str:
-    """Why no joint works, and what to do about it."""
+    """The reason why there is no working joint, and the remedy."""
     text = "no joint turns or slides for itself, so that there is nothing to drive"
     kinds = {joint.type_name() for joint in tree.joints} - {
         "weld",
@@ -279,7 +279,7 @@ def _why_none(tree: Tree) -> str:
 
 
 def _tip(tree: Tree, chain: Sequence[Joint]) -> str:
-    """The frame that a vendor means by the end of a chain, or else what is farthest out."""
+    """The vendor's frame at the end of a chain, otherwise the outermost one."""
     last, moving = chain[-1], {joint.index() for joint in chain}
     context = tree.plant.CreateDefaultContext()
     origin = last.frame_on_child().CalcPoseInWorld(context).translation()
@@ -296,7 +296,7 @@ def _tip(tree: Tree, chain: Sequence[Joint]) -> str:
 
 
 def _locked(tree: Tree, chain: Sequence[Joint]) -> dict[str, float]:
-    """Where each joint that is not of the chain stays; those that follow others follow."""
+    """The locked positions of joints outside the chain; mimic joints follow."""
     moving = {joint.index() for joint in chain}
     followers = {one.follower for one in tree.couplings}
     return {
@@ -309,6 +309,6 @@ def _locked(tree: Tree, chain: Sequence[Joint]) -> dict[str, float]:
 
 
 def _resting(joint: Joint) -> float:
-    """Zero, or what is closest to it within limits."""
+    """Zero, or the nearest value within limits."""
     low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     return float(min(max(0.0, low), high))

@@ -1,4 +1,4 @@
-"""What a robot shall do at a place: a surface, a circle on it, and a force."""
+"""The task at a place: a surface, a circle on it, and a force."""
 
 from dataclasses import dataclass
 from math import ceil, isfinite, log10, pi
@@ -16,10 +16,11 @@ SurfaceKind = Literal["plane", "cylinder", "sphere"]
 Path = CircleReference | SinusoidReference
 
 SHORTEST = 5.0
-"""A circle takes so long at least, in s."""
+"""The shortest period of a circle, in s."""
 
 _RADIUS, _BEND, _FORCE = 0.08, 0.4, 20.0
-"""Of the circle and of a curved surface, relative to the robot's size; and the largest force, N."""
+"""The radii of the circle and of a curved surface, relative to the robot's size; and the largest
+force, N."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +29,12 @@ class NewTask:
 
     Attributes:
         place: Where.
-        name: What the surface is called.
+        name: The name of the surface.
         surface: The surface.
         center: The point of the surface in the middle, m, rounded.
         radius: Of the circle, seen along the normal, m.
-        period: How long it takes, s.
-        force: How hard the tip presses, N.
+        period: The duration of a turn, s.
+        force: The force of the tip, N.
     """
 
     place: TipPlace
@@ -45,7 +46,7 @@ class NewTask:
     force: float
 
     def references(self, tip: str) -> dict[str, Path | float]:
-        """The circle of a frame, or the line where there is one way alone, and the force."""
+        """The circle of a frame, or the line if only one direction is free, and the force."""
         ways, middle = self.place.ways, [self.center[way] for way in self.place.ways]
         path: Path
         if len(ways) > 1:
@@ -57,7 +58,7 @@ class NewTask:
 
     @property
     def path(self) -> str:
-        """What the tip draws."""
+        """The path of the tip."""
         return "circle" if len(self.place.ways) > 1 else "line"
 
 
@@ -76,7 +77,7 @@ def circle(place: TipPlace, kind: SurfaceKind, share: float) -> NewTask:
     inner = (float(middle[0]), float(middle[1]), float(middle[2]))
     if kind == "cylinder":
         axis = [0.0, 0.0, 0.0]
-        axis[place.ways[-1]] = 1.0  # A robot that moves in a plane goes around it.
+        axis[place.ways[-1]] = 1.0  # A planar robot moves around it.
         if len(place.ways) == 1:
             axis = [float(k not in (place.axis, *place.ways)) for k in range(3)]
         surface: Surface = Cylinder(inner, (axis[0], axis[1], axis[2]), bend)

@@ -1,4 +1,4 @@
-"""A new scenario as text: every number with its unit, and why it is what it is."""
+"""A new scenario as text: every number with its unit and reason."""
 
 import json
 import re
@@ -14,10 +14,10 @@ from drake_dae.scenario.new.task import NewTask
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
 _PLAIN = re.compile(r"[A-Za-z_][\w/-]*(?:\.[\w/-]+)*")
-"""Text that YAML reads as such without quotes, but for its words for truth and nothing."""
+"""Text that needs no quotes in YAML, except its words for booleans and null."""
 
 _PATH = (TAG, "center", "radius", "period", "offset", "amplitudes", "frequencies")
-"""What is said of a path; the rest is at its default."""
+"""The keys of a path; the others have their defaults."""
 
 _WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 
@@ -39,8 +39,8 @@ def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Pa
     Args:
         scenario: The scenario, completed.
         robot: Its robot, with remarks.
-        task: What it does.
-        folder: Where it will be.
+        task: Its task.
+        folder: Its folder.
     """
     data = scenario_data(scenario)
     file = Path(data["robot"]["file"])
@@ -51,7 +51,7 @@ def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Pa
 
 def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[str]:
     yield "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m."
-    yield "# `drake-dae analyze FILE` tells how far limits and singularities are,"
+    yield "# `drake-dae analyze FILE` reports the margins to limits and singularities,"
     yield "# `drake-dae simulate FILE` runs it, and with --meshcat it is seen in a browser."
     yield f"description: {_flow(data['description'])}"
     yield "robot:"
@@ -102,7 +102,7 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[
 
 
 def _said(line: str, why: str) -> Iterator[str]:
-    """A line with its reason, which stands above where both are long."""
+    """A line with its reason, which is written above if both are long."""
     if len(line) + len(why) + 4 <= _WIDTH:
         yield f"{line}  # {why}"
         return
@@ -112,7 +112,7 @@ def _said(line: str, why: str) -> Iterator[str]:
 
 
 def _short(value: Any) -> Any:
-    """Data without keys that say no more than their defaults."""
+    """Data without keys that have their default values."""
     if not isinstance(value, Mapping):
         return value
     unsaid: tuple[Any, ...] = ("", [], {}, None, [0.0, 0.0, 0.0], [0.0])

@@ -1,4 +1,4 @@
-"""The bodies and joints of a robot, and where a chain of joints moves a point."""
+"""The bodies and joints of a robot, and the motion of a point by a chain of joints."""
 
 from collections.abc import Sequence
 
@@ -45,12 +45,12 @@ class Tree:
 
     @property
     def works(self) -> list[Joint]:
-        """The joints that turn or slide for themselves."""
+        """The independent rotational and sliding joints."""
         return [joint for joint in self.joints if self.can_work(joint)]
 
     @property
     def empty(self) -> list[str]:
-        """The names of joints whose limits leave them at one place."""
+        """The names of joints whose limits leave a single position."""
         return [
             self.names[joint.index()]
             for joint in self.joints
@@ -60,7 +60,7 @@ class Tree:
 
     @property
     def size(self) -> float:
-        """How far the bodies are from each other at most, in m, in the default configuration."""
+        """The largest distance between bodies, in m, in the default configuration."""
         context = self.plant.CreateDefaultContext()
         places = [
             self.plant.EvalBodyPoseInWorld(context, body).translation()
@@ -69,7 +69,7 @@ class Tree:
         return float(np.linalg.norm(np.ptp(places, axis=0)))
 
     def directions(self, chain: Sequence[Joint], frame: str, point: Vector) -> int:
-        """In how many directions a chain of joints moves a point, in most configurations."""
+        """The number of directions in which a chain of joints moves a point, generically."""
         context = self.plant.CreateDefaultContext()
         columns = [joint.velocity_start() for joint in chain]
         random = np.random.default_rng(0)
@@ -95,7 +95,7 @@ class Tree:
         return {name for one in self.couplings for name in (one.follower, one.leader)}
 
     def can_work(self, joint: Joint) -> bool:
-        """Whether a joint turns or slides for itself."""
+        """Whether a joint is an independent rotational or sliding joint."""
         if not isinstance(joint, RevoluteJoint | PrismaticJoint):
             return False
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]

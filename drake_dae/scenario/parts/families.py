@@ -1,4 +1,4 @@
-"""The families that a tag in a scenario chooses from. A new member is one line here."""
+"""The families from which a tag in a scenario chooses. A new member is one line here."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,9 +23,8 @@ from drake_dae.systems.plants.contact import disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
 from drake_dae.systems.task import phases
 
-# Vectors and arrays stand in a
-# file as `_WRITTEN` tells; numbers, text, truth values, Literals, dataclasses, tuples, and lists
-# and dictionaries of these stand for themselves.
+# Vectors and arrays are written as in `_WRITTEN`; numbers, text, booleans, Literals, dataclasses,
+# tuples, and lists and dictionaries of these are written directly.
 
 _WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
 

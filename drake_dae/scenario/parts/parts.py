@@ -1,4 +1,4 @@
-"""Parts of a scenario that are plain data and no class of the library: force, gains, start."""
+"""Parts of a scenario without a class in the library: force feedback, gains, start."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -72,8 +72,8 @@ class PerOutput:
     """Numbers for all outputs, or for each.
 
     Attributes:
-        all: For every output alike.
-        outputs: Output name -> its numbers; "*" is all others. Not beside `all`.
+        all: The numbers of every output.
+        outputs: Output name -> its numbers; "*" is all others. Only without `all`.
     """
 
     all: list[float] = field(default_factory=list)
@@ -90,7 +90,7 @@ class Poles(PerOutput):
 
     Attributes:
         all: The poles of every output, in 1/s.
-        outputs: Output name -> its poles, in 1/s; "*" is all others. Not beside `all`.
+        outputs: Output name -> its poles, in 1/s; "*" is all others. Only without `all`.
     """
 
     def design(self) -> GainDesign:

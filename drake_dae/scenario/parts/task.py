@@ -12,21 +12,20 @@ from drake_dae.systems.task.task import Task
 
 @dataclass(frozen=True)
 class ScenarioTask:
-    """What the robot does phase by phase, in place of `references`.
+    """A sequence of phases, in place of `references`.
 
-    It begins free, or in contact where the first phase does, at rest at start.positions or, on what
-    it touches, next to them. Where the contact is open its distance is an output, "wall.distance"
-    for example, in place of its force. With ideal constraints in `plant` the contact opens and
-    closes without a bounce.
+    It starts at rest at start.positions: free, or in contact next to them if the first phase starts
+    in contact. While the contact is open its distance is an output, "wall.distance" for example, in
+    place of its force. With ideal constraints in `plant` the contact opens and closes without
+    bouncing.
 
     Attributes:
-        phases: The phases, one after the other; after the last one the robot rests.
-        contact: The name of the constraint that opens and closes; not needed where one alone can.
-        contact_force: A force that is less than this, in N, is none.
-        patience: How long the force of a contact that shall hold may be none before the contact is
-            lost, in s.
+        phases: The phases in their order; after the last one the robot rests.
+        contact: The name of the constraint that opens and closes; not needed if there is only one.
+        contact_force: The force in N below which the contact counts as open.
+        patience: The time in s after which a contact without force counts as lost.
         gains: The gains of the law of the free robot, with the distance among its outputs; those of
-            `gains` where left out.
+            `gains` if left out.
     """
 
     phases: Sequence[Phase]
@@ -42,6 +41,6 @@ class ScenarioTask:
         """The task.
 
         Raises:
-            ModelError: The phases make no sense.
+            ModelError: The phases are not consistent.
         """
         return Task(self.phases, self.contact_force, self.patience)

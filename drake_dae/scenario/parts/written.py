@@ -25,7 +25,7 @@ class Written(ABC, Generic[T]):
         """The object that the library holds.
 
         Args:
-            constraints: The scenario's constraints, as far as they are made.
+            constraints: The scenario's constraints made so far.
 
         Raises:
             ModelError: Something does not fit.
@@ -33,19 +33,19 @@ class Written(ABC, Generic[T]):
 
 
 def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
-    """The object that the library holds for a form; its own classes are their own forms."""
+    """The library's object of a form; the library's own classes are their own forms."""
     return form.made(constraints) if isinstance(form, Written) else form
 
 
 @dataclass(frozen=True)
 class WeldedFrames(Written[contact.Constraint]):
-    """Frame B keeps a pose in frame A: `robots.contact.WeldedFrames`, its pose by angles.
+    """Frame B has a fixed pose in frame A, given by angles.
 
     Attributes:
-        frame_a: Name of frame A; "world" holds B in place.
+        frame_a: Name of frame A; it may be "world".
         frame_b: Name of frame B, on another body.
         pose: The pose of B in A; by default the frames coincide.
-        name: The name of the constraint, before those of its forces and its parameter.
+        name: The name of the constraint, the prefix of its forces and its parameter.
     """
 
     frame_a: str
@@ -61,10 +61,10 @@ class WeldedFrames(Written[contact.Constraint]):
 
 @dataclass(frozen=True)
 class SurfaceCoordinates(Written[outputs.PositionOutput]):
-    """The coordinates along a constraint: `robots.outputs.SurfaceCoordinates`.
+    """The coordinates along a constraint.
 
     Attributes:
-        constraint: The name of a constraint with coordinates, as a PointOnSurface on a !Plane.
+        constraint: The name of a constraint with coordinates, such as a PointOnSurface on a !Plane.
     """
 
     constraint: str
@@ -75,12 +75,12 @@ class SurfaceCoordinates(Written[outputs.PositionOutput]):
 
 @dataclass(frozen=True)
 class TiltFromNormal(Written[outputs.PositionOutput]):
-    """How far a tool's axis is off the normal where it touches: `robots.outputs.TiltFromNormal`.
+    """The tilt of a tool's axis from the surface normal at its contact.
 
     Attributes:
-        constraint: The name of a constraint with a free side, as a PointOnSurface.
+        constraint: The name of a constraint with a free side, such as a PointOnSurface.
         axis: The axis of its frame, "x", "y" or "z".
-        components: Which of the two other axes are rows, "xy" for example; both if empty.
+        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
     """
 
     constraint: str

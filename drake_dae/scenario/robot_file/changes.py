@@ -1,4 +1,4 @@
-"""What a scenario changes about the robot of its file: base, locked joints, actuators, payloads."""
+"""Changes of a scenario to the robot of its file: base, locked joints, actuators, payloads."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,12 +31,12 @@ from drake_dae.scenario.robot_file.robot import Base, Robot
 
 
 def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
-    """Makes what a scenario says of a robot beside its file.
+    """Applies the changes that a scenario makes to the robot of its file.
 
     Args:
-        robot: What the scenario has under `robot`.
+        robot: The key `robot` of the scenario.
         plant: The robot of that file, not finalized.
-        efforts: The effort limits of the file, for actuators that it has not.
+        efforts: The effort limits of the file, for actuators that it does not declare.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -59,7 +59,7 @@ def finalize(plant: MultibodyPlant) -> None:
     """Finalizes a plant.
 
     Raises:
-        ModelError: Drake refuses to.
+        ModelError: Drake cannot finalize it.
     """
     with _told_by_drake():
         plant.Finalize()
@@ -67,7 +67,7 @@ def finalize(plant: MultibodyPlant) -> None:
 
 @contextmanager
 def _told_by_drake() -> Iterator[None]:
-    """Makes errors of Drake ours, SystemExit for an assertion of its own as well."""
+    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
     try:
         yield
     except DrakeDaeError:
@@ -77,7 +77,7 @@ def _told_by_drake() -> Iterator[None]:
 
 
 def _read_couplings(robot: Robot) -> Sequence[Coupling]:
-    """The couplings of the file, from a plant of its own: only a finalized one tells them."""
+    """The couplings of the file, read from a separate plant: only a finalized plant has them."""
     plant, _ = read_robot(robot)
     finalize(plant)
     return couplings_of(plant)
@@ -85,10 +85,10 @@ def _read_couplings(robot: Robot) -> Sequence[Coupling]:
 
 @at("robot.base.weld")
 def weld_base(base: Base, plant: MultibodyPlant) -> None:
-    """Welds a frame of a body that no joint holds to the world.
+    """Welds a frame of a body without a joint to the world.
 
     Raises:
-        ScenarioError: There is no such frame, or a joint holds its body.
+        ScenarioError: There is no such frame, or its body has a joint.
     """
     try:
         frame = GetScopedFrameByName(plant, base.weld)
@@ -97,12 +97,12 @@ def weld_base(base: Base, plant: MultibodyPlant) -> None:
         raise ModelError(unknown_name("free body or frame on it", base.weld, free)) from None
     body = frame.body()
     if body.index() == plant.world_body().index():
-        raise ModelError("the world holds itself; name a frame of the robot")
+        raise ModelError("the world needs no base; name a frame of the robot")
     held = [joint.name() for joint in _joints(plant) if joint.child_body() is body]
     if held:
         raise ModelError(
-            f"body '{body.name()}' is held already, by joint '{held[0]}'; bodies that nothing "
-            f"holds: {', '.join(_free_bodies(plant)) or 'none'}"
+            f"body '{body.name()}' is attached already, by joint '{held[0]}'; unattached bodies: "
+            f"{', '.join(_free_bodies(plant)) or 'none'}"
         )
     rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
     plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
@@ -110,10 +110,10 @@ def weld_base(base: Base, plant: MultibodyPlant) -> None:
 
 @at("robot.free")
 def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
-    """Gives bodies that no joint holds one in roll, pitch and yaw, for which files have no word.
+    """Gives bodies without a joint a floating joint in roll, pitch and yaw.
 
     Raises:
-        ScenarioError: There is no such body, or a joint holds it.
+        ScenarioError: There is no such body, or it has a joint.
     """
     for name in bodies:
         try:
@@ -130,14 +130,14 @@ def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 def lock_joints(
     locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
 ) -> None:
-    """Puts a weld in the place of joints, at given positions.
+    """Replaces joints by welds at given positions.
 
-    Drake locks joints in discrete time alone. A weld has the same motion: X_FM(q) of the joint,
-    from its frame on the parent to that on the child, at the constant q. The torque that holds the
-    joint is then one inside of a body; the actuator, damping and rotor of the joint are gone.
+    Drake locks joints in discrete time only. A weld has the same motion: X_FM(q) of the joint, from
+    its frame on the parent to that on the child, at the constant q. The torque in the joint becomes
+    internal to a body; the actuator, damping and rotor of the joint are removed.
 
-    A joint that a locked one leads, q_f = ratio q_l + offset, is locked with it, and likewise the
-    one that leads a locked one.
+    Joints coupled to a locked one, q_f = ratio q_l + offset, are locked with it, followers and
+    leaders.
 
     Args:
         locked: Name -> position, in rad or m.
@@ -171,12 +171,12 @@ def lock_joints(
 
 @contextmanager
 def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -> Iterator[None]:
-    """Takes the constraints out of a plant, and puts them back between joints that are left.
+    """Removes the constraints of a plant, and restores those between remaining joints.
 
-    Drake removes joints only where there are no constraints.
+    Drake removes joints only from plants without constraints.
 
     Raises:
-        ModelError: The plant has others than these couplings.
+        ModelError: The plant has constraints other than these couplings.
     """
     if plant.num_constraints() > len(couplings):
         raise ModelError(
@@ -210,7 +210,7 @@ def _spread(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
 
 
 def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
-    """Puts a weld in the place of a joint with one position."""
+    """Replaces a joint with one position by a weld."""
     name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
     if isinstance(joint, PrismaticJoint):
         pose = RigidTransform(position * joint.translation_axis())
@@ -233,13 +233,13 @@ def drive_joints(
     couplings: Sequence[Coupling],
     efforts: Mapping[str, float],
 ) -> None:
-    """Gives actuators to the joints that a scenario names, and takes them from all others.
+    """Gives actuators to the joints that a scenario names, and removes those of all others.
 
-    An actuator that the file has stays, with its gear ratio and its rotor.
+    An actuator of the file is kept, with its gear ratio and its rotor.
 
     Args:
-        driven: Names of joints, or name -> effort limit in N m or N; or "all" that turn or slide
-            and follow no other.
+        driven: Names of joints, or name -> effort limit in N m or N; or "all", the revolute and
+            prismatic joints that mimic no other.
         plant: The robot, not finalized; changed.
         couplings: Those of the plant.
         efforts: Name -> effort limit of the file, for actuators that are new and have none.
@@ -291,7 +291,7 @@ def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
 
 
 def _free_bodies(plant: MultibodyPlant) -> list[str]:
-    """The names of the bodies that no joint holds, without the world."""
+    """The names of the bodies without a joint, except the world."""
     held = {joint.child_body().index() for joint in _joints(plant)}
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     return unique_names(plant, [body for body in bodies if body.index() not in held])

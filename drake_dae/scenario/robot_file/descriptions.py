@@ -1,4 +1,4 @@
-"""Robots by their name in the package robot_descriptions."""
+"""Robots of the package robot_descriptions, by their names."""
 
 from difflib import get_close_matches
 from importlib import import_module
@@ -10,11 +10,11 @@ from drake_dae.errors import ModelError
 
 
 class Description(NamedTuple):
-    """A robot that robot_descriptions has.
+    """A robot of robot_descriptions.
 
     Attributes:
         file: Its URDF or MJCF file.
-        folders: Folders in which its packages lie, under their names.
+        folders: Folders that contain its packages, under their names.
     """
 
     file: Path
@@ -22,10 +22,10 @@ class Description(NamedTuple):
 
 
 def find_description(name: str) -> Description:
-    """The robot with a name such as "panda_description"; it is fetched where it is not yet.
+    """The robot with a name such as "panda_description"; downloaded if necessary.
 
     Raises:
-        ModelError: There is none, it cannot be fetched, or the package is not installed.
+        ModelError: There is none, it cannot be downloaded, or the package is not installed.
     """
     try:
         known = import_module("robot_descriptions").DESCRIPTIONS
@@ -58,7 +58,7 @@ def find_description(name: str) -> Description:
 
 
 def _folders(module: Any, file: Path) -> tuple[Path, ...]:
-    """Where the loaders of robot_descriptions look for packages."""
+    """The folders in which the loaders of robot_descriptions look for packages."""
     package, repository = (
         Path(getattr(module, key, file.parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
     )

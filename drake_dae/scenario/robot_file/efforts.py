@@ -1,4 +1,4 @@
-"""Effort limits of a robot's files that Drake does not keep, or keeps in another unit."""
+"""Effort limits of a robot's files that Drake does not read, or reads in another unit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,23 +26,23 @@ def read_efforts(models: Mapping[str, Path]) -> Efforts:
         try:
             root = ElementTree.fromstring(file.read_bytes())
         except ElementTree.ParseError:
-            continue  # Drake reads prefixes that nobody declares.
+            continue  # Drake accepts undeclared prefixes.
         for joint in root.iterfind("joint"):
             limit = joint.find("limit")
             try:
                 effort = float("" if limit is None else limit.get("effort", ""))
             except ValueError:
                 continue
-            if 0.0 < effort < np.inf:  # Many write 0 for what they do not know.
+            if 0.0 < effort < np.inf:  # Many authors write 0 for an unknown limit.
                 found[instance, joint.get("name", "")] = effort
     return found
 
 
 def limit_joints(plant: MultibodyPlant, models: Mapping[str, Path]) -> None:
-    """Makes limits of the motors in MJCF files those of their joints.
+    """Converts limits of the motors in MJCF files to effort limits of their joints.
 
-    A motor of MJCF puts gear times its control on the joint. Drake has the limit of the control,
-    and its control is what the joint feels.
+    A motor of MJCF applies gear times its control to the joint. Drake reads the limit of that
+    control, but its own control is the effort at the joint.
 
     Args:
         plant: The robot, not finalized; changed.

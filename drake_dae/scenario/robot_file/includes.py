@@ -1,4 +1,4 @@
-"""Files of a robot that include themselves, which Drake's parser would follow without end."""
+"""Files of a robot that include themselves, on which Drake's parser would not end."""
 
 import re
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ _INCLUDED[".yml"] = _INCLUDED[".yaml"]
 """Per kind of file: what it includes."""
 
 MOST = 1000
-"""So many files a robot has at most, each counted as often as it is included."""
+"""The largest number of files of a robot, each counted as often as it is included."""
 
 
 def check_includes(file: Path, packages: PackageMap) -> None:
@@ -30,7 +30,7 @@ def check_includes(file: Path, packages: PackageMap) -> None:
         packages: The packages that URLs name.
 
     Raises:
-        ModelError: It does; the message has the chain of files.
+        ModelError: It does; the message has the chain of includes.
     """
     waiting: list[tuple[Path, ...]] = [(file.resolve(),)]
     count = 0
@@ -47,7 +47,7 @@ def check_includes(file: Path, packages: PackageMap) -> None:
 
 
 def _included(file: Path, first: Path, packages: PackageMap) -> Iterator[Path]:
-    """The files that a file includes; what leads nowhere Drake tells."""
+    """The files that a file includes; missing ones are left to Drake's message."""
     form = _INCLUDED.get(file.suffix)
     if form is None or not file.is_file():
         return

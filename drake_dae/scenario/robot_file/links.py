@@ -36,11 +36,11 @@ def add_robot(
         robot: The robot.
         plant: The plant, registered in the scene graph.
         scene_graph: The scene graph.
-        payloads: What the scenario has under `plant_payloads`.
+        payloads: The key `plant_payloads` of the scenario.
 
     Raises:
-        ScenarioError: Drake cannot read the file, or drops something of it; or what the scenario
-            says beside it does not fit.
+        ScenarioError: Drake cannot read the file, or ignores parts of it; or a change of the
+            scenario does not fit it.
     """
     change_robot(robot, plant, read_into(plant, robot, scene_graph))
     add_payloads("plant_payloads", payloads, plant)
@@ -51,12 +51,12 @@ def add_robot(
 def robot_links(
     robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
 ) -> tuple[MultibodyExpressions, list[Constraint]]:
-    """The links of a scenario's robot, and the constraints that those joints are which close loops.
+    """The links of a scenario's robot, and its loop-closing joints as constraints.
 
     Args:
-        robot: What the scenario has under `robot`.
+        robot: The key `robot` of the scenario.
         scene_graph: Where its geometry is registered.
-        payloads: What the scenario has under `plant_payloads`, for the links of the plant.
+        payloads: The key `plant_payloads` of the scenario, for the links of the plant.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -88,7 +88,7 @@ def robot_links(
 
 
 def _check_mass(plant: MultibodyPlant) -> None:
-    """Refuses joints that move no mass: no force decides how they accelerate.
+    """Refuses joints that move no mass: their acceleration is not determined.
 
     Raises:
         ModelError: M(q) is singular in the default configuration, and in others.
@@ -96,7 +96,7 @@ def _check_mass(plant: MultibodyPlant) -> None:
     context = plant.CreateDefaultContext()
     default = plant.GetPositions(context)
     random = np.random.default_rng(0)
-    # A point mass at the end of a straight arm makes M(q) singular there alone.
+    # A point mass at the end of a straight arm makes M(q) singular in that configuration only.
     for step in (np.zeros_like(default), *random.uniform(-1.0, 1.0, (3, default.size))):
         plant.SetPositions(context, default + step)
         values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))

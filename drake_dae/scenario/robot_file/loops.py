@@ -1,4 +1,4 @@
-"""Joints of a robot's file that close loops: cut out of the tree, and made constraints."""
+"""Joints of a robot's file that close loops: removed from the tree and converted to constraints."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ from drake_dae.robots.surfaces.surface import axes_along, triple
 
 @dataclass(frozen=True)
 class CutJoint:
-    """A joint that closes a loop, as it was in the plant.
+    """A joint that closes a loop, as read from the plant.
 
     Attributes:
         name: Its name.
-        slides: Whether it slides; else it turns.
+        slides: Whether it is prismatic; else it is revolute.
         bodies: The indices of parent and child.
         poses: The poses of its frames on parent and child.
         axis: Its axis in these frames, shape (3,).
-        options: What the constraint has of it: damping, limits, motor.
+        options: Its damping, limits and motor, as arguments of the constraint.
     """
 
     name: str
@@ -39,13 +39,13 @@ class CutJoint:
 
 
 def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
-    """Takes joints out of a plant until the others form a tree; a driven one only if it must be.
+    """Removes joints of a plant until the others form a tree; driven ones only if necessary.
 
     Args:
         plant: Not finalized; changed.
 
     Raises:
-        ModelError: A loop has no joint that can be cut, or Drake cannot take it out.
+        ModelError: A loop has no joint that can be cut, or Drake cannot remove it.
     """
     driven = {a.joint().index(): a for a in _actuators(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
@@ -56,7 +56,7 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
 
 
 def closing_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The joints of a plant that is not finalized without which the others form a tree."""
+    """The loop-closing joints of a plant that is not finalized: the others form a tree."""
     driven = {a.joint().index() for a in _actuators(plant)}
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     joints.sort(key=lambda joint: _reluctance(joint, joint.index() in driven), reverse=True)
@@ -79,7 +79,7 @@ def closing_joints(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _reluctance(joint: Joint, is_driven: bool) -> int:
-    """The higher, the later it is cut."""
+    """Joints with a higher value are cut later."""
     if not isinstance(joint, RevoluteJoint | PrismaticJoint):
         return 2
     return 1 if is_driven else 0
@@ -127,13 +127,13 @@ def _cut(
 
 
 def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Constraint]:
-    """The constraints that cut joints are.
+    """The constraints that replace cut joints.
 
-    Where all joints of a loop move in one plane, the constraint is one of that plane alone: in
-    space it would be redundant.
+    If all joints of a loop move in one plane, the constraint is planar: a spatial one would be
+    redundant.
 
     Args:
-        cuts: What `cut_loops` returned.
+        cuts: The result of `cut_loops`.
         plant: The robot, finalized.
     """
     return [_constraint(cut, plant) for cut in cuts]
@@ -178,7 +178,7 @@ def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArra
 
 
 def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArray]]:
-    """Of the joints between two bodies: whether it slides, and its axis in the world."""
+    """The joints between two bodies: whether each is prismatic, and its axis in the world."""
     context = plant.CreateDefaultContext()
     above: dict[int, Joint] = {
         int(joint.child_body().index()): joint
@@ -196,7 +196,7 @@ def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArr
         if isinstance(joint, WeldJoint):
             continue
         if not isinstance(joint, RevoluteJoint | PrismaticJoint):
-            yield False, np.array([1.0, 0.0, 0.0])  # It moves out of any plane.
+            yield False, np.array([1.0, 0.0, 0.0])  # Its motion is not planar.
             yield False, np.array([0.0, 1.0, 0.0])
             continue
         slides = isinstance(joint, PrismaticJoint)

@@ -14,14 +14,14 @@ from drake_dae.scenario.shipped import FOLDER
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
 _MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
-"""What files end with that may name packages themselves."""
+"""The suffixes of files that may name packages themselves."""
 
 
 def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
     """Adds the shipped package and those of `robot.packages`.
 
     Raises:
-        ScenarioError: A folder is not there, or the name is Drake's.
+        ScenarioError: A folder does not exist, or the name is one of Drake's.
     """
     known.AddPackageXml(str(FOLDER / "models" / "package.xml"))
     for name, folder in packages.items():
@@ -35,20 +35,20 @@ def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
 def find_packages(
     file: str, known: PackageMap, places: Sequence[Path] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Adds the packages that a file names, and that files which it names do.
+    """Adds the packages that a file names, and those named by the files that it includes.
 
-    A package is looked for beside the file that names it: in each folder above that file, a folder
-    of that name or that one itself, with a package.xml that bears the name. Then it is looked for
-    in ROS_PACKAGE_PATH, and then in places.
+    A package is searched near the file that names it: each folder above that file, and each
+    subfolder of the package's name in one of these, if it has a package.xml with the name. Then it
+    is searched in ROS_PACKAGE_PATH, and then in places.
 
     Args:
         file: A path, or a URL of a package.
-        known: The packages that are found already; others are added.
-        places: Where packages lie as folders of their name.
+        known: The packages found already; new ones are added.
+        places: Folders with packages as subfolders of their names.
 
     Returns:
-        The folders of the packages that are added, and what is not found: its name -> a file that
-        names it, or "" where `file` itself does.
+        The folders of the added packages, and the packages not found: name -> a file that names it,
+        or "" for `file` itself.
     """
     folders: list[Path] = []
     missing: dict[str, str] = {}
@@ -80,7 +80,7 @@ def find_packages(
 
 
 def explained(missing: Mapping[str, str]) -> str:
-    """What to do about packages that are not found."""
+    """The remedy for packages that are not found, as text."""
     name, origin = next(iter(missing.items()))
     where = (
         f", which '{Path(origin).name}' names, is neither beside it" if origin else " is neither"
@@ -95,7 +95,7 @@ def explained(missing: Mapping[str, str]) -> str:
 
 
 def _path(url: str, known: PackageMap) -> Path | None:
-    """The file that a path or a URL leads to; None where it leads nowhere."""
+    """The file of a path or a URL; None if there is none."""
     if "://" not in url:
         return Path(url)
     try:

@@ -1,4 +1,4 @@
-"""Masses that a scenario fastens to a robot."""
+"""Masses that a scenario attaches to a robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from drake_dae.scenario.forms.values import Triple
 
 @dataclass(frozen=True)
 class Payload:
-    """A mass without extension that is fastened to a robot.
+    """A point mass attached to a robot.
 
     Attributes:
-        frame: Name of the frame that holds it.
+        frame: Name of the frame to which it is attached.
         mass: Its mass, in kg; the parameter "<name>.mass".
-        point: Where it is in the frame, m.
+        point: Its position in the frame, m.
         name: The name of its body.
     """
 

@@ -1,4 +1,4 @@
-"""The robot's files as a MultibodyPlant, with what a scenario changes about it."""
+"""The robot's files as a MultibodyPlant, with the changes of a scenario."""
 
 import logging
 import re
@@ -32,7 +32,7 @@ _IDLE = {
     *("timestep", "integrator", "solver", "iterations", "ls_iterations", "tolerance", "jacobian"),
     *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
 }
-"""What MJCF has and Drake leaves out that no equation of ours has."""
+"""Parts of MJCF that Drake ignores and that do not affect the equations."""
 
 
 def read_robot(
@@ -41,17 +41,17 @@ def read_robot(
     """A plant in continuous time with the models of the robot's file, not finalized.
 
     Args:
-        robot: What the scenario has under `robot`.
-        scene_graph: Where the robot's geometry is registered; None leaves geometry out.
+        robot: The key `robot` of the scenario.
+        scene_graph: Registers the robot's geometry; None leaves geometry out.
 
     Returns:
         The plant, and the effort limits of joints without an actuator.
 
     Raises:
-        ModelError: The files cannot be read, or hold what is not supported.
+        ModelError: The files cannot be read, or are not supported.
         ScenarioError: Something does not fit; the message names its key.
     """
-    # Continuous: only then are the plant's own dynamics those of (37).
+    # In continuous time, in which the plant's own dynamics are those of (37).
     plant = MultibodyPlant(0.0)
     if scene_graph is not None:
         plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -65,8 +65,8 @@ def read_into(
 
     Args:
         plant: The plant.
-        robot: What the scenario has under `robot`.
-        scene_graph: Where the plant is registered; None leaves geometry out.
+        robot: The key `robot` of the scenario.
+        scene_graph: Registers the plant's geometry; None leaves geometry out.
 
     Returns:
         The effort limits of joints without an actuator.
@@ -97,7 +97,7 @@ def read_into(
         except (ScenarioError, ModelError):
             raise
         except (RuntimeError, ValueError, SystemExit) as error:
-            # Drake has all of them: SystemExit for what an assertion of its own finds.
+            # Drake raises any of them: SystemExit for a failed assertion.
             text = copies.named(str(error))
             unknown = {name: origin for name, origin in missing.items() if name in text}
             raise ModelError(explained(unknown) if unknown else _with_remedy(text)) from None
@@ -107,11 +107,11 @@ def read_into(
     if "constraints" in robot.leave_out:
         for key in plant.GetConstraintIds():
             plant.RemoveConstraint(key)
-    told = [text for text in dropped.warnings if not _is_answered(text, robot)]
-    # The parser of SDFormat tells of a link twice, once without the place.
-    told = [text for text in told if not text.startswith("warning: ")] or told
-    if told:
-        raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
+    warned = [text for text in dropped.warnings if not _is_answered(text, robot)]
+    # The parser of SDFormat reports a link twice, once without the line.
+    warned = [text for text in warned if not text.startswith("warning: ")] or warned
+    if warned:
+        raise ModelError("; ".join(_explained(copies.named(text)) for text in warned))
     if scene_graph is not None:
         own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
         own += places[:2]  # The package and the repository of a description.
@@ -130,17 +130,17 @@ _REMEDIES = {
     r"pos_lower_limits": "the lower limit of a joint is above its upper limit; mend them in the "
     "file",
 }
-"""What Drake's message has -> what to do about it."""
+"""A part of Drake's message -> the remedy."""
 
 
 def _with_remedy(text: str) -> str:
-    """A message of Drake's, and what to do."""
+    """A message of Drake's, with the remedy."""
     remedies = (remedy for known, remedy in _REMEDIES.items() if re.search(known, text))
     return "; ".join([text.rstrip("."), *remedies]) if text else text
 
 
 def _is_answered(warning: str, robot: Robot) -> bool:
-    """Whether the scenario says what to do about a warning of Drake's parser."""
+    """Whether a warning of Drake's parser is settled by the scenario."""
     if "effort limit" in warning:
         return robot.actuators is not None
     if "inertia" in warning:
@@ -151,7 +151,7 @@ def _is_answered(warning: str, robot: Robot) -> bool:
 
 
 def _tell_repairs(copies: Copies, robot: Robot) -> None:
-    """Names the inertias that no body can have, and what is taken for them."""
+    """Warns of impossible inertias, with their replacements."""
     if not copies.repaired:
         return
     if "inertia" not in robot.leave_out:
@@ -164,13 +164,13 @@ def _tell_repairs(copies: Copies, robot: Robot) -> None:
 
 
 def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
-    """Takes limits from joints that leave them at one place, and limits of 0 of their speed.
+    """Removes position limits that are empty intervals, and speed limits of 0.
 
-    Many write 0 for what they do not know, as they do for effort limits.
+    Many authors write 0 for an unknown limit.
 
     Args:
         plant: The robot, not finalized; changed.
-        of_positions: Whether limits of positions are taken.
+        of_positions: Whether position limits are removed.
     """
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -184,7 +184,7 @@ def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
 
 
 def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
-    """Names the geometry that is not read, or not drawn, in one line each."""
+    """Warns of geometry that is not read, or not drawn, in one line each."""
     if unread:
         warnings.warn(
             f"geometry that Drake cannot read is left out: {_listed(unread)}; no equation needs it",
@@ -213,11 +213,11 @@ def _listed(files: list[Path]) -> str:
 
 @contextmanager
 def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
-    """Listens to what Drake's parser tells."""
+    """Collects the messages of Drake's parser."""
     log = logging.getLogger("drake")
     level, dropped = log.level, _Dropped(log.getEffectiveLevel(), copies)
     log.addFilter(dropped)
-    log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
+    log.setLevel(logging.WARNING)  # Warnings are collected at any log level of the user.
     try:
         yield dropped
     finally:
@@ -226,7 +226,7 @@ def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
 
 
 class _Dropped(logging.Filter):
-    """Collects what Drake's parser changes or leaves out, with no more than a warning."""
+    """Collects the warnings of Drake's parser about changed or ignored parts."""
 
     KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
 
@@ -251,7 +251,7 @@ class _Dropped(logging.Filter):
 def _explained(warning: str) -> str:
     """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint.
 
-    That of SDFormat may have no place.
+    For SDFormat the file and line may be missing.
     """
     before, _, text = warning.rpartition("warning: ")
     place = before.removesuffix(": ") or "the robot's file"
@@ -284,11 +284,11 @@ def _explained(warning: str) -> str:
 
 
 _WITH_COMMA = re.compile(r"(?:=\s*[\"']|>)\s*([-+.\deE\s]*\d,\d[-+.\deE,\s]*)[\"'<]")
-"""A value of XML that is but numbers, with a comma between two digits."""
+"""A value of XML with numbers only, and a comma between two digits."""
 
 
 def _check_text(file: Path) -> None:
-    """Refuses what Drake would pass over: a second robot in a URDF, and what follows a comma."""
+    """Refuses text that Drake ignores: a second robot in a URDF, and digits after a comma."""
     if file.suffix not in (".urdf", ".sdf", ".xml"):
         return
     text = re.sub(r"<!--.*?-->", _lines, file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
@@ -306,7 +306,7 @@ def _check_text(file: Path) -> None:
 
 
 def _lines(found: re.Match[str]) -> str:
-    """As many lines as there were."""
+    """The line breaks of the text."""
     return "\n" * found[0].count("\n")
 
 

@@ -1,7 +1,7 @@
-"""Which files a robot's geometry may be read from.
+"""The files that a robot's geometry may be read from.
 
-Meshcat copies meshes, and the files that they name, into the page that it writes. A model from a
-stranger could name any file of this machine, and the page would take it along when it is sent.
+Meshcat copies meshes, and the files that they name, into its HTML page. A model from an untrusted
+source could name any file of this machine, which would be disclosed with the page.
 """
 
 import json
@@ -18,7 +18,7 @@ from pydrake.geometry import Role, SceneGraph
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file.readable.converted import ORIGINALS
 
-# Generous, since readers of these formats are: options and line ends may stand before a name.
+# Matches more than the formats permit, since their parsers do: options and line ends before a name.
 _MATERIAL_LIBRARY = re.compile(r"mtllib\s+([^\r\n]+)")
 _TEXTURE = re.compile(r"(?:map_|bump|disp|decal|norm|refl)[^\r\n]*[\r\n]*[^\r\n]*", re.IGNORECASE)
 _COLLADA_IMAGE = re.compile(r"<(?:\w+:)?(?:init_from|ref)\b[^>]*>\s*([^<]+?)\s*<")
@@ -31,17 +31,16 @@ _OUTSIDE = (
 
 
 def package_folder(model: Path) -> Path:
-    """The folder that a model file may read from: that of its package, or else its own."""
+    """The folder that a model file may read from: its package's, or else its own."""
     folder = model.resolve().parent
     homes = (above for above in (folder, *folder.parents) if (above / "package.xml").is_file())
     return next(homes, folder)
 
 
 def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
-    """Refuses a mesh or texture, or what a mesh names, that is outside of all folders.
+    """Refuses meshes, textures and files named by meshes that are outside of all folders.
 
-    Links in the file system are followed: what counts is where a file really is. Drake's own
-    packages are always allowed.
+    Symbolic links are followed: the actual path counts. Drake's own packages are always allowed.
 
     Args:
         scene_graph: With the geometry of the robot, not drawn yet.
@@ -70,7 +69,7 @@ def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
 
 
 def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
-    """Refuses what a file names outside of the folders, and what those files name."""
+    """Refuses files outside of the folders that a file names, directly or through others."""
     waiting, seen = [file], set()
     while waiting:
         current = waiting.pop()
@@ -80,7 +79,7 @@ def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
         for name in _references(current):
             if name.lower().startswith("data:"):
                 continue
-            # Percent signs are decoded by some readers, and taken as they are by Drake's.
+            # Percent encoding is decoded by some parsers, and not by Drake's.
             for spelled in {name, unquote(name)}:
                 target = current.parent / spelled
                 if _SCHEME.match(spelled) or not _is_within(target, allowed):
@@ -92,7 +91,7 @@ def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
 
 
 def _references(file: Path) -> Iterator[str]:
-    """The files that a mesh or a material names, as they are written."""
+    """The files that a mesh or a material names, as written."""
     kind = file.suffix.lower()
     if kind not in (".gltf", ".obj", ".mtl", ".dae"):
         return
@@ -113,10 +112,10 @@ def _references(file: Path) -> Iterator[str]:
 
 
 def _uris(data: Any) -> Iterator[str]:
-    """The entries "uri" of buffers, of images, and of whatever an extension adds.
+    """The entries "uri" of buffers, images and extensions.
 
     Args:
-        data: JSON, with objects as lists of (key, value): a key may be there twice.
+        data: JSON, with objects as lists of (key, value): a key may occur twice.
     """
     if isinstance(data, tuple) and data[0] == "uri" and isinstance(data[1], str):
         yield data[1]
@@ -128,13 +127,13 @@ def _uris(data: Any) -> Iterator[str]:
 def _is_within(file: Path, folders: list[Path]) -> bool:
     try:
         real = file.resolve()
-    except (OSError, RuntimeError, ValueError):  # A loop of links, or no path at all.
+    except (OSError, RuntimeError, ValueError):  # A cycle of symbolic links, or an invalid path.
         return False
     return any(real.is_relative_to(folder) for folder in folders)
 
 
 def _drake_folders() -> Iterator[Path]:
-    """Where Drake's packages are: those that it brings, and those that it downloads."""
+    """The folders of Drake's packages, installed and downloaded."""
     yield Path(GetDrakePath())
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     yield Path(cache) / "drake" / "package_map"

@@ -1,4 +1,4 @@
-"""The robot of a scenario: a file, and what the file does not say of it."""
+"""The robot of a scenario: a file, and additions to it."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from drake_dae.scenario.robot_file.payloads import Payload
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a frame stands in another one, as in Drake's model directives.
+    """The pose of a frame in another one, as in Drake's model directives.
 
     Attributes:
         translation: Its origin, m.
@@ -30,10 +30,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class Base:
-    """Where a robot stands whose file does not say it.
+    """The placement of a robot whose file does not fix it to the world.
 
     Attributes:
-        weld: A link that no joint holds, or a frame on it: "base_link", or "left::base_link".
+        weld: A link without a joint to a parent, or a frame on it: "base_link", or
+            "left::base_link".
         pose: The pose of that frame in the world.
     """
 
@@ -42,7 +43,7 @@ class Base:
 
 
 def _actuators(value: Any) -> Any:
-    """Refuses what is none of the ways to name driven joints."""
+    """Checks the forms in which driven joints may be named."""
     if value is None or value == "all":
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
@@ -78,48 +79,49 @@ Actuators = Annotated[
         }
     ),
 ]
-"""Which joints are driven: "all", names, or name -> effort limit."""
+"""The driven joints: "all", names, or name -> effort limit."""
 
 
 LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
-"""What a scenario may leave out of a robot's file."""
+"""The parts of a robot's file that a scenario may leave out."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot that Drake's Parser reads, and what its file does not say of it.
+    """A robot that Drake's Parser reads, with additions to its file.
 
-    Meshes that Drake cannot read, as collisions in .stl or .dae, are left out: no equation needs
-    them.
-    Joints that mimic another one are constraints "<joint>_coupler". Joints that close loops, as in
-    SDFormat, are constraints of their names; where a loop has joints without motors, one of these.
+    Meshes that Drake cannot read, such as collision meshes in .stl or .dae, are left out: no
+    equation needs them. Joints that mimic another one become constraints "<joint>_coupler". A joint
+    that closes a loop, as in SDFormat, becomes a constraint of its name; of each loop a joint
+    without motor is chosen, if there is one.
 
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
         description: Instead of a file: a robot of the package robot_descriptions by its name there,
             "panda_description", cloned when it is first used (the extra `descriptions`).
-        packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
-            of which a package.xml lies in a folder above the file that names them, or beside such a
-            folder under their name, and those in ROS_PACKAGE_PATH are found without it.
-        free: Names of bodies that no joint holds, "object" or "puck::object", or that the file
-            fixes to the world: they get a joint in roll, pitch and yaw, with the positions
-            "object_qx", "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file has such
-            positions as well, in the place of a quaternion.
-        base: What is welded to the world, where the file does not do it, or elsewhere than it does.
-        locked: Joint name -> position in rad or m where it stays, for joints that turn or slide; a
-            joint that is coupled to it stays as well. Such joints are none in the rest of the
-            scenario.
-        actuators: The driven joints, where they are others than those of the file: a list of
-            names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
-            other. Where no limit is given it is that of the file. Controls have this order, after
-            those that the file gives actuators.
-        leave_out: What the file has and the equations have not, which without this is refused:
-            joint_friction, which is Coulomb friction; inertia that no body can have, in whose place
-            the nearest possible one is taken; empty_limits, the position limits of joints that
-            they leave no room, 0 to 0 for example; constraints, all those that the file has beside
-            its joints, as <equality> of MJCF, which are then written under `constraints`.
-        payloads: Masses that it carries, which plant and law have both.
+        packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Not
+            needed for packages with a package.xml in a folder above the file that names them, or in
+            a folder of their name beside one of these, nor for those in ROS_PACKAGE_PATH.
+        free: Names of bodies without a joint, "object" or "puck::object", or that the file fixes to
+            the world: they get a joint in roll, pitch and yaw, with the positions "object_qx",
+            "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file also gets such positions,
+            instead of a quaternion.
+        base: The link that is welded to the world, if the file does not do it, or does it at
+            another pose.
+        locked: Joint name -> constant position in rad or m, for revolute and prismatic joints;
+            joints coupled to it are locked as well. The rest of the scenario must not name locked
+            joints.
+        actuators: The driven joints, if they differ from those of the file: a list of names, or
+            name -> effort limit in N m or N, or "all" revolute and prismatic joints that mimic no
+            other. A limit that is not given is that of the file. Controls have this order, after
+            those of the file's own actuators.
+        leave_out: Parts of the file to leave out, which are refused otherwise: joint_friction,
+            which is Coulomb friction; inertia, impossible inertias, which are replaced by the
+            nearest possible ones; empty_limits, position limits that are empty intervals, 0 to 0
+            for example; constraints, all those of the file except joints, such as <equality> of
+            MJCF, to be written under `constraints` instead.
+        payloads: Masses attached to it, in plant and law.
     """
 
     file: str = ""
@@ -139,5 +141,5 @@ class Robot:
 
     @property
     def title(self) -> str:
-        """What messages and systems call it: "two_arms" of "two_arms.dmd.yaml"."""
+        """Its name in messages and systems: "two_arms" of "two_arms.dmd.yaml"."""
         return self.description or Path(self.file).name.split(".")[0]

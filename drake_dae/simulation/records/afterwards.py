@@ -1,4 +1,4 @@
-"""What a record has that was not logged: it follows from what was."""
+"""Signals of a record that are computed from the logged ones."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -17,7 +17,7 @@ from drake_dae.systems.plants.contract import Plant
 
 
 class Estimate(Protocol):
-    """What gives a controller its state in place of the plant."""
+    """The source of a controller's state in place of the plant."""
 
     @property
     def output(self) -> OutputPort:
@@ -29,44 +29,44 @@ class RecordedLoop(Protocol):
 
     @property
     def plant(self) -> Plant:
-        """What was simulated."""
+        """The plant."""
 
     @property
     def controller(self) -> Controller:
-        """What computed its control."""
+        """The controller."""
 
     @property
     def generator(self) -> ReferenceGenerator | None:
-        """What gave the references, or None."""
+        """The generator of references, or None."""
 
     @property
     def signals(self) -> Mapping[str, Sequence[Signal]]:
-        """Names and units of each signal that was logged, or is computed here."""
+        """Names and units of each signal that is logged or computed here."""
 
     @property
     def exogenous(self) -> ReferenceGenerator | None:
-        """What gave the exogenous signals of the law, or None."""
+        """The source of the law's exogenous signals, or None."""
 
     @property
     def plant_exogenous(self) -> ReferenceGenerator | None:
-        """What gave those of the plant, or None."""
+        """The source of the plant's exogenous signals, or None."""
 
     @property
     def encoders(self) -> Estimate | None:
-        """What measured the state for the law, or None."""
+        """The sensor of the state for the law, or None."""
 
 
 def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
-    """A record with what follows from what was logged of a loop.
+    """A record with the signals computed from the log of a loop.
 
     Args:
-        logged: What was logged.
+        logged: The logged signals.
         loop: The loop, whose plant has `functions`.
         context: The context of its diagram after the run.
 
     Raises:
-        WiringError: An input port of plant or controller has a fixed value in this context, of
-            which nobody knows since when.
+        WiringError: An input port of plant or controller has a fixed value in this context, since
+            an unknown time.
     """
     _refuse_fixed_ports(loop, context)
     plant = loop.plant
@@ -86,7 +86,7 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
 def _control_along(
     loop: RecordedLoop, context: Context, times: FloatArray, given: dict[str, FloatArray]
 ) -> FloatArray:
-    """The control of a law that acts at once: a function of what else is known."""
+    """The control of a continuous law, as a function of the other signals."""
     plant, controller, law = loop.plant, loop.controller, loop.controller.law
     of_plant = given["parameters"]
     gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
@@ -94,7 +94,7 @@ def _control_along(
     if gains is None:
         gains = _parameters_along(loop, controller, context, times)
     if law.measured_force and "measured_force" not in given:
-        # Without a sensor; a law that only integrates the force reads none here.
+        # Without a sensor; a law that only integrates the force does not need it here.
         given["measured_force"] = (
             plant.along("constraint_force", given)
             if law.control_takes_force
@@ -105,18 +105,18 @@ def _control_along(
         return function_along(law.function, given)
 
     def alone(moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
-        """The control where the plant has no value with it."""
+        """The control at times where the plant has no value."""
         values = law.function.evaluate(*moment[:3])
         return values if law.function.is_valid else None
 
-    # Machine code that is there, in place of some for the law alone.
+    # Uses existing machine code instead of code for the law alone.
     return function_along(motion, {**given, "law": gains, "plant": of_plant}, alone)
 
 
 def _parameters_along(
     loop: RecordedLoop, block: Plant | Controller, context: Context, times: FloatArray
 ) -> FloatArray:
-    """The parameters of a block at each time, those that move as they did."""
+    """The parameters of a block at each time, with exogenous ones."""
     values = block.parameters_along(block.GetMyContextFromRoot(context), times)
     moving = loop.plant_exogenous if block is loop.plant else loop.exogenous
     if moving is not None:
@@ -134,11 +134,11 @@ def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:
     for name, giver in wires.items():
         port = taker.GetInputPort(name)
         if not port.HasValue(own):
-            continue  # The law knows its references, and is fed back.
+            continue  # The law has its references, and is used at `feedback`.
         try:
             given = giver.Eval(giver.get_system().GetMyContextFromRoot(context))
         except DrakeDaeError:
-            continue  # Where a run failed.
+            continue  # At the failure of a run.
         if not np.array_equal(given, port.Eval(own), equal_nan=True):
             raise _fixed(name, taker)
     if plant.HasInputPort("feedback"):

@@ -1,4 +1,4 @@
-"""Events of contacts that open and close: on disk, as a table, and how animations show them."""
+"""Events of opening contacts: on disk, as a table, and in animations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,14 +9,14 @@ from drake_dae.arrays import FloatArray
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 
 FLASH = 0.3
-"""How long an animation shows an impact, in s."""
+"""The duration of an impact in an animation, in s."""
 
 
 def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
     """Events as arrays of plain numbers and text, one row for each event; {} if there are none.
 
     The columns of "events.happened", "events.closed" and "events.impulses" (N s) are the contacts
-    "events.contacts"; "events.rest_time" is nan where there is none.
+    "events.contacts"; "events.rest_time" is nan without a value.
     """
     if not events:
         return {}
@@ -36,7 +36,7 @@ def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
 
 
 def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ...]:
-    """The events that `event_arrays` made arrays of.
+    """The events of arrays made by `event_arrays`.
 
     Raises:
         KeyError, ValueError: The arrays are those of something else.
@@ -90,7 +90,7 @@ def impacts(events: Sequence[ContactEvent]) -> list[ContactEvent]:
 
 
 def flashes(events: Sequence[ContactEvent], names: Sequence[str], times: FloatArray) -> FloatArray:
-    """How bright each contact flashes: its share in the largest impulse of all, which fades.
+    """The brightness of each contact's flash: its impulse relative to the largest, fading.
 
     Args:
         events: The events of a run.

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from types import FrameType
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, what batch systems and `kill` send, and a terminal that is closed."""
+"""Ctrl-C, the signals of batch systems and `kill`, and a closed terminal."""
 
 AGAIN = 1e-3
-"""After so many seconds a signal that came within a call of CasADi's comes again."""
+"""The delay in s after which a signal during a call of CasADi is raised again."""
 
 
 @contextmanager
@@ -22,8 +22,8 @@ def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
     ignored, as under nohup, stays so.
 
     Args:
-        handle: Gets the signal, between two instructions of Python; those that CasADi calls do not
-            count, since it loses exceptions that are raised in them.
+        handle: Gets the signal, between two instructions of Python outside of callbacks from
+            CasADi, which loses exceptions raised in them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -47,7 +47,7 @@ def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
         yield
     finally:
         for number, handler in previous.items():
-            # None: the handler before was not Python's.
+            # None: the previous handler was not set by Python.
             signal.signal(number, handler or signal.SIG_DFL)
 
 
@@ -68,7 +68,7 @@ class Interruption:
     """Remembers the first signal, instead of an exception in the middle of a step.
 
     Attributes:
-        signal: What came, or None. A second one is a KeyboardInterrupt.
+        signal: The first signal, or None. A second one raises a KeyboardInterrupt.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What a run leaves: every signal over time, with names and units."""
+"""The record of a run: every signal over time, with names and units."""
 
 import csv
 import html
@@ -49,14 +49,14 @@ class Record:
     Events stand in it as "events.time", "events.kind", "events.impulses" and others; and "about" is
     JSON with the versions that made it and, of a run by the command, the scenario with all seeds.
 
-    Velocities jump at impacts: the sample of that time is the one before it.
+    Velocities jump at impacts: the sample at that time is the one before the impact.
 
     Attributes:
         time: The times in s, shape (k,), strictly increasing.
         signals: Name of a signal -> its values.
-        events: What happened to contacts that open and close, in the order of time.
-        about: What one needs to repeat the run, as plain data: "versions" of the library, of what
-            it stands on and of the machine, which `save` adds; and "scenario", if it is known.
+        events: The events of opening contacts, in the order of time.
+        about: The data to repeat the run: "versions" of the library, its dependencies and the
+            machine, which `save` adds; and "scenario", if it is known.
     """
 
     time: FloatArray
@@ -126,7 +126,7 @@ class Record:
         return type(self)(self.time[first:], signals, events, self.about)
 
     def while_finite(self) -> Self:
-        """The record up to the first moment at which some signal is not finite."""
+        """The record up to the first time at which some signal is not finite."""
         finite = [np.isfinite(recorded.values).all(axis=1) for recorded in self.signals.values()]
         broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
         if not broken.any():
@@ -143,8 +143,8 @@ class Record:
     def event_rows(self) -> list[dict[str, Any]]:
         """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
 
-        Each has "time [s]", "event", "contacts" (to which it happened) and "closed" (which are so
-        after it), separated by commas, "impulse [N s]" (the sum of theirs) and "energy lost [J]".
+        Each has "time [s]", "event", "contacts" (of the event) and "closed" (after it), separated
+        by commas, "impulse [N s]" (the sum of theirs) and "energy lost [J]".
         """
         return event_rows(self.events)
 
@@ -155,25 +155,25 @@ class Record:
         context: Context,
         after: float | None = None,
     ) -> Self:
-        """Collects per-step logs, whatever they hold up to now.
+        """Collects per-step logs up to now.
 
         Args:
             loggers: Name -> (sink, names and units of its input).
             context: The context of the diagram.
-            after: Only what was logged later than this time is collected, in s; None for all.
+            after: Only later samples than this time are collected, in s; None for all.
         """
         logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
         times = [log.sample_times() for log in logs.values()]
-        # A run that failed in the middle of a step may have logged some of the signals only.
+        # A run that failed within a step may have logged only some of the signals.
         count = min((len(t) for t in times), default=0)
         time = times[0][:count] if times else np.zeros(0)
         first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
-        # Nor is what a run that failed left in its last step a number.
+        # The last step of a failed run may have values that are not numbers.
         finite = [np.isfinite(log.data()[:, first:count]).all(axis=0) for log in logs.values()]
         broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
         count = first + int(np.argmax(broken)) if broken.any() else count
         time = time[first:count]
-        # The last sample of a moment is the one after the projection.
+        # The last sample of a time is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
         return cls(
             time[last].copy(),
@@ -253,7 +253,7 @@ class Record:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what `save` or a `RecordWriter` wrote, the latter as far as it came.
+        """Reads a file of `save` or of a `RecordWriter`, which may be incomplete.
 
         Raises:
             ModelError: The file holds something else.
@@ -269,7 +269,7 @@ class Record:
                 signals = {name: _read(file, name) for name in names}
                 about = json.loads(str(file["about"])) if "about" in file.files else {}
                 return cls(file["time"], signals, events_of_arrays(file), about)
-        except Exception as error:  # Those of zip files, of NumPy's headers and of JSON are many.
+        except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
             text = getattr(error, "strerror", None) or error
             raise ModelError(f"{path} is not a record of a run: {text}") from None
 
@@ -283,7 +283,7 @@ def _label(signal: Signal) -> str:
 
 
 def _needed(module: str, asked: str) -> Any:
-    """A module that only some need.
+    """An optional module.
 
     Raises:
         ModelError: It is not installed.
@@ -295,7 +295,7 @@ def _needed(module: str, asked: str) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """The versions of the library, of what it stands on and of Python, and the machine."""
+    """The versions of the library, its dependencies and Python, and the machine."""
     found = {"python": platform.python_version(), "machine": platform.platform()}
     for name in ("drake_dae", "drake", "casadi", "numpy"):
         with suppress(PackageNotFoundError):  # Drake may be built from its source.
@@ -307,7 +307,7 @@ R = TypeVar("R", bound=Record)
 
 
 def _read_rows(file: BinaryIO, kind: type[R]) -> R:
-    """What a `RecordWriter` appended; bytes after the last whole row are left out."""
+    """The rows of a `RecordWriter`; bytes after the last whole row are ignored."""
     head = json.loads(file.readline())
     labels = head["signals"]
     named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
@@ -316,7 +316,7 @@ def _read_rows(file: BinaryIO, kind: type[R]) -> R:
     width = int(stops[-1])
     count = len(data) // (8 * width)
     rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
-    # A machine that lost its power may leave zeros where nothing was synced.
+    # After a power failure, unsynced bytes may be zeros.
     whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
     time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
     pairs = zip(named.items(), columns, strict=True)

@@ -1,4 +1,4 @@
-"""The record of a run on disk while the run goes on."""
+"""The record of a run on disk during the run."""
 
 import json
 import os
@@ -22,7 +22,7 @@ PERIOD = 1.0
 """Between two appends, in s."""
 
 _SHARE = 0.02
-"""Of the run that appending may take: on a slow disk it waits longer."""
+"""The largest fraction of the run for appending: on a slow disk it is done less often."""
 
 
 @checked(ModelError)
@@ -32,19 +32,19 @@ class RecordWriter:
         with RecordWriter("run.part", loop.record) as writer:
             simulate(loop.diagram, context, 10.0, config, after_step=writer.update)
 
-    Whatever ends the process, `Record.load` reads the file up to the last append. It is one line of
+    However the process ends, `Record.load` reads the file up to the last append. It is one line of
     JSON with names and units, and then rows of numbers (little-endian float64): the time in s and
-    the signals in the order of that line. A file that was cut off anywhere lacks its last row.
-    Events of contacts are not in it, but which contacts are closed is a signal.
+    the signals in the order of that line. A truncated file lacks its last row. Events of contacts
+    are not included, but the closed contacts are a signal.
 
-    The file is made with the first append, and never in the place of another one. Where appending
-    fails, as on a full disk, this warns and tries again a second later; the run goes on.
+    The file is created with the first append and never replaces another one. If appending fails, as
+    on a full disk, this warns and tries again a second later; the run continues.
 
     Args:
         path: The file.
-        record: From a context and a time in s, or None, to what was recorded later, as
+        record: A function of a context and a time in s (or None) that returns the later record, as
             `ClosedLoop.record`.
-        about: What one needs to repeat the run, as in `Record`.
+        about: The data to repeat the run, as in `Record`.
 
     Attributes:
         path, about: The arguments.
@@ -79,9 +79,10 @@ class RecordWriter:
             self._file = None
 
     def update(self, context: Context) -> None:
-        """Appends what was recorded since the last time, if it is time to.
+        """Appends the new part of the record, if an update is due.
 
-        The last row stays behind: a run that ends here replaces it by the one after its projection.
+        The last row is not written yet: at the end of a run it is replaced by the one after the
+        projection.
 
         Warns:
             UserWarning: The file cannot be written to; once.
@@ -89,7 +90,7 @@ class RecordWriter:
         if time.perf_counter() < self._next:
             return
         record = self._made(context)
-        # What making it takes grows with the steps, and does not have to wait for a slow disk.
+        # The time to make it grows with the steps, and does not depend on the disk.
         began = time.perf_counter()
         try:
             self._append(record, keep_last=True)
@@ -105,16 +106,16 @@ class RecordWriter:
         self._next = done + max(PERIOD, (done - began) / _SHARE)
 
     def finish(self, context: Context) -> None:
-        """Appends all that was recorded since the last time.
+        """Appends the rest of the record.
 
         Raises:
-            ModelError: What makes the record fails.
+            ModelError: The function `record` fails.
             OSError: The file cannot be written to; it keeps what fits.
         """
         self._append(self._made(context), keep_last=False)
 
     def _made(self, context: Context) -> Record:
-        """What was recorded since the last time."""
+        """The new part of the record."""
         record = result_of("record", self._record, context, self._time)
         if not isinstance(record, Record):
             raise ModelError(f"record must return a Record, got {brief(record)}")
@@ -130,7 +131,7 @@ class RecordWriter:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         if self._end == 0:
             data = _head(record, self.about) + data
-        # At a place of its own: what a failed append left there is written over.
+        # At a fixed place: the remains of a failed append are overwritten.
         done = 0
         while done < len(data):
             done += os.pwrite(self._file, data[done:], self._end + done)

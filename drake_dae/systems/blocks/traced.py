@@ -110,6 +110,36 @@ class Guard:
 
 
 @dataclass(frozen=True, eq=False)
+class Stepped:
+    """What Drake steps in a block at t_k = k period, as its own contact, since it is not traced.
+
+    The first entries of the block's HELD are the values of some output ports of that system, below
+    each other. They change at t_k alone, as by an unrestricted update; its step depends on them, on
+    what one of its input ports reads at t_k, and on t_k. Other entries have updates as usual.
+
+    Attributes:
+        system: What Drake steps: the block, or a diagram in it.
+        period: In s.
+        ports: The names of these output ports.
+        into: The name of that input port.
+        reads: What it reads: the name of an input port of the block, or of an output that one of
+            its computations has.
+        held: The context of the block -> HELD, shape (size,).
+        put: (context of the system, HELD) -> None; puts in what it steps from.
+        size: The number of entries of HELD.
+    """
+
+    system: System
+    period: float
+    ports: tuple[str, ...]
+    into: str
+    reads: str
+    held: Callable[[Context], FloatArray]
+    put: Callable[[Context, FloatArray], None]
+    size: int
+
+
+@dataclass(frozen=True, eq=False)
 class Block:
     """What one system of a diagram computes.
 
@@ -126,6 +156,7 @@ class Block:
         unwired: Name of an input port -> what stands there without a wire and without a value.
         moving: The entries of its parameters that come through an input port "exogenous".
         guard: When and how it changes at moments that a run has to find; None if at none.
+        stepped: What Drake steps in it; None if all of it is traced.
         draws: Whether its update takes new random numbers.
         model: What its first parameters are those of, such as a DaeSystem; None for nothing that
             another block has.
@@ -146,6 +177,7 @@ class Block:
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
     guard: Guard | None = None
+    stepped: Stepped | None = None
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None

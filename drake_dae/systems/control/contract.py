@@ -128,7 +128,7 @@ class Controller(System):
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
-        """The outputs now and what they should be, with their names; None where nobody tells it.
+        """The outputs now and what they should be, with their names; None if unknown.
 
         Args:
             context: The context of this system.

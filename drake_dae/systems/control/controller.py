@@ -185,7 +185,7 @@ class TrackingController(ParameterizedSystem, Controller):
         self.check_context(context)
         size = len(self.law.integral.outputs)
         if not size:
-            raise ModelError(f"{self.get_name()}: its law integrates nothing")
+            raise ModelError(f"{self.get_name()}: its law has no integral action")
         values = vector("integral", integral, size)
         if self.sample_period:
             context.SetDiscreteState(values)

@@ -23,8 +23,8 @@ def warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
     stability = dynamics.stability(law.structure.states[0], outputs=outputs)
     if stability.verdict is Verdict.UNSTABLE:
         warnings.warn(
-            f"{law.system.name}: {stability.reason}. The outputs follow the reference "
-            "while other states, or the control, run off; choose other outputs",
+            f"{law.system.name}: {stability.reason}. The outputs follow the reference while other "
+            "states, or the control, grow without bound; choose other outputs",
             NonMinimumPhaseWarning,
             stacklevel=3,
         )

@@ -114,10 +114,10 @@ def _traced_integrals(
     inputs, of = [rate, sigma, hold], ("integral_rate", memory, "hold")
     output = HELD if sample_period else DERIVATIVE
     summed = Computation(ca.Function("integral", inputs, [after]), of, (output,))
-    told = Computation(ca.Function("integral", [sigma], [sigma]), (memory,), ("integral",))
+    accumulated = Computation(ca.Function("integral", [sigma], [sigma]), (memory,), ("integral",))
     if sample_period:
-        return (acts, rates, told), (Update(summed, sample_period, 0.0, True),)
-    return (acts, rates, told, summed), ()
+        return (acts, rates, accumulated), (Update(summed, sample_period, 0.0, True),)
+    return (acts, rates, accumulated, summed), ()
 
 
 def _motion_under(law: TrackingLaw, sources: tuple[str, ...]) -> Computation | None:

@@ -106,7 +106,9 @@ class Plant(System):
         Raises:
             ModelError: There is no such port.
         """
-        raise ModelError(f"{self.dae.name}: nothing tells what its port '{port}' showed")
+        raise ModelError(
+            f"{self.dae.name}: the values of its port '{port}' cannot be computed from a log"
+        )
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""

@@ -134,9 +134,9 @@ class ToleranceWatch(LeafSystem):
             f"the recent error of {signal.name} is {recent[worst]:.3g}{unit} at t = {time:.6g} s, "
             f"and {self._largest[worst]:.3g}{unit} is tolerated"
         )
-        told = [
+        listed = [
             f"{one.name} = {value:.3g} {one.unit}"
             for one, value in zip(self._forces, force, strict=True)
         ]
-        text += f"; then {', '.join(told)}" if told else ""
+        text += f"; then {', '.join(listed)}" if listed else ""
         return SimulationError(text, time, state)

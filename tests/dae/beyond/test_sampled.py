@@ -97,7 +97,7 @@ def test_deviations_of_a_robot_follow_the_poles(period, is_stable):
 
 
 @pytest.mark.slow
-def test_error_of_a_sampled_run_is_told_beforehand():
+def test_error_of_a_sampled_run_is_reported_beforehand():
     """To second order: a period of 4 ms leaves a quarter of what 8 ms leave off the prediction."""
     found, chosen = arm("two_link"), law("two_link", poles(-10.0))
     references = [SinusoidReference(0.3, 0.1, 2.0), SinusoidReference(20.0, 5.0, 3.0)]
@@ -139,9 +139,9 @@ def test_error_of_a_sampled_run_is_told_beforehand():
 def test_laws_with_a_state_of_their_own_are_refused():
     system = mass_on_a_spring(0.0)
     chosen = TrackingLaw(system, poles(-4.0), integral=[system.output_signals[0].name])
-    with pytest.raises(ModelError, match="a law with integrals has a state of its own"):
+    with pytest.raises(ModelError, match="a law with integrals"):
         sampled_poles(chosen, np.zeros(3), T)
-    with pytest.raises(ModelError, match="delay must be 0 s or more"):
+    with pytest.raises(ModelError, match="delay"):
         sampled_poles(TrackingLaw(system, poles(-4.0)), np.zeros(3), T, -1.0)
     plain = TrackingLaw(system, poles(-4.0))
     for sizes in ((2, 1), (3, 2)):
@@ -156,7 +156,7 @@ def test_poles_are_those_about_a_rest_that_few_periods_reach():
         ModelError, match=r"about an equilibrium under the law, and there .* changes"
     ):
         sampled_poles(plain, [0.1, 0.0, 0.0], T)
-    with pytest.raises(ModelError, match=r"a delay of 10 s is 10000000 periods of 1e-06 s"):
+    with pytest.raises(ModelError, match="10000000 periods"):
         sampled_poles(plain, np.zeros(3), 1e-6, 10.0)
 
 

@@ -160,7 +160,7 @@ def test_a_rank_that_changes_from_state_to_state():
 
 
 def test_a_spread_of_a_wrong_shape_is_refused():
-    with pytest.raises(ModelError, match=r"spread must be a number or have shape \(3,\)"):
+    with pytest.raises(ModelError, match="spread"):
         dynamic_extension(unicycle(), spread=[0.1, 0.2])
 
 

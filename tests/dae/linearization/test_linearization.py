@@ -148,7 +148,7 @@ def test_a_pendulum_by_hand():
     np.testing.assert_allclose(np.abs(values), np.sqrt(9.81), rtol=1e-12)
     with pytest.raises(InconsistentStateError, match="is not on N"):
         linearize(system, [0.0, -1.3, 0.0, 0.0])
-    with pytest.raises(ModelError, match="control must be finite and of shape"):
+    with pytest.raises(ModelError, match="control"):
         linearize(system, control=np.zeros(3))
 
 

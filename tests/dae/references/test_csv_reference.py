@@ -20,7 +20,7 @@ def wave(folder: Path, delimiter: str = ",") -> Path:
 
 
 @pytest.mark.parametrize("order", [2, 4])
-def test_smoothing_costs_what_is_told(order, tmp_path):
+def test_the_error_of_smoothing_is_the_reported_one(order, tmp_path):
     """(order + 2) / 24 smoothing^2 times the acceleration, 0.4, away from the ends; 2 % beside."""
     path = CsvReference(str(wave(tmp_path)), ["y"], "t", smoothing=0.05, order=order)
     function = path.derivatives([2])
@@ -67,7 +67,7 @@ def test_few_rows_are_met_within_the_tolerance(strokes, length, times, order, tm
         off = np.array([np.abs(function(row[0]) - row[1:]) for row in path.table])
         assert np.all(off.max(axis=0) <= share * np.ptp(path.table[:, 1:], axis=0))
         np.testing.assert_allclose(path.deviation, off.max(axis=0), atol=1e-14 * length)
-        assert f"y by {off[:, 0].max():.2g}, z by" in path.remark
+        assert f"{off[:, 0].max():.2g} in y, " in path.remark
 
 
 def test_smoothing_that_loses_the_rows_is_refused_with_what_is_lost(tmp_path):
@@ -87,7 +87,7 @@ def test_a_column_that_stays_is_met_to_round_off(tmp_path):
 
 
 @pytest.mark.parametrize("length", [1000.1, 999.99, 5.0, 1.0 / 3.0])
-def test_the_least_smoothing_that_is_told_is_taken(length, tmp_path):
+def test_the_reported_least_smoothing_is_accepted(length, tmp_path):
     file = tmp_path / "long.csv"
     file.write_text(f"time,y\n0,0\n{length / 2},1\n{length},0\n")
     with pytest.raises(ReferenceSignalError, match="or more") as refused:

@@ -133,7 +133,7 @@ def test_turns_of_a_spiral_are_a_pitch_apart(name):
         (lambda: CircleReference([0, 0], 1.0, 0.0), "period and turns must not be zero"),
         (lambda: SpiralReference([0, 0], 1.0, 1.0, 0.1, LIMITS), "must differ and not be negative"),
         (lambda: SpiralReference([0, 0], 0.0, 1.0, 0.0, LIMITS), "pitch must be positive, got 0"),
-        (lambda: CircleReference([0, 0], 1.0, 2.0).travel, "no limits: it moves all the time"),
+        (lambda: CircleReference([0, 0], 1.0, 2.0).travel, "periodic"),
         (
             lambda: LineReference([1.0], [2.0], LIMITS, order=3).derivatives([4]),
             "LineReference has 3 continuous derivatives, the law needs 4: pass order=4",

@@ -40,7 +40,7 @@ def test_the_force_is_smaller_between_strokes():
     assert np.linalg.norm(found[:, :2, 2], axis=1).max() <= 4.0
 
 
-def test_all_letters_are_as_high_as_told():
+def test_all_letters_have_the_given_height():
     for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789":
         path = TextReference(letter, [0.0, 0.0], 1.0, LIMITS, corner=0.01, order=2)
         points = course(path, count=401)[:, :, 0]

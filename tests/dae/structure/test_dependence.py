@@ -54,7 +54,7 @@ def test_the_rows_that_follow_are_named_with_their_factors():
     np.testing.assert_allclose(again.factors, [1000.0], rtol=1e-9)
     text = str(found)
     assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in text
-    assert "how the forces split among them is not determined" in text
+    assert "distribution of the forces among them is not determined" in text
 
 
 def test_rows_are_named_also_where_their_derivatives_have_no_room():
@@ -64,7 +64,7 @@ def test_rows_are_named_also_where_their_derivatives_have_no_room():
     assert "gradients of constraints: 'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
 
 
-def test_factors_that_depend_on_the_state_are_told():
+def test_factors_that_depend_on_the_state_are_reported():
     """k_2 = (2 + sin q_2) k_1 has the gradient (2 + sin q_2) dk_1 on N*."""
     found = violation(mass_point(lambda q: [q[0], (2 + ca.sin(q[1])) * q[0]]))
     assert found.cause is Cause.REDUNDANT
@@ -84,7 +84,7 @@ def test_a_singular_configuration_is_one():
     assert found.combinations[0].name == "y1"
     np.testing.assert_allclose(found.combinations[0].factors, [1.0], rtol=1e-9)
     assert "This is a singular configuration" in str(found)
-    assert "smaller steps do not help" in str(found)
+    assert "a law cannot" in str(found)
     # Around it nothing is wrong: on the branch x = 0 the gradients are (0, 1, 0) and (y, 1, 0).
     beside = mass_point(k, nominal=[0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     assert find_structure(beside, spread=0.01).constraint_degrees == (2, 2)
@@ -141,7 +141,7 @@ def test_the_analysis_names_them_too():
 
 def test_a_singular_mass_matrix_comes_with_its_remedy():
     """0 = z - x^2 as a row of E x' = f; then lifted: z' = v, k = z - x^2."""
-    with pytest.raises(ModelError, match="lift it: make z a state with z' = v"):
+    with pytest.raises(ModelError, match="z' = v"):
         find_structure(
             DaeSystem.from_functions(
                 ["x", "z"],

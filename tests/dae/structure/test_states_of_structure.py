@@ -23,7 +23,7 @@ from drake_dae.trace.functions import TracedFunction
 
 @pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
 def test_a_constraint_that_cannot_be_met(k):
-    with pytest.raises(InconsistentStateError, match="test: no consistent state found near"):
+    with pytest.raises(InconsistentStateError, match="no consistent state"):
         find_structure(
             system_of(
                 2,
@@ -58,7 +58,7 @@ def test_functions_that_are_not_finite_at_the_nominal_state(fields, message):
 
 
 def test_a_constraint_that_is_not_finite_at_the_nominal_state():
-    with pytest.raises(InconsistentStateError, match="y0 is not finite at the given state"):
+    with pytest.raises(InconsistentStateError, match="y0 is not finite"):
         find_structure(redundant(lambda x: [ca.sqrt(x[0] - 1) - 1, x[2]]), spread=0.0)
 
 
@@ -99,7 +99,7 @@ def test_infinite_matrices_are_no_singularity():
 
 
 def test_a_law_needs_as_many_outputs_as_controls():
-    with pytest.raises(ModelError, match="no control input, so there is nothing to steer"):
+    with pytest.raises(ModelError, match="no control input"):
         find_structure(system_of(1, f=lambda x: 0))
     for outputs, l in ((0, None), (2, lambda x: x[:2])):  # noqa: E741
         system = system_of(3, f=lambda x: 0 * x, h=lambda x: [1, 0, 0], l=l)
@@ -141,7 +141,8 @@ def test_constraints_alone_decide_how_a_system_moves():
         "not examined"
     ] * 2
     assert (
-        analysis.assumptions[3].reason == "there is no control input, so there is nothing to steer"
+        analysis.assumptions[3].reason
+        == "there is no control input, so no output can be controlled"
     )
     assert analysis.constraint_structure.constraint_degrees == (2,)
     assert not analysis.problems
@@ -176,7 +177,7 @@ def test_parameters_take_part_with_their_defaults():
     "mass", [[[2.0, 1.0], [0.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]], [[1.0, 1.0], [1.0, 1.0]]]
 )
 def test_mass_matrices_must_be_symmetric_and_positive_definite(mass):
-    with pytest.raises(ModelError, match="mass_matrix is not symmetric and positive"):
+    with pytest.raises(ModelError, match="mass_matrix"):
         find_structure(changed(double_integrator(), mass_matrix=ca.SX(np.array(mass))))
 
 

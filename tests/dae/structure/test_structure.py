@@ -154,7 +154,7 @@ def test_units_do_not_matter(problem, seed):
         structure = find_structure(one, spread=0.01 / factors[0])
         assert structure.constraint_degrees == problem.constraint_degrees
         assert structure.output_degrees == problem.output_degrees
-    # The same matrix but for scaling; the equilibration is not quite unique.
+    # The same matrix except for scaling; the equilibration is not quite unique.
     relative = find_structure(system, spread=0.01).control_margin.relative
     assert structure.control_margin.relative == pytest.approx(relative, rel=0.9)
 
@@ -193,7 +193,7 @@ def test_a_mass_matrix_changes_nothing(problem):
 
 
 def test_a_control_that_the_constraint_cancels_never_acts():
-    """A radial force on a pendulum is taken up by the rod: h* is zero but for round-off, p = 1."""
+    """A radial force on a pendulum is borne by the rod: h* is zero up to round-off, p = 1."""
     system = PROBLEMS["pendulum"]().system
     x = system.state
     radial = ca.vertcat(0, 0, x[0] * untidy_one(x[1]), x[1])
@@ -203,7 +203,7 @@ def test_a_control_that_the_constraint_cancels_never_acts():
 
 
 def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
-    """A tangential force u on a pendulum: n* = beta is zero but for round-off, p = 1.
+    """A tangential force u on a pendulum: n* = beta is zero except for round-off, p = 1.
 
     So the tension m (w^2 L + ...) has degree 1, while the pendulum swings.
     """

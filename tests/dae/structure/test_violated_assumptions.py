@@ -90,7 +90,7 @@ def test_1_a_degree_that_is_lost_between_the_sampled_states():
     ],
 )
 def test_2_redundant_constraints(k):
-    """Exactly, by a factor, on N* alone, by an identity, and but for round-off."""
+    """Exactly, by a factor, on N* alone, by an identity, and except for round-off."""
     error = violation(redundant(k))
     assert error.assumption == 2
     assert "A(x) loses rank at x = " in str(error)

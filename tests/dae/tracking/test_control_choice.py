@@ -244,8 +244,10 @@ def test_the_controller_has_the_gradients_of_the_choice(law):
     assert_allclose(ExtractGradient(value), np.array(expected).T, rtol=1e-6, atol=1e-7)
 
 
-def test_the_report_tells_what_is_left_to_choose(law):
-    assert "B(x) leaves 2 combinations of the controls open" in str(analyze(law.system, count=5))
+def test_the_report_reports_what_is_left_to_choose(law):
+    assert "B(x) leaves 2 combinations of the controls undetermined" in str(
+        analyze(law.system, count=5)
+    )
 
 
 def test_units_of_the_controls_change_nothing_but_their_numbers(law):
@@ -267,7 +269,7 @@ def test_units_of_the_controls_change_nothing_but_their_numbers(law):
     assert [a.finding for a in one.assumptions] == [a.finding for a in two.assumptions]
 
 
-def test_outputs_that_depend_on_each_other_are_told():
+def test_outputs_that_depend_on_each_other_are_reported():
     x = ca.SX.sym("x", 2)
     h = ca.SX([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0]])
     system = DaeSystem(x, -x, ca.SX(2, 0), h, ca.SX(0, 1), x, ca.SX(2, 0), control_metric=np.eye(3))

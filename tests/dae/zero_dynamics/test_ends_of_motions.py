@@ -21,9 +21,9 @@ from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pursuit as module
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import (
-    NonFiniteError,
-)
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.errors import NonFiniteError
 
 
 def test_a_reference_out_of_reach_ends_the_motion_where_the_arm_is_straight():
@@ -178,6 +178,20 @@ def test_the_work_is_bounded(monkeypatch):
     )
     assert "after 50 steps the motion is at t = " in str(motion.ending)
     assert 0.0 < motion.ending.time < 1000.0
+
+
+def test_what_stands_still_in_time_is_not_followed_for_thousands_of_steps(monkeypatch):
+    """s' = -1 / s is at 0 after half a second, with steps that lead nowhere before."""
+    times, rate = [], PinnedOutputs.rate
+
+    def counted(self: PinnedOutputs, *arguments: Array) -> Array:
+        times.append(arguments)
+        return rate(self, *arguments)
+
+    monkeypatch.setattr(PinnedOutputs, "rate", counted)
+    dynamics = zero_dynamics(internal(lambda s, z: -1.0 / s))
+    assert dynamics.stability([0.0, 1.0]).verdict is Verdict.UNDECIDED
+    assert 100 < len(times) < 3000  # Those of 350 steps; there were 5001.
 
 
 def test_motions_end_where_domain_and_reference_do():

@@ -294,7 +294,7 @@ def test_a_limit_cycle_beside_a_reference_that_never_returns_is_undecided():
     assert "was not seen to return" in without_period.reason
 
 
-def test_a_motion_that_ends_is_told():
+def test_a_motion_that_ends_is_reported():
     system = oscillator(lambda s, w, z: 10 * s + 0 * z)
     grown = along(system, sinusoid(2.0), 60.0)
     assert (grown.verdict, grown.multipliers.size) == (Verdict.UNSTABLE, 0)
@@ -313,10 +313,10 @@ def test_a_motion_that_ends_is_told():
 def test_arguments_that_do_not_fit_are_refused():
     dynamics = ZeroDynamics(oscillator(mathieu))
     motion = dynamics.motion(sinusoid(2.0), [0.0, 1.0])
-    with pytest.raises(ModelError, match=r"reference\(0\) must be finite and of shape \(2,\)"):
+    with pytest.raises(ModelError, match=r"reference\(0\)"):
         dynamics.stability_along(lambda t: np.zeros(3), motion)
     other = DaeSystem.from_functions(2, f=lambda x: [0, x[1]], h=lambda x: [1, 0], l=lambda x: x[0])
-    with pytest.raises(ModelError, match="the motion is one of another system"):
+    with pytest.raises(ModelError, match="another system"):
         ZeroDynamics(other).stability_along(sinusoid(2.0), motion)
 
 
@@ -401,7 +401,7 @@ def test_several_equilibria():
     assert "At rest at z=0, s=1, s" not in str(told)
     assert "At rest at z=0, s=1, w=0: exponentially stable." in str(told)
     assert "converges to another stable motion" in told.problems[0]
-    with pytest.raises(ModelError, match="guesses must have shape"):
+    with pytest.raises(ModelError, match="guesses"):
         dynamics.equilibria([0.0, 0.0, 0.0])
 
 
@@ -417,7 +417,7 @@ def test_a_continuum_of_equilibria_is_one():
 
 
 @pytest.mark.slow
-def test_analyze_tells_of_growth_along_a_reference():
+def test_analyze_reports_growth_along_a_reference():
     told = analyze(oscillator(mathieu), reference=sinusoid(2.0), times=np.linspace(0.0, 60.0, 61))
     assert told.zero_dynamics.verdict is Verdict.STABLE
     assert told.zero_dynamics_along.verdict is Verdict.UNSTABLE

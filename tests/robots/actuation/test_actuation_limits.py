@@ -123,7 +123,7 @@ def test_motor_law_tends_to_the_rigid_law_at_rate_l(name):
     ],
 )
 def test_trajectories_tend_to_those_of_the_rigid_robot(kind, parameter, matrix, operation):
-    """The same control moves the robot as its limit is moved, but for O(1 / K_2) and O(L).
+    """The same control moves the robot as its limit is moved, except for O(1 / K_2) and O(L).
 
     By the two laws' identities above, a robot under u(t) moves to first order as its limit does
     under u less M_2 K_2^-1 tau'', or less L (N K_m)^-1 tau'. What is left is of second order: here

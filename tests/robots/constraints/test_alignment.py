@@ -128,5 +128,5 @@ def test_a_disk_stays_flush_on_a_dome_with_chosen_moments():
 
 
 def test_an_axis_of_no_length_is_refused():
-    with pytest.raises(ModelError, match="axis must not be zero"):
+    with pytest.raises(ModelError, match="axis"):
         AxisNormalToSurface("tool", DOME, (0.0, 0.0, 0.0))

@@ -129,7 +129,7 @@ def test_rods_of_a_plant_are_fixed_distances():
 
     links = MultibodyExpressions(two_wheels(rods))
     own = JointCoupler("hinge0", "hinge1")
-    with pytest.raises(ModelError, match="3 constraint forces are outputs, but 2 actuators"):
+    with pytest.raises(ModelError, match=r"3 constraint forces .* 2 actuators"):
         RobotModel(links, [own], [])
     model = RobotModel(links, [own], [], forces=["rod1.thrust", "rod0.thrust"])
     assert model.constraints == (

@@ -272,7 +272,7 @@ def closed_loop(model, amplitude=0.1):
 
 
 @pytest.mark.slow
-def test_the_law_steers_through_a_motor_in_the_loop_and_limits_are_told_alike():
+def test_the_law_steers_through_a_motor_in_the_loop_and_limits_are_reported_alike():
     """The same closed loop, cut at the driven joint 3 and elsewhere, integrated at 1e-9."""
     records, texts = [], []
     for cut in (3, 7):

@@ -115,7 +115,7 @@ def test_the_arm_stays_on_a_plate_that_moves_and_turns(seed):
 @pytest.mark.parametrize(
     ("friction", "viscous"), [(0.4, None), (None, 30.0), (0.2, 10.0)], ids=["mu", "d", "both"]
 )
-def test_a_surface_that_turns_drags_along_what_rubs_on_it(friction, viscous):
+def test_a_turning_surface_drags_a_frictional_contact_along(friction, viscous):
     """F_t = -(mu lambda s + d v_t) for the velocity v_t relative to what touches of the surface.
 
     That place moves by c' + R' R^T (p - c), with R' by a central difference of order 2, good to

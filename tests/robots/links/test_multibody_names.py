@@ -166,9 +166,9 @@ def test_unknown_frame_lists_near_and_known_names():
         ModelError, match=r"no frame 'hok'; did you mean 'hook'\?.*there are .*boom"
     ):
         expressions.rotation("hok")
-    with pytest.raises(ModelError, match="frame 'hook' belongs to another plant"):
+    with pytest.raises(ModelError, match="another plant"):
         expressions.rotation(crane().GetFrameByName("hook"))
-    with pytest.raises(ModelError, match="point must be finite real numbers"):
+    with pytest.raises(ModelError, match="point"):
         expressions.position("hook", [1.0, np.nan, 0.0])
     np.testing.assert_array_equal(ca.DM(expressions.rotation("world")), np.eye(3))
     np.testing.assert_array_equal(ca.DM(expressions.position("world", [1, 2, 3])), [[1], [2], [3]])

@@ -88,7 +88,7 @@ def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
 
 @pytest.mark.parametrize("text", ["1_0 - x", "0x10 - x", "0b1 - x", "x - 1e400", "x*1_000.5"])
 def test_numbers_of_python_alone_are_none_of_a_formula(text):
-    with pytest.raises(ModelError, match="is no number, or is too large a number"):
+    with pytest.raises(ModelError, match="too large"):
         ImplicitSurface(text)
 
 
@@ -199,14 +199,14 @@ def test_a_height_map_of_a_wave_is_the_wave():
         np.testing.assert_array_less(np.abs(found - wanted) / scale, [1e-6, 2e-6, 2e-5, 3e-4, 3e-3])
 
 
-def test_what_smoothing_costs_is_told():
+def test_the_error_of_smoothing_is_reported():
     """Measured again from the distances of the data's own points, and a tenth of it is noise."""
     noise = 1e-4 * np.random.default_rng(0).normal(size=WAVES.shape)
     surface = HeightMap((0.4, 0.3), WAVES + noise, resolution=0.05)
     off = surface.relief.heights(X, Y) - WAVES - noise
     assert surface.relief.largest == pytest.approx(np.max(np.abs(off)), rel=1e-12)
     assert surface.relief.rms == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
-    told = f"{1e3 * surface.relief.largest:.2g} mm at most and {1e3 * surface.relief.rms:.2g} mm"
+    told = f"{1e3 * surface.relief.largest:.2g} mm and {1e3 * surface.relief.rms:.2g} mm"
     assert told in surface.remark
     assert 0.5e-4 < surface.relief.rms < 1.2e-4
     # It is nearer to the wave than the noise is.
@@ -340,7 +340,7 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
     file = stl_of(tmp_path / "table.stl", *both)
-    with pytest.raises(ModelError, match=r"at \[0\.\d+ *, +0\.\d+ *\] m .*lies over itself"):
+    with pytest.raises(ModelError, match=r"at \[0\.\d+ *, +0\.\d+ *\] m .*overlaps itself"):
         MeshSurface(file)
     left = MeshSurface(file, middle=(0.2, 0.5), size=(0.4, 0.8))
     assert left.relief.heights(np.array([0.2]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
@@ -386,14 +386,14 @@ def test_refusals(make, words, tmp_path):
     assert len(str(caught.value)) < 400
 
 
-def test_what_is_missing_to_read_a_mesh_is_told(tmp_path, monkeypatch):
+def test_what_is_missing_to_read_a_mesh_is_reported(tmp_path, monkeypatch):
     file = stl_of(tmp_path / "box.stl", *box([0, 0, 0], [1, 1, 1]))
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     with pytest.raises(ModelError, match=r"pip install 'drake_dae\[meshes\]', or give the mesh as"):
         MeshSurface(file)
 
 
-def test_functions_of_numpy_are_told_in_one_line_and_once():
+def test_functions_of_numpy_are_reported_in_one_line_and_once():
     """CasADi tells them in twenty lines, each time that the surface is asked."""
     p = ca.SX.sym("p", 3)
     with warnings.catch_warnings(record=True) as told:

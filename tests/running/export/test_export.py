@@ -185,7 +185,7 @@ def test_the_projection(library):
         assert library.call("project", state, parameters) in (1, 3)
 
 
-def test_values_that_are_of_no_use_are_told(library):
+def test_useless_values_are_reported(library):
     law = library.loop.controller.law
     state = law.structure.states[0].copy()
     results = [np.zeros(2), np.zeros(2)]
@@ -249,7 +249,7 @@ def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     assert done.returncode == 0, done.stdout
 
 
-def test_the_command_tells_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
+def test_the_command_reports_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
     words = ["export", "wall_bounce", "--set", "saturation=true", "--out", str(tmp_path)]
     assert main(words) == 0
     told = capsys.readouterr().out.splitlines()[-1]

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from drake_dae.running.rollout.many import BLOCK, FEW, Many
+from drake_dae.running.rollout.stepping.many import BLOCK, FEW, Many
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
 a, b, c = ca.vertsplit(X)

@@ -199,7 +199,7 @@ def refusal(open_):
 
 
 @pytest.mark.slow
-def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
+def test_a_start_out_of_reach_is_reported_with_the_output_and_by_how_much():
     """The arm reaches 1.5 m at most from its shoulder."""
     message = refusal(left_out(references={"tool": ConstantReference([0.0, 3.0])}))
     assert message.startswith("references: the robot cannot start there within its joint limits")
@@ -207,7 +207,7 @@ def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
     assert "from 3 m" in message
 
 
-def test_a_surface_out_of_reach_is_told():
+def test_a_surface_out_of_reach_is_reported():
     far = PointOnSurface("tool", Plane((4.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), name="wall")
     message = refusal(touching(far))
     assert message.startswith("constraints: the robot cannot start there")
@@ -219,7 +219,7 @@ def test_a_surface_out_of_reach_is_told():
     [
         (
             {"outputs": [PointCoordinates("tool", "y")]},
-            "references: left without one: tool.y",
+            "references: missing: tool.y",
         ),
         (
             {"references": {"tool": ConstantReference((0.0,) * 4), "wall.force": FORCE}},

@@ -60,7 +60,7 @@ def squeezes(pairs):
 
 
 @pytest.mark.slow
-def test_six_squeezes_of_feet_in_one_plane_are_told_to_be_five(tmp_path):
+def test_of_six_squeezes_of_feet_in_one_plane_five_are_independent(tmp_path):
     """Six bars between four points of a plane bear one state of stress without any load."""
     held = ", ".join(f"{pair}: 1.0" for pair in PAIRS)
     rest = f"{squeezes(PAIRS)}\nreferences: {{{held}}}\n{START}"
@@ -89,7 +89,7 @@ def test_force_outputs_that_are_missing_can_be_named_as_the_message_does(pairs, 
 @pytest.mark.slow
 def test_a_free_base_whose_outputs_nothing_asks_for_says_so(tmp_path):
     scenario = legs(tmp_path, "forces: []")
-    with pytest.raises(ScenarioError, match=r"outputs: there are none, and nothing completes them"):
+    with pytest.raises(ScenarioError, match="outputs: there are none"):
         build_scenario(scenario)
 
 

@@ -94,7 +94,7 @@ def test_a_member_has_a_tag_and_defaults_of_its_own():
     }
 
 
-def test_what_a_class_refuses_is_told_in_one_line_at_its_key():
+def test_what_a_class_refuses_is_reported_in_one_line_at_its_key():
     assert problems("contact: {surface: !Funnel {apex: [0, 0, 0], angle: 90}}") == {
         "contact.surface": "angle must be between 0 and 90 degrees, got 90.0"
     }

@@ -1,4 +1,4 @@
-"""What goes wrong in a scenario is told with the keys of a scenario."""
+"""What goes wrong in a scenario is reported with the keys of a scenario."""
 
 import re
 
@@ -27,7 +27,7 @@ def test_no_remedy_is_a_call_of_python(cause, assumption, key):
     assert not PYTHON.search(text), text
 
 
-def test_what_is_no_violation_is_told_as_it_is():
+def test_other_messages_are_unchanged():
     assert violated(AssumptionError("no integrators", 5)).problems == (
         ("outputs", "no integrators"),
     )

@@ -139,7 +139,9 @@ HINGE = robot("hinge", link("base", 1), link("lid", 1), joint("j", "base", "lid"
         ("hinge.urdf", HINGE, ["the tip 'lid' moves in one direction alone by 1 joint (j)"]),
     ],
 )
-def test_what_no_scenario_can_be_written_for_is_told_with_what_to_do(name, text, words, tmp_path):
+def test_what_no_scenario_can_be_written_for_is_reported_with_what_to_do(
+    name, text, words, tmp_path
+):
     (tmp_path / name).write_text(text)
     with pytest.raises(ScenarioError) as caught:
         new_scenario(str(tmp_path / name))

@@ -325,7 +325,7 @@ def test_effort_limits_are_those_of_the_file_where_none_is_given(actuators, limi
 
 
 @pytest.mark.parametrize("effort", ["0", "none", ""])
-def test_an_effort_limit_that_tells_nothing_is_none(effort, tmp_path):
+def test_meaningless_effort_limits_are_ignored(effort, tmp_path):
     file = tmp_path / "robot.urdf"
     file.write_text(robot("one", joint("j", "a", "b", "0 0 1")).replace("87.0", effort))
     assert read_efforts({"": file}) == {}
@@ -373,7 +373,7 @@ def test_a_transmission_without_effort_needs_actuators(tmp_path):
         scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
 
 
-def test_what_drake_refuses_to_change_is_told(tmp_path):
+def test_what_drake_refuses_to_change_is_reported(tmp_path):
     """An actuator of the file has the name that the one of another joint would get."""
     drive = (
         "<transmission><type>transmission_interface/SimpleTransmission</type>"

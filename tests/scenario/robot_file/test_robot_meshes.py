@@ -154,7 +154,7 @@ def test_what_meshcat_cannot_draw_is_named(tmp_path: Path):
         ("link.dae", "none.dae", ["none.dae", "not exist"]),
     ],
 )
-def test_other_faults_of_a_file_are_told_as_before(old: str, new: str, words, tmp_path: Path):
+def test_other_faults_of_a_file_are_reported_as_before(old: str, new: str, words, tmp_path: Path):
     """The message has the file that the user has, not the copy, and the line in it."""
     file = write_ur5(tmp_path)
     text = file.read_text().replace(old, new, 1)

@@ -104,7 +104,7 @@ def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
         mass = plant_of(file).GetBodyByName("mark").default_mass()
         assert mass == pytest.approx(1000 * 1e-3 / 6, rel=1e-6)
     else:
-        with pytest.raises(ModelError, match=r"body 'mark' has its mass from the mesh 'part\.stl'"):
+        with pytest.raises(ModelError, match=r"'mark' .*'part\.stl'"):
             plant_of(file)
 
 
@@ -385,7 +385,7 @@ def test_a_package_with_three_slashes_is_that_with_two(slashes, tmp_path):
         ("r.xml", '<mujoco model="m"><compiler coordinate="global"/></mujoco>', "MuJoCo up to"),
     ],
 )
-def test_what_drake_cannot_read_is_told_with_what_to_do(name, text, words, tmp_path):
+def test_what_drake_cannot_read_is_reported_with_what_to_do(name, text, words, tmp_path):
     with pytest.raises(ModelError, match=words):
         plant_of(written(tmp_path, text, name))
 
@@ -556,7 +556,7 @@ def test_a_floating_joint_can_be_welded(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", [*HELD, "two.dmd.yaml"])
-def test_a_robot_in_the_place_of_a_scenario_is_told(name, tmp_path):
+def test_a_robot_in_the_place_of_a_scenario_is_reported(name, tmp_path):
     text = HELD.get(name) or TWO.format(written(tmp_path, HELD["arm.urdf"], "arm.urdf"))
     file = written(tmp_path, text, name)
     with pytest.raises(ScenarioError, match=r"this is a robot, not a scenario; `drake-dae new"):

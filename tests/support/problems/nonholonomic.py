@@ -80,7 +80,7 @@ def knife_edge() -> Problem:
 def knife_edge_force() -> Problem:
     """The knife edge with z = (lateral force, heading).
 
-    z1 = v = m w V is met at once only in appearance: n* = beta is zero but for round-off. So
+    z1 = v = m w V is met at once only in appearance: n* = beta is zero except for round-off. So
     mu = (1, 2): (m w V)' = m V u2/I + w u1 (+ m w^2 k off N*), regular while w is not 0.
     """
     mass, inertia = 3.0, 0.4

@@ -179,7 +179,7 @@ def test_outputs_derivatives_and_updates_are_those_of_the_block(name):
 
 
 @pytest.mark.parametrize("name", BLOCKS)
-def test_a_block_tells_the_same_each_time_and_all_of_it(name):
+def test_a_block_reports_the_same_each_time_and_all_of_it(name):
     """Rules 1 and 6."""
     system = BLOCKS[name]()
     assert isinstance(system, Traced)

@@ -133,7 +133,7 @@ def test_a_fixed_step_that_fails_names_where_it_began(run, name):
 
 
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
-def test_an_accepted_state_out_of_the_domain_is_told(run):
+def test_an_accepted_state_out_of_the_domain_is_reported(run):
     """Euler's step of 0.05 s ends at 1 - 0.05 * 450 without a trial."""
     diagram, _ = alone(DaePlant(tank()))
     config = SimulatorConfig(

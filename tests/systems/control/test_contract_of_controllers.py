@@ -103,7 +103,7 @@ def test_rule_3_laws(controller):
         controller.parameters_along(context, [0.0, 1.0]), [values, values]
     )
     if controller.takes_over or isinstance(controller, RestingController):
-        with pytest.raises(ModelError, match="are fixed when it is made"):
+        with pytest.raises(ModelError, match="fixed"):
             controller.set_gains(context, poles(-9.0))
     else:
         controller.set_gains(context, poles(-9.0))
@@ -130,7 +130,7 @@ def test_rule_4_plants_and_parts(controller):
 
 
 def test_what_takes_references_is_refused_where_there_are_none():
-    with pytest.raises(WiringError, match="tolerances: it takes the references of a generator"):
+    with pytest.raises(WiringError, match="tolerances"):
         wired(MEMBERS["resting"](), tolerances=Tolerances({"tool.z": 0.1}))
 
 
@@ -139,7 +139,7 @@ def test_references_are_where_the_controller_takes_them(controller):
     if controller.takes_over:
         plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
     if controller.HasInputPort("reference"):
-        with pytest.raises(WiringError, match="tracking_controller needs a ReferenceGenerator"):
+        with pytest.raises(WiringError, match="ReferenceGenerator"):
             wire_loop(plant, controller)
     else:
         generator = ReferenceGenerator([ConstantReference(g) for g in GOALS], [2, 0])
@@ -149,7 +149,7 @@ def test_references_are_where_the_controller_takes_them(controller):
 
 def test_a_sensor_that_nothing_reads_is_refused(controller):
     if not controller.HasInputPort("measured_force"):
-        with pytest.raises(WiringError, match="takes no measured force"):
+        with pytest.raises(WiringError, match="measured force"):
             wired(controller, sensor=ForceSensor(1, 0.01))
 
 

@@ -108,7 +108,7 @@ def test_gains_change_in_a_context():
             state, reference, parameters=system.parameters(context)
         ),
     )
-    with pytest.raises(GainError, match="poles: values must be"):
+    with pytest.raises(GainError, match="poles: values"):
         system.set_gains(context, poles("fast"))
 
 
@@ -122,5 +122,5 @@ def test_gains_that_the_law_does_not_have_are_refused():
     )
     block = TrackingController(TrackingLaw(system, poles(-1.0)))
     coupled = gain_matrices([np.array([[2.0, 0.5], [0.0, 2.0]]), 3.0 * np.eye(2)])
-    with pytest.raises(GainError, match="no gain from the error of z1 to z0; make a new law"):
+    with pytest.raises(GainError, match="z1 to z0"):
         block.set_gains(block.CreateDefaultContext(), coupled)

@@ -149,8 +149,8 @@ def test_a_force_that_friction_falsifies_is_integrated_away():
         q, v = np.split(record["state"][i], 2)
         n = numbers("two_link", q, v)
         J, P = n.constraint_jacobian[0], n.output_jacobian[0]
-        rub = 0.4 * P * (P @ v) / np.hypot(P @ v, 0.05)
-        A_0, A = (J @ np.linalg.solve(n.mass, column) for column in (J, J - rub))
+        slip_row = 0.4 * P * (P @ v) / np.hypot(P @ v, 0.05)
+        A_0, A = (J @ np.linalg.solve(n.mass, column) for column in (J, J - slip_row))
         pressed = 20.0 - 50.0 * record["integral"][i, 0]
         assert record["constraint_force"][i, 0] == pytest.approx(pressed * A_0 / A, rel=1e-9)
 
@@ -228,22 +228,22 @@ def test_the_control_is_that_of_the_law_and_converts():
 def test_what_makes_no_sense_is_refused():
     found = arm("two_link")
     system, known = found.model.dae, {"structure": found.structure}
-    with pytest.raises(GainError, match=r"the law meets 'wall\.force' at once"):
+    with pytest.raises(GainError, match=r"wall\.force"):
         TrackingLaw(system, poles(-4.0), integral=["wall.force"], **known)
-    with pytest.raises(GainError, match=r"'tool\.z' stands twice"):
+    with pytest.raises(GainError, match=r"'tool\.z' occurs twice"):
         TrackingLaw(system, poles(-4.0), integral=["tool.z", "tool.z"], **known)
     with pytest.raises(GainError, match=r"integral: .*tool\.y"):
         TrackingLaw(system, poles(-4.0), integral=["tool.y"], **known)
-    with pytest.raises(ModelError, match="integral_limits must be a positive number"):
+    with pytest.raises(ModelError, match="integral_limits"):
         controller_of(-1.0)
     controller = TrackingController(law("two_link"))
-    with pytest.raises(ModelError, match="integrates nothing"):
+    with pytest.raises(ModelError, match="no integral action"):
         controller.set_integral(controller.CreateDefaultContext(), [0.0])
     controller, context = controller_of()
     with pytest.raises(ModelError, match="integral"):
         controller.set_integral(context, [0.0, 0.0])
     state = found.structure.states[0]
-    with pytest.raises(ModelError, match="a state of its own"):
+    with pytest.raises(ModelError, match="state"):
         linearize_loop(controller.law, state, np.zeros(4))
 
 

@@ -171,7 +171,7 @@ def test_refusals(make, message):
 
 def test_a_time_outside_a_trajectory_is_refused():
     generator = ReferenceGenerator([TrajectoryReference(hold([0, 1]))], [1])
-    with pytest.raises(ReferenceSignalError, match=r"covers 0 to 1 s and was asked for t = 1.5 s"):
+    with pytest.raises(ReferenceSignalError, match=r"t = 1\.5 s"):
         generator.reference(1.5)
 
 

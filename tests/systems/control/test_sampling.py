@@ -63,7 +63,7 @@ def at(record, name, times):
 
 @pytest.mark.parametrize(("period", "delay"), [(1e-3, 1e6), (1e-12, 1.0), (1.0, 1e300)])
 def test_a_delay_of_more_samples_than_are_kept_is_refused(period, delay):
-    with pytest.raises(ModelError, match="10000 periods at most"):
+    with pytest.raises(ModelError, match="10000 periods"):
         Sampling(period, delay)
     assert Sampling(period, 9_999.5 * period).late_samples == 10_000
 
@@ -246,7 +246,7 @@ def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
         )
 
 
-def test_a_law_that_reads_the_force_of_its_own_first_control_is_told():
+def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
     """A sensor that samples has a force at the start."""
     arms = arm("two_link")
     more = {"structure": arms.structure, "measured_force": True, "force_gain": 0.4}
@@ -262,7 +262,7 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_told():
         simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
         return loop.record(context)["constraint_force"][-1]
 
-    with pytest.raises(WiringError, match="the first control cannot be found, as where a law"):
+    with pytest.raises(WiringError, match="first control"):
         pressed(None)
     assert pressed(ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
 
@@ -299,7 +299,7 @@ def test_scenario_samples_and_limits():
         "seven_joint_wall", "sampling={period: 2.0e-3, delay: 1.0e-3}", "saturation=true"
     )
     assert found.sampling == Sampling(2e-3, 1e-3)
-    with pytest.raises(ScenarioError, match="sampling: a sampling's period must be positive"):
+    with pytest.raises(ScenarioError, match="sampling: a sampling's period"):
         scenario("two_link_wall", "sampling={period: 0.0}")
 
 
@@ -329,7 +329,7 @@ def test_what_a_sampled_sensor_takes_is_read_a_sample_later(gain, late):
     wanted = [ConstantReference(0.3), ConstantReference(20.0)]
     settings = LoopSettings(sensor=ForceSensor(1, lag, period), sampling=sampling)
     plant = RobotPlant(found.model, structure=found.structure)
-    with pytest.raises(WiringError, match="multiplies the force error by") as told:
+    with pytest.raises(WiringError, match="force error") as told:
         make_closed_loop(plant, tracking, wanted, settings)
     number = float(re.search(r"force error by ([0-9.]*[0-9])", str(told.value))[1])
     assert number == pytest.approx(radius, rel=5e-3)

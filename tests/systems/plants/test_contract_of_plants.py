@@ -123,7 +123,7 @@ def test_rule_1_ports(plant):
 def test_rules_2_and_3_system_and_robot(plant):
     assert plant.structure.system is plant.dae
     if plant.model is None:
-        with pytest.raises(ModelError, match="an animation needs a robot, as of a RobotPlant"):
+        with pytest.raises(ModelError, match="RobotPlant"):
             plant.robot("an animation")
         return
     assert plant.robot("an animation") is plant.model
@@ -167,7 +167,7 @@ def test_rule_8_parameters(plant):
         plant.set_parameter(context, "nothing", 1.0)
     place = plant.dae.parameter_slice("link2.mass")
     if isinstance(plant, ContactPlant | SpringyPlant):  # A test knows its members.
-        with pytest.raises(ModelError, match="fixed when it is made"):
+        with pytest.raises(ModelError, match="fixed"):
             plant.set_parameter(context, "link2.mass", 6.0)
         np.testing.assert_array_equal(plant.parameters(context), before)
     else:

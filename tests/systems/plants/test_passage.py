@@ -103,7 +103,7 @@ def test_where_nothing_leads_through_it_says_so(rates):
     _, plant = bars(1, 9.81)
     context = plant.CreateDefaultContext()
     plant.set_state(context, [0.0, 0.0, 0.0, *rates])
-    with pytest.raises((SingularityError, SimulationError), match="only where its velocity leads"):
+    with pytest.raises((SingularityError, SimulationError), match="velocity"):
         simulate(plant, context, 0.1, fixed_step(1e-2))
 
 

@@ -132,7 +132,7 @@ def test_set_consistent_state_mends_a_guess():
     assert 0 < np.linalg.norm(state - guess) < 0.3
     simulator.Initialize()
     plant.set_parameter(context, "wall.position", [5.0, 0, 0])
-    with pytest.raises(InconsistentStateError, match="no consistent state found"):
+    with pytest.raises(InconsistentStateError, match="no consistent state"):
         plant.set_consistent_state(context, guess)
 
 
@@ -216,7 +216,7 @@ def test_the_structure_of_another_system_is_refused():
     )
     with pytest.raises(ModelError, match=reason):
         RobotPlant(arm("two_link").model, structure=other)
-    with pytest.raises(ModelError, match="DaePlant: the structure is that of another system"):
+    with pytest.raises(ModelError, match="another system"):
         DaePlant(hanging_pendulum(), structure=find_structure(hanging_pendulum()))
 
 

@@ -374,11 +374,11 @@ def test_wrong_inputs():
     with pytest.raises(InconsistentStateError, match=r"not on the constraint.*project") as info:
         minimal.set_state(context, [0.5, -0.6, 0.0, 0.0])
     np.testing.assert_allclose(info.value.residual, [(0.61 - 0.64) / 2, 0.0], atol=1e-15)
-    with pytest.raises(ModelError, match="state must be finite real numbers"):
+    with pytest.raises(ModelError, match="state"):
         minimal.set_state(context, [np.nan, -0.6, 0.0, 0.0])
-    with pytest.raises(ModelError, match="a state must be finite and of shape"):
+    with pytest.raises(ModelError, match="a state"):
         minimal.set_state(context, [0.5, 0.0])
-    with pytest.raises(ModelError, match="does not convert to AutoDiffXd"):
+    with pytest.raises(ModelError, match="AutoDiffXd"):
         minimal.ToAutoDiffXd()
 
 

@@ -239,7 +239,7 @@ def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
 
 
 @pytest.mark.parametrize("reaction", ["hold", "fail"])
-def test_guard_that_never_fires_is_told(reaction):
+def test_guard_that_never_fires_is_reported(reaction):
     """The wall is 20 mm away, and 0.2 s are not enough."""
     loop = task_loop([Approach(SPEED, within=0.2, if_late=reaction), Press(20.0)])
     context = started(loop)
@@ -348,7 +348,7 @@ def test_free_member_is_the_robot_without_the_wall():
 def test_drakes_own_contact_is_the_plant():
     """1e5 N/m at 1 kHz, one sample late: measured 0.4 N and 0.2 mm off at most in contact.
 
-    It touches as fast as designed but for what a delay of 1 ms does, measured 0.6 %.
+    It touches as fast as designed except for what a delay of 1 ms does, measured 0.6 %.
     """
     found = arm("two_link")
     plant = ContactPlant(

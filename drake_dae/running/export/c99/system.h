@@ -2,7 +2,7 @@
 
    Written by drake_dae $version with CasADi $casadi; the terms are in LICENSE.txt. Nothing but the C
    library and libm is needed. No function allocates, keeps anything between calls, or calls the
-   system, and each takes the same time in every call, ${prefix}_project but for its iterations.
+   system, and each takes the same time in every call, ${prefix}_project except for its iterations.
 
    Compile it as the Makefile does. */
 

@@ -1,4 +1,4 @@
-"""Meshes that Drake neither reads nor draws, as .obj, where the package trimesh is there."""
+"""Meshes that Drake neither reads nor draws, converted to .obj by the optional package trimesh."""
 
 from functools import cache
 from pathlib import Path
@@ -8,11 +8,11 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.mesh_file import read_mesh
 
 ORIGINALS: dict[Path, Path] = {}
-"""A mesh that was written here -> the one that it is a copy of."""
+"""A converted mesh -> its original."""
 
 
 def as_obj(mesh: Path) -> Path | None:
-    """The mesh as an .obj in the same unit, which stays as long as this process.
+    """The mesh as an .obj in the same unit, in a file that lasts as long as this process.
 
     Returns:
         The file; None if the mesh cannot be read, or trimesh is not installed.

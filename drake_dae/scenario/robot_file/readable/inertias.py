@@ -1,4 +1,4 @@
-"""Inertias of a file that no body can have, and the nearest ones that a body can.
+"""Physically impossible inertias of a file, and the nearest possible ones.
 
 The moments d of an inertia about the centre of mass are d_i = s_j + s_k with the second moments
 s >= 0 along the principal axes: so none exceeds the sum of the others. The nearest possible inertia
@@ -22,17 +22,17 @@ _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 _LEAST = 1e-9
-"""The least second moment relative to their sum, so that round-off leaves none negative."""
+"""The least second moment relative to their sum, so that none is negative by round-off."""
 
 
 @dataclass(frozen=True)
 class RepairedInertia:
-    """An inertia that no body can have.
+    """A physically impossible inertia.
 
     Attributes:
         owner: The file with the line, and the link or body.
         moments: Its principal moments about the centre of mass, kg m^2.
-        possible: Those of the nearest inertia that a body can have.
+        possible: The moments of the nearest possible inertia.
         change: The Frobenius norm of the difference, relative to that of the inertia.
     """
 
@@ -53,8 +53,8 @@ class RepairedInertia:
 
 
 def nearest_inertia(inertia: FloatArray) -> FloatArray:
-    """The inertia of a body that is nearest to a symmetric matrix in the Frobenius norm, (3, 3)."""
-    from scipy.optimize import nnls  # Loads what few runs need.
+    """The possible inertia nearest to a symmetric matrix in the Frobenius norm, (3, 3)."""
+    from scipy.optimize import nnls  # Imported here, since few runs need it.
 
     moments, axes = np.linalg.eigh(inertia)
     second, _ = nnls(np.ones((3, 3)) - np.eye(3), moments)
@@ -63,11 +63,11 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
 
 
 def possible_inertias(text: str, file: Path) -> tuple[str, list[RepairedInertia]]:
-    """A file's text with possible inertias, with the same lines, and what was changed.
+    """A file's text with possible inertias, line by line as before, and the changed inertias.
 
     Args:
         text: A URDF, SDFormat or MJCF file without comments.
-        file: Its name tells which it is.
+        file: Its suffix determines which.
 
     Raises:
         ModelError: A mass is negative, or there is no possible inertia near one.
@@ -75,7 +75,7 @@ def possible_inertias(text: str, file: Path) -> tuple[str, list[RepairedInertia]
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return text, []  # Drake says what is wrong.
+        return text, []  # The error is left to Drake.
     form = _FORMS[file.suffix]
     found = list(_inertials(root))
     repaired: list[RepairedInertia] = []
@@ -87,7 +87,7 @@ def possible_inertias(text: str, file: Path) -> tuple[str, list[RepairedInertia]
             return block[0]
         mass, inertia = read
         if not np.all(np.isfinite([mass, *inertia.flat])):
-            return block[0]  # Drake tells it.
+            return block[0]  # The error is left to Drake.
         line = text.count("\n", 0, block.start()) + 1
         place = f"{file}:{line}"
         if mass < 0.0:
@@ -126,7 +126,7 @@ def _repaired(owner: str, inertia: FloatArray, nearest: FloatArray) -> RepairedI
 
 
 def _is_possible(mass: float, inertia: FloatArray) -> bool:
-    """Whether Drake takes an inertia for that of a body."""
+    """Whether Drake accepts an inertia."""
     if mass == 0.0:
         return not np.any(inertia)
     try:
@@ -145,12 +145,12 @@ def _matrix(entries: Sequence[float]) -> FloatArray:
 
 
 _Read = tuple[float, FloatArray] | None
-"""Mass in kg and inertia in kg m^2 about the centre of mass; None where they are not written."""
+"""Mass in kg and inertia in kg m^2 about the centre of mass; None if missing."""
 
 
 @dataclass(frozen=True)
 class _Form:
-    """How a kind of file writes an inertia."""
+    """The way in which a kind of file writes an inertia."""
 
     read: Callable[[ElementTree.Element], _Read]
     write: Callable[[str, FloatArray], str]
@@ -190,7 +190,7 @@ def _read_mjcf(inertial: ElementTree.Element) -> _Read:
 
 
 def _write_mjcf(block: str, inertia: FloatArray) -> str:
-    # A fullinertia has no place beside a quat: what was diagonal stays so.
+    # A fullinertia cannot be combined with a quat, so a diagonal inertia remains diagonal.
     key = "fullinertia" if "fullinertia" in block else "diaginertia"
     values = list(_entries(inertia).values())[: 6 if key == "fullinertia" else 3]
     return _replaced(block, rf"{key}\s*=\s*[\"'][^\"']*[\"']", f'{key}="{" ".join(values)}"')
@@ -200,7 +200,7 @@ def _numbers(mass: str, entries: Sequence[str]) -> _Read:
     try:
         return float(mass), _matrix([float(entry) for entry in entries])
     except ValueError:
-        return None  # Drake tells it.
+        return None  # The error is left to Drake.
 
 
 def _entries(inertia: FloatArray) -> Mapping[str, str]:
@@ -208,7 +208,7 @@ def _entries(inertia: FloatArray) -> Mapping[str, str]:
 
 
 def _replaced(block: str, pattern: str, text: str) -> str:
-    """A block with another text for a pattern, with the same lines."""
+    """A block with the matches of a pattern replaced, with the same number of lines."""
     return re.sub(pattern, lambda found: text + "\n" * found[0].count("\n"), block, flags=re.DOTALL)
 
 

@@ -1,7 +1,8 @@
-"""A robot's files as Drake can read them: without some meshes, with inertias of bodies.
+"""A robot's files made readable for Drake: without some meshes, with possible inertias.
 
-Vendors write collisions in .stl or .dae, which MultibodyPlant refuses as soon as it has a
-SceneGraph, and MJCF has .stl for all. The equations need none: what remains is read and drawn.
+Vendors use .stl or .dae for collision geometry, which a MultibodyPlant with a SceneGraph refuses,
+and MJCF uses .stl for all meshes. The equations need no meshes: the readable ones are read and
+drawn.
 """
 
 import re
@@ -36,13 +37,13 @@ _FILE = {
     ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
 }
-"""Per kind of file: what stands before a mesh's name, the name, and what stands after it."""
+"""Per kind of file: the text before a mesh's name, the name, and the text after it."""
 
 _MESH = {
     ".urdf": re.compile(r"(<mesh\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<mesh\b[^>]*>(?:(?!</mesh).)*?<uri>\s*)([^<]*?)(\s*</uri>)", re.DOTALL),
 }
-"""The same of meshes alone."""
+"""The same, for meshes only."""
 
 DRAWN = (".obj", ".gltf", ".dae")
 """The kinds of mesh that Drake's Meshcat draws."""
@@ -50,14 +51,14 @@ DRAWN = (".obj", ".gltf", ".dae")
 
 @dataclass(frozen=True)
 class Copies:
-    """Files that Drake reads in the place of those of the user.
+    """Copies of the user's files that Drake reads instead.
 
     Attributes:
-        leave_out: What the scenario says of it.
-        placed: The links that the scenario welds or sets free, "base" or "left::base".
-        originals: A copy -> the file that it is a copy of, with the same lines.
-        left_out: The meshes that are left out.
-        repaired: The inertias that no body can have.
+        leave_out: The key `leave_out` of the scenario.
+        placed: The links that the scenario welds or makes free, "base" or "left::base".
+        originals: A copy -> its original, with the same lines.
+        left_out: The omitted meshes.
+        repaired: The impossible inertias.
         floating: Model instance, or "", -> the floating joints of its file.
     """
 
@@ -69,7 +70,7 @@ class Copies:
     floating: dict[str, list[FloatingJoint]] = field(default_factory=dict)
 
     def named(self, text: str) -> str:
-        """A message of Drake's parser, about the files that the user has."""
+        """A message of Drake's parser, with the names of the user's files."""
         for copy, original in self.originals.items():
             text = text.replace(str(copy), str(original))
         return text
@@ -80,12 +81,12 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
 
     Args:
         file: A file that Drake's Parser reads.
-        parser: It knows the packages, and the plant.
-        folder: An empty one, where copies of files are written.
-        copies: Without any; the copies are added, also where the files are refused then.
+        parser: A parser with the packages, for the plant.
+        folder: An empty folder for the copies.
+        copies: An empty one; the copies are added, also if the files are refused afterwards.
 
     Returns:
-        The file of each model instance of directives, or the file itself under "".
+        The file of each model instance of the directives, or the file itself under "".
 
     Raises:
         ModelError: A body has its mass from a mesh that Drake cannot read.
@@ -134,7 +135,7 @@ def _readable(
     instance: str,
     placed: Collection[str],
 ) -> tuple[Path, list[str]]:
-    """The file, or a copy as Drake can read it, and the links that it fixes to the world."""
+    """The file or a readable copy, and the links that it fixes to the world."""
     if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
         return file, []
     plain = _COMMENT.sub(blank, file.read_text("utf-8", errors="replace"))
@@ -147,7 +148,7 @@ def _readable(
     text, repaired = possible_inertias(text, file)
     copies.repaired.extend(repaired)
     left_out: list[Path] = []
-    if _is_mjcf(file):  # Of MJCF Drake reads the meshes also where they are not registered.
+    if _is_mjcf(file):  # Drake reads the meshes of MJCF even if they are not registered.
         text, left_out = without_assets(text, file)
     elif has_geometry:
         text, left_out = _without_collisions(text, file, packages)
@@ -169,7 +170,7 @@ def _is_mjcf(file: Path) -> bool:
 
 
 def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[str, list[Path]]:
-    """A URDF or SDFormat file without the collision meshes that Drake cannot read, and these."""
+    """A URDF or SDFormat file without its unreadable collision meshes, and these meshes."""
     name, left_out = _FILE[file.suffix], []
 
     def kept(collision: re.Match[str]) -> str:
@@ -182,7 +183,7 @@ def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[st
 
 
 def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
-    """A text whose meshes that cannot be drawn are copies that can, as far as there are any."""
+    """Replaces meshes that cannot be drawn by drawable copies, if there are any."""
 
     def drawn(found: re.Match[str]) -> str:
         mesh = _resolved(found[2], file, packages)
@@ -195,7 +196,7 @@ def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
 
 
 def _with_absolute_names(text: str, file: Path) -> str:
-    """A copy lies elsewhere: relative names would lead nowhere."""
+    """Makes names absolute, since the copy is in another folder."""
     name = _FILE[file.suffix]
     return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text)
 
@@ -205,7 +206,7 @@ def _absolute(name: str, file: Path) -> str:
 
 
 def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
-    """Where a mesh is, or None where its name leads nowhere, which Drake tells better."""
+    """The path of a mesh; None if there is none, for which Drake's message is better."""
     name = _absolute(name, file)
     try:
         return Path(packages.ResolveUrl(name) if "://" in name else name)
@@ -214,7 +215,7 @@ def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
 
 
 def _is_refused(mesh: Path) -> bool:
-    """Whether Drake, asked for the convex hull that a collision needs, says no."""
+    """Whether Drake cannot compute the convex hull that a collision needs."""
     if not mesh.is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""An MJCF file as Drake can read it: meshes as .obj, and bodies of mass 0."""
+"""An MJCF file made readable for Drake: meshes as .obj, and bodies of mass 0."""
 
 import re
 from collections.abc import Iterator
@@ -15,18 +15,17 @@ _READ = ".obj"
 
 
 def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
-    """A file with its meshes as .obj, without others and the geometry that is made of them.
+    """A file with meshes as .obj only, without the other meshes and their geometry.
 
-    A body whose <inertial> has mass 0 has none, and its geometry weighs nothing: MuJoCo takes such
-    bodies where they do not move, or move with others.
+    A body whose <inertial> has mass 0 loses it, and its geometry gets no mass: MuJoCo accepts such
+    bodies if they do not move, or move with others.
 
     Args:
         text: The text of the file, without comments.
-        file: Where it is.
+        file: Its path.
 
     Returns:
-        The text, with the same lines and names of the meshes that lead there from anywhere; and the
-        meshes that are left out.
+        The text, with the same lines and absolute names of meshes; and the omitted meshes.
 
     Raises:
         ModelError: A body that can move has its mass from such a mesh.
@@ -34,7 +33,7 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return text, []  # Drake says what is wrong.
+        return text, []  # The error is left to Drake.
     whole, text = text, _without_mass(text, root)
     folder = file.resolve().parent
     for compiler in root.iter("compiler"):
@@ -67,7 +66,7 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
 
 
 def _without_mass(text: str, root: ElementTree.Element) -> str:
-    """Bodies of mass 0 as Drake reads them: without <inertial>, of geometry that weighs nothing."""
+    """Rewrites bodies of mass 0 for Drake: without <inertial>, with geometry of mass 0."""
     if _takes_geometry(root):
         return text
     empty = {
@@ -93,7 +92,7 @@ def _without_mass(text: str, root: ElementTree.Element) -> str:
 
 
 def _takes_geometry(root: ElementTree.Element) -> bool:
-    """Whether masses are those of the geometry also where there is an <inertial>."""
+    """Whether masses are computed from the geometry even if there is an <inertial>."""
     return any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
 
 
@@ -101,11 +100,11 @@ def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
     try:
         return inertial is not None and float(inertial.get("mass", "")) == 0.0
     except ValueError:
-        return False  # Drake tells it.
+        return False  # The error is left to Drake.
 
 
 def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
-    """The bodies in an element that joints move."""
+    """The bodies in an element that are moved by joints."""
     for child in body.iterfind("body"):
         own = moves or child.find("joint") is not None or child.find("freejoint") is not None
         if own:
@@ -114,7 +113,7 @@ def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementT
 
 
 def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
-    """Refuses a body that moves and weighs what its meshes do."""
+    """Refuses a moving body whose mass is computed from its omitted meshes."""
     always = _takes_geometry(root)
     for body in (body for world in root.iter("worldbody") for body in _moving(world)):
         if body.find("inertial") is not None and not always:

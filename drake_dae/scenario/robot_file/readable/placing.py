@@ -1,8 +1,8 @@
-"""Links that a robot's file holds in the world, or lets float.
+"""Links that a robot's file fixes to the world, or lets float.
 
-Those it holds are set free where the user says where they stand. Those it lets float have no joint
-in Drake, which leaves them free with a quaternion: its length 1 is an equation that no force keeps.
-They get one in roll, pitch and yaw.
+Fixed links are released if the scenario places them. Floating links have no joint in Drake, which
+makes them free bodies with a quaternion, whose length 1 is an equation that no constraint force
+enforces. They get a joint in roll, pitch and yaw.
 """
 
 import re
@@ -22,7 +22,7 @@ from drake_dae.scenario.robot_file.readable.urdf import blank
 _JOINT = re.compile(r"<joint\b[^>]*(?<!/)>.*?</joint\s*>", re.DOTALL)
 _BODY = re.compile(r"<body\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*(?<!/)>")
 _HOLDING = ("fixed", "floating")
-"""Joints to the world in whose place another one can stand."""
+"""Kinds of joints to the world that can be replaced."""
 
 
 def world_links(text: str, file: Path) -> list[str]:
@@ -30,7 +30,7 @@ def world_links(text: str, file: Path) -> list[str]:
 
     Args:
         text: A URDF, SDFormat or MJCF file without comments.
-        file: Its name tells which it is.
+        file: Its suffix determines which.
     """
     if file.suffix == ".xml":
         return [body.get("name", "") for body in _fixed_bodies(text)]
@@ -39,9 +39,9 @@ def world_links(text: str, file: Path) -> list[str]:
 
 
 def released(text: str, file: Path, links: Collection[str]) -> str:
-    """A file's text in which no joint of it leads from the world to some links, same lines.
+    """A file's text without the joints from the world to some links, with the same lines.
 
-    The arguments are those of `world_links`, and the names of the links.
+    The arguments are those of `world_links`, and the names of the links to release.
     """
     if not links:
         return text
@@ -58,13 +58,13 @@ def released(text: str, file: Path, links: Collection[str]) -> str:
 
 @dataclass(frozen=True)
 class FloatingJoint:
-    """A joint that holds nothing.
+    """A floating joint.
 
     Attributes:
         name: Its name.
-        parent: The link in which its positions are; "world" for the world.
+        parent: The link relative to which it floats; "world" for the world.
         child: The link that floats.
-        origin: Its place in the parent, m, and roll, pitch and yaw there, rad.
+        origin: Its position in the parent, m, and roll, pitch and yaw there, rad.
     """
 
     name: str
@@ -76,10 +76,10 @@ class FloatingJoint:
 def floating_joints(text: str, file: Path) -> tuple[str, list[FloatingJoint]]:
     """The text of a file without its floating joints, with the same lines, and these.
 
-    Drake reads those of MJCF as bodies that are free; they stay in the text.
+    Drake reads those of MJCF as free bodies; they remain in the text.
 
     Raises:
-        ModelError: The origin of one is no six numbers.
+        ModelError: The origin of one is not six numbers.
     """
     if file.suffix == ".xml":
         return text, list(_free_joints(text))
@@ -112,7 +112,7 @@ def _free_joints(text: str) -> Iterator[FloatingJoint]:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return  # Drake says what is wrong.
+        return  # The error is left to Drake.
     for body in root.iterfind("worldbody/body"):
         joints = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
         for joint in joints[:1]:
@@ -124,11 +124,11 @@ def _free_joints(text: str) -> Iterator[FloatingJoint]:
 def add_floating_joints(
     plant: MultibodyPlant, instance: str, joints: Iterable[FloatingJoint]
 ) -> None:
-    """Adds floating joints in roll, pitch and yaw, and says so.
+    """Adds floating joints in roll, pitch and yaw, with a warning.
 
     Args:
         plant: The robot, not finalized; changed.
-        instance: The model instance of the file; "" where it is the only one.
+        instance: The model instance of the file; "" if it is the only one.
         joints: Its floating joints, of links that no other joint holds.
     """
     models = [plant.GetModelInstanceByName(instance)] if instance else []
@@ -156,7 +156,7 @@ def add_floating_joints(
 
 
 def _held(joint: str) -> tuple[str, str]:
-    """The kind of a joint from the world and the link that it holds; empty for other joints."""
+    """The kind of a joint from the world and the link that it fixes; empty for other joints."""
     kind, child, parent, _ = _ends(joint)
     return (kind, child) if parent == "world" else ("", "")
 
@@ -175,11 +175,11 @@ def _ends(joint: str) -> tuple[str, str, str, str]:
 
 
 def _fixed_bodies(text: str) -> Iterator[ElementTree.Element]:
-    """The bodies that stand in the world of an MJCF file without a joint."""
+    """The bodies in the world of an MJCF file without a joint."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
-        return  # Drake says what is wrong.
+        return  # The error is left to Drake.
     for body in root.iterfind("worldbody/body"):
         if body.find("joint") is None and body.find("freejoint") is None:
             yield body

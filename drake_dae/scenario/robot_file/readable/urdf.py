@@ -1,9 +1,8 @@
-"""A URDF as its authors mean it, where Drake refuses it or reads something else.
+"""URDF constructs of vendors that Drake refuses or reads differently, rewritten.
 
-A continuous joint has no position limits, whatever its <limit> says. A joint that is fixed follows
-no other one. A material without a colour has the one that its name has first, or none. Two
-actuators of one name are two actuators. A transmission to a joint that is not there drives none.
-"package:///" is "package://".
+Position limits of a continuous joint are ignored, and <mimic> of a fixed one. A material without a
+colour gets the first colour of its name, or none. Two actuators of one name get different names.
+Transmissions to joints that do not exist are removed. "package:///" is "package://".
 """
 
 import re
@@ -29,14 +28,15 @@ _ACTUATOR = re.compile(r"(<actuator\b[^>]*?\bname\s*=\s*[\"'])([^\"']*)")
 
 
 def as_meant(text: str, without_limits: bool) -> str:
-    """The text of a URDF without comments, changed as said above, with the same lines.
+    """The text of a URDF without comments, rewritten as described above, with the same lines.
 
     Args:
         text: The text.
-        without_limits: Whether limits that leave a joint no room are none.
+        without_limits: Whether empty intervals of limits are removed.
 
     Raises:
-        ModelError: The lower limit of a joint is above the upper one, and that is no limit's sign.
+        ModelError: The lower limit of a joint is above the upper one, and this does not mean "no
+            limits".
     """
     text = _JOINT.sub(lambda joint: _joint(joint, without_limits), text)
     text = _with_first_materials(text)
@@ -68,14 +68,14 @@ def _bounds(joint: str) -> Iterator[tuple[str, float]]:
         try:
             yield side, float(value)
         except ValueError:
-            continue  # Drake tells it.
+            continue  # The error is left to Drake.
 
 
 def _with_first_materials(text: str) -> str:
-    """Materials with the colour that their name has first; without one, where it has none.
+    """Gives materials the first colour of their name, if there is one.
 
-    Vendors give a name several colours, of which other readers take one and Drake none; or use it
-    before its colour, or never say which one it is.
+    Vendors give a name several colours, of which other parsers use one and Drake none; or use a
+    name before its colour is defined, or never define it.
     """
     colours: dict[str, str] = {}
     is_plain = True
@@ -96,7 +96,7 @@ def _with_first_materials(text: str) -> str:
 
 
 def _without_idle_transmissions(text: str) -> str:
-    """A text without transmissions to joints that it has not."""
+    """A text without transmissions to joints that do not exist."""
     joints = {joint[1] for joint in _JOINT.finditer(text)}
 
     def kept(transmission: re.Match[str]) -> str:
@@ -107,7 +107,7 @@ def _without_idle_transmissions(text: str) -> str:
 
 
 def _with_names_of_their_own(text: str) -> str:
-    """Actuators whose names differ: those of a name that was there get a number."""
+    """Makes names of actuators unique, by a number."""
     taken = Counter(name for _, name in _ACTUATOR.findall(text))
     seen: Counter[str] = Counter()
 
@@ -126,5 +126,5 @@ def _with_names_of_their_own(text: str) -> str:
 
 
 def blank(found: re.Match[str]) -> str:
-    """As many lines as there were, so that messages tell the right one."""
+    """The line breaks of a text, so that line numbers in messages remain right."""
     return "\n" * found[0].count("\n")

@@ -15,7 +15,6 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
 
 
 class ContactForces(LeafSystem):
@@ -127,6 +126,3 @@ class ContactForces(LeafSystem):
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         state, force = self._state.Eval(context), self._force(context)
         output.SetFromVector(self._output(state, force, self._parameters)[0])
-
-    def traced(self) -> Block:
-        raise not_traced("Drake's own contact")

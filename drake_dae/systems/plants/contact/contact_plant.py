@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
@@ -31,10 +32,15 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
+from drake_dae.robots.constraint_wrenches import (
+    ConstraintWrenches,
+    contact_normals,
+    own_values,
+)
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped, Update
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
@@ -57,6 +63,10 @@ from drake_dae.systems.plants.contract import Plant
 def _is_of_use(record: logging.LogRecord) -> bool:
     """Filters Drake's message on half spaces in deformable contact, which is not used here."""
     return "half spaces are not currently supported for deformable" not in record.getMessage()
+
+
+_OF_FORCES = ("constraint_force", "contact_force", "constraint_residual", "controlled_output")
+"""The output ports of `ContactForces`."""
 
 
 @checked(ModelError)
@@ -127,11 +137,11 @@ class ContactPlant(Diagram, Plant):
         if model.stages:
             check_step(model, material.time_step, self._values)
         logging.getLogger("drake").addFilter(_is_of_use)
-        builder = DiagramBuilder()
+        inner = DiagramBuilder()
         config = MultibodyPlantConfig(
             time_step=material.time_step, contact_model=material.contact_model
         )
-        plant, scene_graph = AddMultibodyPlant(config, builder)
+        plant, scene_graph = AddMultibodyPlant(config, inner)
         self.multibody = plant
         add_robot(plant, scene_graph)
         if any(stage.carries_rotors for stage in model.stages):
@@ -143,39 +153,41 @@ class ContactPlant(Diagram, Plant):
         self._masses = self._other_masses()
         if disturbances:
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
-            applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
+            applied = inner.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             port = plant.get_applied_spatial_force_input_port()
-            builder.Connect(applied.get_output_port(), port)
-
-        forces = builder.AddSystem(ContactForces(model, structure, pairs, self._values))
+            inner.Connect(applied.get_output_port(), port)
+        forces = inner.AddSystem(ContactForces(model, structure, pairs, self._values))
         self.contact_force_signals = forces.contact_force_signals
         results = plant.get_contact_results_output_port()
-        builder.Connect(results, forces.GetInputPort("contact_results"))
-        links = state = plant.get_state_output_port()
+        inner.Connect(results, forces.GetInputPort("contact_results"))
+        inner.ExportInput(plant.get_actuation_input_port(), "joint_torque")
+        inner.ExportInput(forces.GetInputPort("state"), "state")
+        inner.ExportOutput(plant.get_state_output_port(), "link_state")
+        for name in _OF_FORCES:
+            inner.ExportOutput(forces.GetOutputPort(name), name)
+        inner.ExportOutput(results, "contact_results")
+        inner.ExportOutput(scene_graph.get_query_output_port(), "query_object")
+        # A diagram of its own, which a rollout lets Drake step without the stages.
+        builder, scene = DiagramBuilder(), inner.Build()
+        scene.set_name("scene")
+        self._scene = builder.AddSystem(scene)
+        links = state = scene.GetOutputPort("link_state")
         self._stages = None
         if model.stages:
             stages = builder.AddSystem(SteppedStages(model, self.time_step, self._values))
             self._stages, state = stages, stages.GetOutputPort("state")
             builder.Connect(links, stages.GetInputPort("link_state"))
             torque = stages.GetOutputPort("joint_torque")
-            builder.Connect(torque, plant.get_actuation_input_port())
+            builder.Connect(torque, scene.GetInputPort("joint_torque"))
             builder.ExportInput(stages.GetInputPort("control"), "control")
             for name in ("joint_torque", *stages.stage_ports):
                 builder.ExportOutput(stages.GetOutputPort(name), name)
         else:
-            builder.ExportInput(plant.get_actuation_input_port(), "control")
-        builder.Connect(state, forces.GetInputPort("state"))
+            builder.ExportInput(scene.GetInputPort("joint_torque"), "control")
+        builder.Connect(state, scene.GetInputPort("state"))
         builder.ExportOutput(state, "state")
-        builder.ExportOutput(links, "link_state")
-        for name in (
-            "constraint_force",
-            "contact_force",
-            "constraint_residual",
-            "controlled_output",
-        ):
-            builder.ExportOutput(forces.GetOutputPort(name), name)
-        builder.ExportOutput(results, "contact_results")
-        builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
+        for name in ("link_state", *_OF_FORCES, "contact_results", "query_object"):
+            builder.ExportOutput(scene.GetOutputPort(name), name)
         builder.BuildInto(self)
         self.set_name(model.dae.name)
 
@@ -278,14 +290,75 @@ class ContactPlant(Diagram, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        own = self.GetMutableSubsystemContext(self.multibody, context)
         count = self.multibody.num_multibody_states()
         links, stages = np.split(self.dae.state_vector(state), [count])
+        self._set_links(self.GetMutableSubsystemContext(self._scene, context), links)
+        if self._stages is not None:
+            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+
+    def _set_links(self, context: Context, links: FloatArray) -> None:
+        """Sets (q, v) and changed masses in a context of the scene."""
+        own = self._scene.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(own, links)
         for body, mass in self._masses:
             body.SetMass(own, mass)
+
+    def traced(self) -> Block:
+        count, of_links = self.dae.num_states, self.multibody.num_multibody_states()
+        forces = 3 * self.dae.num_constraints
+        held = ca.SX.sym("held", count + forces)
+        links, contact, of_stages = ca.vertsplit(
+            held, [0, of_links, of_links + forces, held.numel()]
+        )
+        state, given = ca.vertcat(links, of_stages), ca.DM(self._values)
+        normals = contact_normals(self.model).function(state, given)[0]
+        force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
+        acting = ca.SX.sym("force", force.numel())
+        found = [self.dae.outputs(acting), self.structure.manifold.residual_expression]
+        symbols = [self.dae.state, self.dae.parameter_symbol, acting]
+        output, residual = ca.substitute(found, symbols, [state, given, force])
+        shown = {
+            "state": (state, self.dae.state_signals),
+            "link_state": (links, ()),
+            "contact_force": (contact, self.contact_force_signals),
+            "constraint_force": (force, self.dae.force_signals),
+            "constraint_residual": (residual, self.structure.manifold.residual_signals),
+            "controlled_output": (output, self.dae.output_signals),
+        }
+        reads, updates = "control", []
         if self._stages is not None:
-            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+            reads, step = "joint_torque", self._stages.step
+            values = {"joint_torque": self._stages.torque(state, given)}
+            for name, part in self._stages.stage_ports.items():
+                values[name] = of_stages[part]
+            shown |= {name: (value, ()) for name, value in values.items()}
+            control = ca.SX.sym("control", self.dae.num_controls)
+            after = ca.vertcat(links, contact, step(state, control, given))
+            function = ca.Function("step", [held, control], [after])
+            computation = Computation(function, (HELD, "control"), (HELD,))
+            updates.append(Update(computation, self.time_step, 0.0, True))
+        computations = tuple(
+            Computation(ca.Function(name, [held], [value]), (HELD,), (name,))
+            for name, (value, _) in shown.items()
+        )
+        ports = {name: tuple(signals) for name, (_, signals) in shown.items() if signals}
+        stepped = Stepped(
+            self._scene,
+            self.time_step,
+            ("link_state", "contact_force"),
+            "joint_torque",
+            reads,
+            self._held,
+            lambda context, values: self._set_links(context, values[:of_links]),
+            held.numel(),
+        )
+        return Block(self, computations, tuple(updates), stepped=stepped, ports=ports)
+
+    def _held(self, context: Context) -> FloatArray:
+        """(q, v), the contact forces, and the states of the stages."""
+        count = self.multibody.num_multibody_states()
+        links, stages = np.split(self.state(context), [count])
+        return np.concatenate([links, self.GetOutputPort("contact_force").Eval(context), stages])
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.

@@ -9,7 +9,6 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -82,15 +81,25 @@ class SteppedStages(LeafSystem):
         count = model.joint_force.numel()
         self.DeclareVectorOutputPort("joint_torque", count, weakly(self._calc_torque), both)
         self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._calc_state), both)
-        self.stage_ports: list[str] = []
+        self.stage_ports: dict[str, slice] = {}
         start = 0
         for stage in model.stages:
             for name, part in stage.ports.items():
                 places = slice(start + part.start, start + part.stop)
                 calc = weakly(self._calc_part, places)
                 self.DeclareVectorOutputPort(name, part.stop - part.start, calc, own)
-                self.stage_ports.append(name)
+                self.stage_ports[name] = places
             start += stage.state.numel()
+
+    def step(self, state: ca.SX, control: ca.SX, parameters: ca.DM) -> ca.SX:
+        """s after a step, of x, shape (n, 1), and u, shape (p, 1)."""
+        found: ca.SX = self._step.function(state, control, parameters)[0]
+        return found
+
+    def torque(self, state: ca.SX, parameters: ca.DM) -> ca.SX:
+        """The joint torque at x, shape (n, 1)."""
+        found: ca.SX = self._torque.function(state, parameters)[0]
+        return found
 
     def state(self, context: Context) -> FloatArray:
         """s in a context, shape (k,)."""
@@ -128,9 +137,6 @@ class SteppedStages(LeafSystem):
         if function.is_valid:
             return values[0]
         raise simulation_error(function.failure(), context.get_time(), state, self._signals)
-
-    def traced(self) -> Block:
-        raise not_traced("Drake's own contact behind springs, motors or valves")
 
 
 def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:

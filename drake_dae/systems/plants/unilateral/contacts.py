@@ -110,16 +110,16 @@ class UnilateralContacts:
         ]
         if not restitution:
             raise ModelError(
-                f"{model.name}: no contact that opens and closes is given; those that can are "
-                f"{fitting}. Where none shall, take a RobotPlant"
+                f"{model.name}: no opening contacts are given; possible ones are {fitting}. If no "
+                "contact opens, use a RobotPlant"
             )
         for name in restitution:
             if name not in parts:
                 raise ModelError(f"{model.name}: {unknown_name('constraint', name, parts)}")
             if name not in fitting:
                 raise ModelError(
-                    f"{model.name}: '{name}' cannot open, since it has no single force that can "
-                    f"only push; those that have are {fitting}"
+                    f"{model.name}: '{name}' cannot open, since it is not unilateral with a "
+                    f"single force; those that are: {fitting}"
                 )
         if model.dae.sharing is not None:
             raise ModelError(
@@ -243,7 +243,7 @@ class UnilateralContacts:
         self, time: float, state: FloatArray, names: Sequence[str], found: PainleveOutcome | None
     ) -> PainleveError:
         """The error of a Painleve paradox."""
-        outcome = f". What becomes of it is {found.value}" if found else ""
+        outcome = f". Its outcome is {found.value}" if found else ""
         return PainleveError(
             f"{self.dae.name}: Painleve paradox at the contact of {', '.join(names)} at "
             f"t = {time:.6g} s, state {show(state)}{outcome}. Lower the friction, slide the other "

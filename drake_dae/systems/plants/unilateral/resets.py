@@ -240,8 +240,8 @@ class Resets:
 
     def _unfit(self, time: float, state: FloatArray) -> SimulationError:
         return SimulationError(
-            f"{self._contacts.dae.name}: no forces of the contacts that touch at t = "
-            f"{time:.6g} s, state {show(state)}, keep them from being pierced by pushing alone",
+            f"{self._contacts.dae.name}: no forces of the contacts that touch at t = {time:.6g} "
+            f"s, state {show(state)}, prevent penetration by compressive forces alone",
             time,
             state,
         )
@@ -250,13 +250,13 @@ class Resets:
         self, time: float, before: Closed, closed: Closed, events: Sequence[ContactEvent]
     ) -> list[ContactEvent]:
         """The contacts that opened or closed without impact."""
-        told = {name for event in events for name in event.contacts}
+        named = {name for event in events for name in event.contacts}
         found = []
         for kind, was in ((ContactChange.OPENING, True), (ContactChange.CLOSING, False)):
             names = tuple(
                 name
                 for name, old, new in zip(self._contacts.names, before, closed, strict=True)
-                if old is was and new is not was and not (name in told and not was)
+                if old is was and new is not was and not (name in named and not was)
             )
             if names:
                 found.append(ContactEvent(time, kind, names, ()))
@@ -264,10 +264,10 @@ class Resets:
 
     def _told(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
         names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
-        told = []
+        named = []
         for event in events:
             found = replace(event, closed=names)
             if event.kind is ContactChange.REST and not set(event.contacts) & set(names):
                 found = replace(found, kind=ContactChange.IMPACT, rest_time=None)
-            told.append(found)
-        return told
+            named.append(found)
+        return named

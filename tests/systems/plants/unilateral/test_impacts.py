@@ -166,7 +166,7 @@ def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count,
 
 @pytest.mark.slow
 def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
-    """Each moves along its own slope; impulses pierce nothing, and rub in their cones."""
+    """Each moves along its own slope; impulses pierce nothing, and are in their friction cones."""
     for seed in range(6):
         random = np.random.default_rng(seed)
         J = random.standard_normal(4)
@@ -184,7 +184,7 @@ def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
 
 
 def test_a_box_that_lands_on_four_feet():
-    """Twelve rows on six freedoms: impulses are in their cones, and rub as Coulomb says."""
+    """Twelve rows on six freedoms: impulses are in their cones, and obey Coulomb's law."""
     for seed in range(30):
         random = np.random.default_rng(seed)
         a, b, h = random.uniform(0.1, 1.0, 3)
@@ -207,7 +207,7 @@ def test_a_box_that_lands_on_four_feet():
             assert push[0] >= 0.0
             assert np.linalg.norm(push[1:]) <= mu * push[0] + 1e-12
             assert slip[0] >= -e * max(rise, 0.0) - 1e-10
-            # What rubs does so against the slip, with all that the cone has.
+            # Friction acts against the slip, with all that the cone has.
             assert push[1:] @ slip[1:] == pytest.approx(
                 -mu * push[0] * np.linalg.norm(slip[1:]), abs=1e-9
             )
@@ -215,7 +215,7 @@ def test_a_box_that_lands_on_four_feet():
 
 @pytest.mark.slow
 def test_a_wedged_body_bounces_less_or_not_at_all():
-    """Between two walls that rub it as it sinks in: no impulse moves it along, nor apart.
+    """Between two walls with friction as it sinks in: no impulse moves it along, nor apart.
 
     A point between planes that lean by 10 degrees, mu = 1: each impulse of one is held by the
     other's, so that Newton's law of impact asks for rates that no impulse brings.
@@ -307,7 +307,7 @@ def test_a_lever_of_one_freedom_rubs(slope, bounce):
     after = before + A @ impulses
     assert impulses[0] > 0.0
     assert abs(impulses[1]) <= mu * impulses[0] * (1.0 + 1e-12)
-    # Leaving, the tip slides along slope, where it rubs by -mu sign(slope).
+    # Leaving, the tip slides along slope, where its friction is -mu sign(slope).
     locks = 1.0 - mu * abs(slope) <= 0.0
     assert_allclose(after, 0.0 if locks else 2.0 * bounce * J, atol=1e-9)
 
@@ -319,7 +319,7 @@ def test_of_impulses_that_stick_alike_those_are_taken_that_rub_least(tangents, s
     random = np.random.default_rng(seed)
     J = random.standard_normal((1 + tangents, tangents))
     n = np.linalg.svd(J.T)[2][-1]
-    # By impulses that push more than they rub, so that they are in the cone.
+    # By impulses that push more than the friction, so that they are in the cone.
     given = np.array([3.0, *random.uniform(-1.0, 1.0, tangents)])
     before = -J @ J.T @ given
     if before[0] > 0.0:

@@ -111,7 +111,7 @@ def test_a_box_tips_where_the_moment_outweighs_it(bouncing_box):
     assert [event.kind for event in plant.events(context)][-1] is ContactChange.OPENING
     force = plant.GetOutputPort("constraint_force").Eval(context)
     assert force[0] == 0.0
-    # J M^-1 J^T lambda = g + b tau / I where it is upright, but for the angle, below 1e-5.
+    # J M^-1 J^T lambda = g + b tau / I where it is upright, except for the angle, below 1e-5.
     acceleration = GRAVITY + HALF * 1.001 * most / INERTIA
     mobility = 1.0 / MASS + HALF**2 / INERTIA
     assert_allclose(force[1], acceleration / mobility, rtol=1e-3)

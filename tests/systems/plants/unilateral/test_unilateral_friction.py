@@ -1,4 +1,4 @@
-"""Contacts that rub, open and close: Painleve's rod."""
+"""Contacts with friction that open and close: Painleve's rod."""
 
 import numpy as np
 import pytest

@@ -156,7 +156,7 @@ $updates
   return good;
 }
 
-/* What happens at the start of a step: the projection, and the updates that are due. */
+$sample/* What happens at the start of a step: the projection, and the updates that are due. */
 static int update(Run *run, double *x, double *held, Given *g, long long num_events,
                   const double *events, const long long *due, const double *noise) {
   while (run->pending) {

@@ -9,9 +9,9 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.fused import Fused, Seen
-from drake_dae.running.rollout.many import BLOCK, Many
 from drake_dae.running.rollout.run import Ending, Problem, Run
+from drake_dae.running.rollout.stepping.fused import Fused, Seen
+from drake_dae.running.rollout.stepping.many import BLOCK, Many
 from drake_dae.systems.blocks.trials import SLOWEST, STEPS
 
 REACHED = 1e-11

@@ -7,9 +7,9 @@ from math import isfinite, sqrt
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.course import REACHED, Course, Ended, Rows, Step
-from drake_dae.running.rollout.fused import CHUNK, Fused
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, Tableau
+from drake_dae.running.rollout.stepping.course import REACHED, Course, Ended, Rows, Step
+from drake_dae.running.rollout.stepping.fused import CHUNK, Fused
 
 SHORTEST = 1e-12
 """A step that is shorter than this, relative to the time, is none."""

@@ -10,9 +10,9 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import ARGUMENTS
-from drake_dae.running.rollout.many import Many
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Tableau
+from drake_dae.running.rollout.stepping.many import Many
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
 
 CHUNK = 64
@@ -96,6 +96,7 @@ class Fused:
         self._updates = [
             (rate.is_unrestricted, list(rate.places), Called(rate.function))
             for rate in compiled.rates
+            if rate.stepped is None
         ]
         self._steps: dict[bytes, tuple[Called, Called]] = {}
         self._called = Called(self._rate)

@@ -1,6 +1,7 @@
 """A diagram as one library of machine code, which steps it without Python in between."""
 
 import ctypes
+import time
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compiled import Rate
+from drake_dae.compiler.rates import Rate
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
@@ -23,8 +24,8 @@ Library = ctypes.CDLL
 _PROJECTION, _ALL = 2, 7
 """What is pending before a step, as stepper.c has it."""
 
-BUDGET = 20_000
-"""So many steps are taken before Python looks at the run: at most some tenths of a second."""
+FIRST, PAUSE = 500, 0.1
+"""So many steps are taken before Python looks at the run, then as many as take this time, in s."""
 
 
 class _Run(ctypes.Structure):
@@ -79,11 +80,14 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
     given = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
     given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
-    ending = Ending.PAUSED
+    ending, budget = Ending.PAUSED, FIRST
     while ending is Ending.PAUSED and not settings.look(
         lambda: problem.whole(rows[: own.row]), problem.context
     ):
-        ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
+        began = time.perf_counter()
+        ending = Ending(step(ctypes.byref(own), *arguments, _argument(budget)))
+        passed = time.perf_counter() - began
+        budget = max(1, int(budget * min(4.0, PAUSE / max(passed, 1e-9))))
         if ending is Ending.OFF_MANIFOLD:
             try:
                 state[:] = problem.project(own.time, state, held)
@@ -115,7 +119,7 @@ def _argument(value: Any) -> Any:
 def _source(program: Program) -> str:
     compiled, calls = program.compiled, program.functions
     sizes: dict[str, int] = {
-        "SIZE": program.size,
+        "SIZE": max(1, program.size),  # An array has one entry at least.
         "HELD": compiled.sizes["held"],
         "NOISE": compiled.sizes["noise"],
         "WIDTH": program.width,
@@ -151,7 +155,10 @@ def _source(program: Program) -> str:
             generate(*(renamed(each, f"dae_{name}") for name, each in calls.items()))
         ),
         "constants": "\n".join([*lines, ""]),
-        "updates": "\n".join(_updated(*item) for item in enumerate(compiled.rates)),
+        "updates": "\n".join(
+            _updated(*item) for item in enumerate(compiled.rates) if item[1].stepped is None
+        ),
+        "sample": _sampled(len(compiled.rates) - 1) if compiled.has_stepped else "",
         "watch": _WATCH if compiled.watched else "  (void)time, (void)x, (void)g;",
         "guards": _GUARDS if compiled.guards else "  (void)x, (void)g;",
     }
@@ -170,6 +177,28 @@ def _updated(number: int, rate: Rate) -> str:
     good &= isfinite(valid) != 0;
     for (i = 0; i < {count}; i++) fresh[places_{number}[i]] = values[i];
   }}"""
+
+
+def _sampled(number: int) -> str:
+    """What stepper.c has for a diagram with a block that Drake steps."""
+    return f"""
+/* What Drake's step reads and the unrestricted updates; or, after it, the discrete ones. */
+__attribute__((visibility("default"))) int sample(
+    double time, double *held, const double *parameters, const double *noise, long long due,
+    int unrestricted, double *input) {{
+  Given g;
+  double x[SIZE] = {{0.0}}, valid = 0.0;
+  const double *arg[UPDATE_{number}_ARG] = {{&time, x, held, parameters, g.given, noise}};
+  double *res[UPDATE_{number}_RES] = {{input, &valid}};
+  g.held = held;
+  g.parameters = parameters;
+  g.time = NAN;
+  set_time(time, &g);
+  if (unrestricted) dae_update_{number}(arg, res, 0, 0, 0);
+  if (!isfinite(valid)) return INVALID;
+  return apply(time, x, held, &g, noise, due, unrestricted) ? DONE : INVALID;
+}}
+"""
 
 
 _GUARDS = """\
