@@ -1,5 +1,6 @@
 """All combinations of parts of a scenario: a rollout is Drake's run, or one sentence refuses."""
 
+import re
 from itertools import product
 
 import numpy as np
@@ -87,11 +88,15 @@ def test_a_rollout_is_drakes_run_or_says_why_not(names, tmp_path):
     except (ScenarioError, WiringError):
         return  # No scenario at all.
     chosen = load_scenario(path)
-    if names[3] == "Drake's contact":
-        with pytest.raises(ModelError, match=r"^[^.]+cannot be traced[^.]+by simulate$"):
-            start_values(loop, context)
+    refused = ""
+    try:
+        start, parameters = start_values(loop, context)
+    except ModelError as error:
+        refused = str(error)
+    if refused:
+        assert names[3] == "Drake's contact", refused
+        assert re.fullmatch(r"[^.]+(\. [^.]+)?", refused), refused
         return
-    start, parameters = start_values(loop, context)
     seeds = {"force_noise": chosen.force_feedback.seed} if chosen.force_feedback.is_measured else {}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
