@@ -137,7 +137,7 @@ class _CommandRun:
 
 def _step(run: _CommandRun) -> RunStatistics:
     """Runs by Drake's Simulator."""
-    _tell_rate(run)
+    _warn_of_rate(run)
     return simulate(
         run.loop.diagram,
         run.context,
@@ -149,7 +149,7 @@ def _step(run: _CommandRun) -> RunStatistics:
     )
 
 
-def _tell_rate(run: _CommandRun) -> None:
+def _warn_of_rate(run: _CommandRun) -> None:
     """Warns before a run in real time that is too slow for it."""
     scenario, config = run.scenario, run.scenario.integrator
     wanted = config.target_realtime_rate

@@ -71,22 +71,22 @@ def reference_remarks(references: Mapping[str, Any]) -> list[str]:
     Args:
         references: Objects with references, in lists, mappings and data classes, by name.
     """
-    return list(dict.fromkeys(_told(references)))
+    return list(dict.fromkeys(_remarks_of(references)))
 
 
-def _told(one: Any, name: str = "") -> Iterator[str]:
+def _remarks_of(one: Any, name: str = "") -> Iterator[str]:
     if isinstance(one, Reference):
         if one.remark:
             yield f"{name}: {one.remark}" if name else one.remark
     elif isinstance(one, Mapping):
         for key, inner in one.items():
-            yield from _told(inner, key)
+            yield from _remarks_of(inner, key)
     elif isinstance(one, (list, tuple)):
         for inner in one:
-            yield from _told(inner, name)
+            yield from _remarks_of(inner, name)
     elif is_dataclass(one):
         for part in fields(one):
-            yield from _told(getattr(one, part.name), name)
+            yield from _remarks_of(getattr(one, part.name), name)
 
 
 def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:

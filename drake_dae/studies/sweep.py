@@ -166,7 +166,7 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
     if len(variations) > MOST_RUNS:
         raise ScenarioError(("", f"a study has at most {MOST_RUNS} runs, got {len(variations)}"))
     problems: dict[tuple[str, str], None] = {}
-    for changes in _telling(variations):
+    for changes in _representatives(variations):
         try:
             robot = read_scenario(varied_data(base, changes)).robot
             for path in (robot.file, *robot.packages.values()):
@@ -181,7 +181,7 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
         raise ScenarioError(*problems)
 
 
-def _telling(variations: Sequence[Variation]) -> Iterator[Variation]:
+def _representatives(variations: Sequence[Variation]) -> Iterator[Variation]:
     """Variations that together have each value of each key, of its numbers the extreme ones."""
     for alike in _same_keys(variations):
         first = alike[0]

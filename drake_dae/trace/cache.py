@@ -67,7 +67,7 @@ def open_cache(create: bool = False) -> Path | None:
     except OSError as error:
         if isinstance(error, FileNotFoundError) and not create:
             return None
-        raise MachineCodeError(_told(folder, error)) from None
+        raise MachineCodeError(_message(folder, error)) from None
     if not stat.S_ISDIR(found.st_mode):
         raise MachineCodeError(f"the cache {folder} is no folder; remove it")
     if found.st_uid != os.getuid():
@@ -103,7 +103,7 @@ def find(key: str) -> Path | None:
             return path
         path.unlink()
     except OSError as error:
-        raise MachineCodeError(_told(folder, error)) from None
+        raise MachineCodeError(_message(folder, error)) from None
     warnings.warn(f"{path} was damaged, and is removed", MachineCodeWarning, stacklevel=1)
     return None
 
@@ -119,11 +119,11 @@ def workplace() -> Iterator[Path]:
     try:
         place = tempfile.mkdtemp(prefix="new-", dir=folder)
     except OSError as error:
-        raise MachineCodeError(_told(cache_folder(), error)) from None
+        raise MachineCodeError(_message(cache_folder(), error)) from None
     try:
         yield Path(place)
     except OSError as error:
-        raise MachineCodeError(_told(cache_folder(), error)) from None
+        raise MachineCodeError(_message(cache_folder(), error)) from None
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
@@ -147,7 +147,7 @@ def contents() -> list[Path]:
         found = sorted(folder.iterdir()) if folder is not None else []
         return [path for path in found if _OURS.fullmatch(path.name)]
     except OSError as error:
-        raise MachineCodeError(_told(cache_folder(), error)) from None
+        raise MachineCodeError(_message(cache_folder(), error)) from None
 
 
 def clear() -> None:
@@ -163,12 +163,12 @@ def clear() -> None:
             else:
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise MachineCodeError(_told(path, error)) from None
+            raise MachineCodeError(_message(path, error)) from None
 
 
 def _name(key: str, code: bytes) -> str:
     return f"{key}-{hashlib.sha256(code).hexdigest()[:32]}{SUFFIX}"
 
 
-def _told(path: Path, error: OSError) -> str:
+def _message(path: Path, error: OSError) -> str:
     return f"the cache {path} cannot be used: {error.strerror or error}"

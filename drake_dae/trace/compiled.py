@@ -108,7 +108,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     try:
         return _load(function.name(), str(path))
     except MachineCodeError as error:
-        _tell(error, make)
+        _warn(error, make)
         return None
 
 
@@ -127,11 +127,11 @@ def library(source: str, operations: int, compiled: Compiled, make: bool) -> Pat
     try:
         return _library(source, operations, compiled, make)
     except MachineCodeError as error:
-        _tell(error, make)
+        _warn(error, make)
         return None
 
 
-def _tell(error: MachineCodeError, make: bool) -> None:
+def _warn(error: MachineCodeError, make: bool) -> None:
     if make:
         # One text at one place: Python shows it once.
         warnings.warn(

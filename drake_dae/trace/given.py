@@ -33,7 +33,7 @@ def result_of(
 
 
 @contextmanager
-def numpy_told(what: str) -> Iterator[None]:
+def numpy_explained(what: str) -> Iterator[None]:
     """Warns in one line, once, that a function calls NumPy on symbols; CasADi's warning has twenty.
 
     Args:
@@ -45,13 +45,13 @@ def numpy_told(what: str) -> Iterator[None]:
     for one in found:
         text = str(one.message)
         if one.category is FutureWarning and "casadi" in text and "numpy" in text:
-            _tell(what)
+            _warn(what)
         else:
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
 
 
 @cache
-def _tell(what: str) -> None:
+def _warn(what: str) -> None:
     warnings.warn(
         f"{what} calls a function of NumPy on CasADi symbols; write casadi.sin for numpy.sin, and "
         "likewise for others: CasADi is about to change what NumPy's give",

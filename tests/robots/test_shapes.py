@@ -172,7 +172,7 @@ def test_a_robot_without_shapes_has_none():
 
 
 @pytest.mark.slow
-def test_analyze_tells_of_shapes_before_a_run(tmp_path):
+def test_analyze_reports_shapes_before_a_run(tmp_path):
     """The first link ends at cos 1.2 or so, before a wall at 1.2 m; its ball is 0.95 m large."""
     text = shipped_model("two_link_arm.urdf").read_text()
     ball = (

@@ -129,7 +129,7 @@ def test_what_knows_no_tasks_says_so(file, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_rollout_of_a_task_tells_its_phases(file, tmp_path, capsys):
+def test_a_rollout_of_a_task_reports_its_phases(file, tmp_path, capsys):
     told = []
     for number, more in enumerate(([], ["--rollout"])):
         words = ["--set", "integrator.accuracy=1e-9", "--out", str(tmp_path / f"run {number}")]

@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.trace.given import numpy_told
+from drake_dae.trace.given import numpy_explained
 from drake_dae.trace.smoothness import find_flaw
 
 
@@ -157,7 +157,7 @@ def call(
             f"{owner}: {letter} must be a function of the state, got "
             f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
         )
-    with numpy_told(f"{owner}: function {letter}"):
+    with numpy_explained(f"{owner}: function {letter}"):
         try:
             value = function(*arguments)
         except Exception as error:

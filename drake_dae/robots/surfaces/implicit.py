@@ -17,7 +17,7 @@ from drake_dae.robots.surfaces.surface import (
     triple,
 )
 from drake_dae.trace.formula import check_names, parse_formula
-from drake_dae.trace.given import numpy_told, result_of
+from drake_dae.trace.given import numpy_explained, result_of
 
 _TAKEN = (
     "position",
@@ -90,5 +90,5 @@ class ImplicitSurface(Surface):
                 self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
             )
         more = [SimpleNamespace(**names)] if names else []
-        with numpy_told("the function of an ImplicitSurface"):
+        with numpy_explained("the function of an ImplicitSurface"):
             return result_of("function", self.function, p, *more)

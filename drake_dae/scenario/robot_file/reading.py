@@ -102,7 +102,7 @@ def read_into(
             unknown = {name: origin for name, origin in missing.items() if name in text}
             raise ModelError(explained(unknown) if unknown else _with_remedy(text)) from None
     limit_joints(plant, models)
-    _tell_repairs(copies, robot)
+    _warn_of_repairs(copies, robot)
     _take_empty_limits(plant, "empty_limits" in robot.leave_out)
     if "constraints" in robot.leave_out:
         for key in plant.GetConstraintIds():
@@ -116,7 +116,7 @@ def read_into(
         own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
         own += places[:2]  # The package and the repository of a description.
         check_resources(scene_graph, [*own, *folders])
-        _tell_what_is_left_out(copies.left_out, scene_graph)
+        _warn_of_omitted(copies.left_out, scene_graph)
     return read_efforts(models)
 
 
@@ -150,7 +150,7 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
-def _tell_repairs(copies: Copies, robot: Robot) -> None:
+def _warn_of_repairs(copies: Copies, robot: Robot) -> None:
     """Warns of impossible inertias, with their replacements."""
     if not copies.repaired:
         return
@@ -183,7 +183,7 @@ def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
             joint.set_velocity_limits(-unlimited, unlimited)
 
 
-def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
+def _warn_of_omitted(unread: list[Path], scene_graph: SceneGraph) -> None:
     """Warns of geometry that is not read, or not drawn, in one line each."""
     if unread:
         warnings.warn(

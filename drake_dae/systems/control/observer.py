@@ -205,7 +205,7 @@ class DisturbanceObserver(ParameterizedSystem):
     def traced(self) -> Block:
         functions, memory = self._functions, self._functions.memory
         read = ("estimated_state", HELD)
-        told = (*read, "measured_force", "reference", PARAMETERS)
+        needed = (*read, "measured_force", "reference", PARAMETERS)
         sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
         parts = [memory.disturbance, memory.friction]
         shown = ca.Function("shown", [memory.column], parts)
@@ -213,7 +213,7 @@ class DisturbanceObserver(ParameterizedSystem):
         return Block(
             self,
             (
-                Computation.of(functions.exogenous, told, ("exogenous",)),
+                Computation.of(functions.exogenous, needed, ("exogenous",)),
                 Computation.of(functions.hold, ("measured_force", "hold"), ("hold",)),
                 Computation(shown, (HELD,), ("disturbance", "friction")),
             ),

@@ -84,7 +84,7 @@ class ObserverFunctions:
         self._is_lost = ca.vertcat(ca.SX(0, 1), *pressed) < observing.least_force
         hold = ca.SX.sym("hold", 1)
         self.sample = self._sampled(hold)
-        self.exogenous = self._told(law, delay)
+        self.exogenous = self._exogenous_function(law, delay)
         holds = ca.fmax(hold != 0, ca.mmax(self._is_lost) if pressed else 0)
         self.hold = TracedFunction(
             "hold", {"constraint_input": self._force, "hold": hold}, {"hold": holds}
@@ -143,8 +143,8 @@ class ObserverFunctions:
             {"held": memory.column, "control": u, "constraint_input": v, "hold": hold},
         )
 
-    def _told(self, law: TrackingLaw, delay: float) -> TracedFunction:
-        """What the port `exogenous` tells."""
+    def _exogenous_function(self, law: TrackingLaw, delay: float) -> TracedFunction:
+        """The output of the port `exogenous`: disturbance, coefficients and their derivatives."""
         observation, memory = self.observation, self.memory
         x, v, mu = self._system.state, self._force, memory.friction
         reference = ca.SX.sym("reference", law.layout.reference_size)
@@ -164,13 +164,13 @@ class ObserverFunctions:
         zeros = [ca.SX(0.0)] * self._lags[0].degree
         for j, name in enumerate(observation.frictions):
             rows[name] = [[mu[j], *zeros]]
-        told, left = list[ca.SX](), iter(law.exogenous_degrees)
+        stacked, left = list[ca.SX](), iter(law.exogenous_degrees)
         for p in self._system.exogenous.moving:
             for row in rows[p.name]:
-                told += row[: 1 + next(left)]
+                stacked += row[: 1 + next(left)]
         return self._system.trace(
-            "what the observer tells",
-            {"exogenous": ca.vertcat(*told)},
+            "exogenous signals of the observer",
+            {"exogenous": ca.vertcat(*stacked)},
             {"held": memory.column, "constraint_input": v, "reference": reference},
             pivot,
         )

@@ -19,7 +19,7 @@ from drake_dae import (
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.given import numpy_told
+from drake_dae.trace.given import numpy_explained
 from drake_dae.trace.smoothness import find_flaw
 
 X, Y = np.linspace(-0.2, 0.2, 33), np.linspace(-0.15, 0.15, 25)
@@ -403,7 +403,7 @@ def test_functions_of_numpy_are_reported_in_one_line_and_once():
             surface.distance(p)
             surface.unit_normal(p)
         for _ in range(2):
-            with numpy_told("this function"):
+            with numpy_explained("this function"):
                 warnings.warn("casadi: a numpy function was called", FutureWarning, stacklevel=1)
                 warnings.warn("something else", FutureWarning, stacklevel=1)
     texts = [str(one.message) for one in told]

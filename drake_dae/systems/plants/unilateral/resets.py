@@ -135,7 +135,7 @@ class Resets:
         closed = tuple(i in pushing for i in range(len(closed)))
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
-        return After(x, closed, tuple(self._told(events, closed)))
+        return After(x, closed, tuple(self._completed(events, closed)))
 
     def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
         """The contacts that touch at rest, as many as can be closed together."""
@@ -262,7 +262,7 @@ class Resets:
                 found.append(ContactEvent(time, kind, names, ()))
         return found
 
-    def _told(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
+    def _completed(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
         names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
         named = []
         for event in events:

@@ -129,7 +129,7 @@ def rubbing_bodies(seed, tangents, count=2):
     ("tangents", "count", "seeds"),
     [(1, 1, 40), (1, 2, 40), (1, 3, 20), (2, 1, 40), (2, 2, 20), (2, 3, 10)],
 )
-def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count, seeds):
+def test_impacts_with_friction_are_in_their_cones_and_gain_no_energy(tangents, count, seeds):
     """By the conditions themselves; some bodies bounce less, as Kane says."""
     seen, less = set(), 0
     for seed in range(seeds):
@@ -296,7 +296,7 @@ def test_of_several_directions_of_sliding_it_is_that_which_goes_on_most_as_it_ca
 
 @pytest.mark.parametrize("bounce", [0.0, 0.5])
 @pytest.mark.parametrize("slope", [0.2, -3.0, 3.0])
-def test_a_lever_of_one_freedom_rubs(slope, bounce):
+def test_a_lever_of_one_freedom_with_friction(slope, bounce):
     """Its tip moves along (1, slope) alone; with slope > 1 / mu sliding on would lock it.
 
     At rest it may be held by many pairs of impulses, each with the same sum: the motion is one.
@@ -314,7 +314,7 @@ def test_a_lever_of_one_freedom_rubs(slope, bounce):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("tangents", [1, 2])
-def test_of_impulses_that_stick_alike_those_are_taken_that_rub_least(tangents, seed):
+def test_of_equally_sticking_impulses_those_with_least_friction_are_taken(tangents, seed):
     """One freedom less than rows: Lambda + s n sticks alike for each s, where J^T n = 0."""
     random = np.random.default_rng(seed)
     J = random.standard_normal((1 + tangents, tangents))

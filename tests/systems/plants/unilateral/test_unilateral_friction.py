@@ -30,7 +30,7 @@ def plant():
 @pytest.mark.parametrize(
     ("turn", "outcome"), [(0.0, PainleveOutcome.INCONSISTENT), (6.0, PainleveOutcome.INDETERMINATE)]
 )
-def test_a_rod_that_jams_does_not_start(plant, turn, outcome):
+def test_in_the_paradox_a_rod_does_not_start(plant, turn, outcome):
     """b = l sin a a'^2 - g: a rod at rest would pierce the floor, one that turns fast lifts off."""
     with pytest.raises(PainleveError, match=f"'?floor'? .*{outcome.name.lower()}:") as caught:
         simulator_of(plant, sliding(1.1, turn))
@@ -68,7 +68,7 @@ def test_a_run_into_the_edge_stops_there():
     assert plant.events(context) == ()
 
 
-def test_a_rod_that_rubs_lands_and_stays_as_its_equation_says(plant):
+def test_a_rod_with_friction_lands_and_stays_as_its_equation_says(plant):
     """At 35 degrees there is no paradox: an end that slides keeps lambda = -b / A > 0."""
     start = sliding(0.6)
     start[1] += 0.01
