@@ -32,7 +32,6 @@ from drake_dae import (
     make_animation,
     make_closed_loop,
     poles,
-    rollout,
     simulate,
 )
 from drake_dae.errors import ModelError, ScenarioError
@@ -361,15 +360,13 @@ def test_the_shipped_arm_leaves_its_wall_and_strikes_it():
     assert "pulls from 2.08" in problem
 
 
-def test_a_scenario_changes_its_restitution_by_a_parameter_and_no_rollout_knows_it():
+def test_a_scenario_changes_its_restitution_by_a_parameter():
     chosen = scenario("wall_bounce", "plant_parameters={wall.restitution: 0.25}")
     loop, context = build_scenario(chosen)
     own = loop.plant.GetMyContextFromRoot(context)
     assert_array_equal(loop.plant.get_parameter(own, "wall.restitution"), [0.25])
     with pytest.raises(ModelError, match="1 entry"):
         loop.plant.set_parameter(own, "wall.restitution", [0.5, 0.5])
-    with pytest.raises(ModelError, match="cannot be traced"):
-        rollout(loop, np.zeros(4), None, [0.0, 0.1])
 
 
 @pytest.mark.parametrize(
