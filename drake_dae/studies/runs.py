@@ -175,10 +175,6 @@ class Runner:
             self._key, self._built = "", None
             self.builds += 1
             try:
-                if self._lasting is not None and built["task"]:
-                    raise ScenarioError(
-                        ("task", ("rollouts do not support tasks: run it without --rollout"))
-                    )
                 self._built = build_completed(read_scenario(built))[1]
             except DrakeDaeError as error:
                 self._built = error

@@ -210,9 +210,9 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
         ("gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: groups: ", "lengths"]),
         # References.
-        ("references={}", ["references: left without one: tool.z, wall.force"]),
+        ("references={}", ["references: missing: tool.z, wall.force"]),
         ("references=[1, 2]", ["references: expected names with values, got [1, 2]"]),
-        ("references={tool: 1}", ["references: left without one: wall.force"]),
+        ("references={tool: 1}", ["references: missing: wall.force"]),
         ("references={tool.z: a}", ["references.tool.z: expected one of !C", "a number, "]),
         ("references={tool.z: true}", ["references.tool.z: expected one of !Constant", "got True"]),
         ("references.wall.forc=1", ["references.wall.forc: no output", "mean 'wall.force'?"]),

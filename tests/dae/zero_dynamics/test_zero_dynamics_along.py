@@ -269,7 +269,7 @@ def test_exponents_without_a_period():
     assert stable.verdict is Verdict.STABLE
     short = along(oscillator(lambda s, w, z: -(1 + 0.1 * z) * s - 0.5 * w), two_tones, 2.0)
     assert short.verdict is Verdict.UNDECIDED
-    assert "not long enough" in short.reason
+    assert "too short" in short.reason
 
 
 @pytest.mark.slow
@@ -286,12 +286,12 @@ def test_a_limit_cycle_beside_a_reference_that_never_returns_is_undecided():
     found = along(system, sinusoid(3.3, 0.3), 60.0)
     assert found.verdict is Verdict.UNDECIDED
     assert np.abs(found.multipliers[0]) > 2.0
-    assert "was not seen to return" in found.reason
+    assert "did not return" in found.reason
     without_period = along(
         oscillator(lambda s, w, z: van_der_pol(s, w, z) + 0.01 * z), two_tones, 120.0
     )
     assert without_period.verdict is Verdict.UNDECIDED
-    assert "was not seen to return" in without_period.reason
+    assert "did not return" in without_period.reason
 
 
 def test_a_motion_that_ends_is_reported():

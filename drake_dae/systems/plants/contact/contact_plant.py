@@ -311,7 +311,7 @@ class ContactPlant(Diagram, Plant):
             lambda context, values: self._set_links(context, values[:count]),
             self.dae.num_states + len(self.contact_force_signals),
         )
-        return traced_contact(self, stepped, self._stages, self._values)
+        return traced_contact(self, self.contact_force_signals, stepped, self._stages, self._values)
 
     def _held(self, context: Context) -> FloatArray:
         """(q, v), the contact forces, and the states of the stages."""

@@ -1,37 +1,41 @@
 """What a `ContactPlant` computes of what Drake steps in it."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped, Update
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages
-
-if TYPE_CHECKING:
-    from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.contract import Plant
 
 
 def traced_contact(
-    plant: "ContactPlant", stepped: Stepped, stages: SteppedStages | None, values: FloatArray
+    plant: Plant,
+    contact_signals: Sequence[Signal],
+    stepped: Stepped,
+    stages: SteppedStages | None,
+    values: FloatArray,
 ) -> Block:
     """The computations of a `ContactPlant`, whose HELD are (q, v), contact forces, and the stages.
 
     Args:
-        plant: The plant.
+        plant: The `ContactPlant`.
+        contact_signals: Names and units of the contact forces.
         stepped: What Drake steps, which shows (q, v) and the contact forces.
         stages: The stages of its actuation, which are traced; None with rigid joints.
         values: Values of all its parameters.
     """
-    dae, manifold = plant.dae, plant.structure.manifold
-    links, forces = plant.multibody.num_multibody_states(), len(plant.contact_force_signals)
+    dae, manifold, forces = plant.dae, plant.structure.manifold, len(contact_signals)
+    links = stepped.system.GetOutputPort("link_state").size()
     held, given = ca.SX.sym("held", stepped.size), ca.DM(values)
     ends = np.cumsum([0, links, forces, stepped.size - links - forces]).tolist()
     of_links, contact, of_stages = ca.vertsplit(held, ends)
     state = ca.vertcat(of_links, of_stages)
-    normals = contact_normals(plant.model).function(state, given)[0]
+    normals = contact_normals(plant.robot("contact")).function(state, given)[0]
     force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
     acting = ca.SX.sym("force", force.numel())
     found = [dae.outputs(acting), manifold.residual_expression]
@@ -61,7 +65,7 @@ def traced_contact(
     )
     ports = {
         "state": tuple(dae.state_signals),
-        "contact_force": tuple(plant.contact_force_signals),
+        "contact_force": tuple(contact_signals),
         "constraint_force": tuple(dae.force_signals),
         "constraint_residual": tuple(manifold.residual_signals),
         "controlled_output": tuple(dae.output_signals),
