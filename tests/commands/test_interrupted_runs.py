@@ -214,6 +214,7 @@ sys.exit(main(["render", "nowhere"]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
 def test_a_signal_waits_while_drake_is_loaded(sent):

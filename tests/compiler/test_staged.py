@@ -36,6 +36,7 @@ def _noise(compiled: CompiledDiagram) -> np.ndarray:
     return np.linspace(-1.0, 1.0, compiled.sizes["noise"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sine", "two_link_wall", "seven_joint_moving_plate"])
 def test_functions_in_stages_are_the_plain_ones_to_the_bit(name):
     """The same operations in the same order, only some of them in another function."""

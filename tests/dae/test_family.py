@@ -68,6 +68,7 @@ OUTPUTS = {
 the degree is 3."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("moves", [False, True])
 def test_an_output_whose_degree_depends_on_numbers_is_refused(name, moves):
@@ -88,6 +89,7 @@ def test_an_output_whose_degree_depends_on_numbers_is_refused(name, moves):
     assert found.violation.deciding.names == deciding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("moves", [False, True])
 def test_bounds_of_one_value_restrict_it_by_the_users_word(name, moves):

@@ -116,6 +116,7 @@ def beside(rate, start):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESCAPES)
 def test_an_escape_within_a_finite_time_is_no_jump_of_the_reference(name):
     rate, start, when = ESCAPES[name]

@@ -103,6 +103,7 @@ def test_every_link_moves_as_the_plant_does(shown):
     assert moving >= 2
 
 
+@pytest.mark.slow
 def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     """For a plane and a sphere, where normal and force are known without the library."""
     loop, record, page = shown

@@ -159,6 +159,7 @@ def test_a_squeeze_moves_nothing():
     assert_allclose(grasp_map(pose)[0] @ change, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_puck_goes_where_it_shall_with_the_error_by_hand():
     """An accuracy of 1e-11 in each of some 150 steps."""
     chosen = scenario("three_fingers", *FINE)

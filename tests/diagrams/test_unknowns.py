@@ -53,6 +53,7 @@ def left_behind(force):
     return (free @ np.vstack([normal, along]).T @ force).item() / W**2
 
 
+@pytest.mark.slow
 @PLANTS
 def test_a_disturbance_leaves_the_error_of_statics(plant):
     """A push of 5 N up the wall; second order in the error, 4e-3 m beside a metre, is left out.

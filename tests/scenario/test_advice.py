@@ -113,6 +113,7 @@ def test_ideal_plants_are_not_advised():
     assert advised(found, model, scenario_structure(model)).scenario is found
 
 
+@pytest.mark.slow
 def test_stiffness_of_a_patch_is_that_of_drakes():
     """k = dF/dphi between two depths, within a fifth of what the advice is for, at 10 N.
 

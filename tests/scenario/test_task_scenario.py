@@ -159,6 +159,7 @@ def test_a_task_has_the_noise_of_its_seed(file):
     assert found[0] == found[2] != found[1]
 
 
+@pytest.mark.slow
 def test_a_link_is_heavier_in_either_plant(file):
     """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
     sagged = []

@@ -77,6 +77,7 @@ FIXED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [(), FIXED])
 @pytest.mark.parametrize("compiled", ["true", "false"])
 def test_rollouts_diverge_as_simulations_do(fixed, compiled):

@@ -47,6 +47,11 @@ def some(cases: Iterable[Any]) -> list[ParameterSet]:
     return [pytest.param(case, marks=marks[i % 2]) for i, case in enumerate(cases)]
 
 
+def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:
+    """Cases of which all but the first one are slow."""
+    return [pytest.param(case, marks=[pytest.mark.slow] * (i > 0)) for i, case in enumerate(cases)]
+
+
 def scenario(name: str, *settings: str) -> Scenario:
     """A shipped scenario, with settings as those of `--set`."""
     return load_scenario(find_scenario(name), settings)

@@ -70,6 +70,7 @@ def press(law, references, stiffness, start, times, order=0):
     return np.column_stack([phi, -stiffness * phi]), found.y.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0, 3.0])
 def test_a_contact_that_gives_way_is_damped_as_chosen(share):
     """phi'' + c phi' + A k phi = -A lambda_d from phi = phi' = 0, for c of several times 2 w.
@@ -270,6 +271,7 @@ def sampled(frequency, damping, sample_time, delay, samples):
     return np.array(largest)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_dae.errors.AdviceWarning")
 @pytest.mark.parametrize("delay", [0, 1, 2])
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.4, 0.8])

@@ -71,6 +71,7 @@ def test_degrees_are_found(name, kind):
     assert structure.output_degrees == (position,) * count + (force,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
 def test_rest_state_is_the_static_equilibrium(name, kind):

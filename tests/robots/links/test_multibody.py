@@ -198,6 +198,7 @@ def test_discrete_plant_has_the_same_terms(seed):
         np.testing.assert_array_equal(own, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_masses_change_as_with_set_mass(seed):
     robot = random_robot(seed)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from runs import run_scenario, scenario
+from runs import first_quick, run_scenario, scenario
 
 from drake_dae import build_scenario, rollout, start_values
 from drake_dae.errors import ModelError, SimulationError
@@ -46,7 +46,7 @@ def chosen(name, duration=0.06):
     return scenario(robot, *settings, f"duration={duration}")
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", first_quick(LOOPS))
 def test_the_record_is_that_of_simulate(name):
     """Drake makes the same steps of the plant in both, so that only round-off differs.
 
@@ -68,6 +68,7 @@ def test_the_record_is_that_of_simulate(name):
         assert_allclose(record[signal][own], expected[signal][rows], rtol=0, atol=1e-9 * size)
 
 
+@pytest.mark.slow
 def test_machine_code_and_interpreter_agree():
     found = chosen("a law with observer and integrals")
     loop, context = build_scenario(found)
@@ -81,6 +82,7 @@ def test_machine_code_and_interpreter_agree():
         assert_allclose(fast.record[signal], slow.record[signal], rtol=0, atol=1e-9 * size)
 
 
+@pytest.mark.slow
 def test_many_starts_are_each_alone():
     found = chosen("a law with observer and integrals", 0.02)
     loop, context = build_scenario(found)
@@ -95,6 +97,7 @@ def test_many_starts_are_each_alone():
     assert np.abs(both[1].record["state"] - both[0].record["state"]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_run_that_diverges_ends_with_what_it_recorded():
     """Springs behind Drake's contact, with a load that the law does not know."""
     load = "plant_payloads=[{frame: tool, mass: 0.5}]"
@@ -107,6 +110,7 @@ def test_a_run_that_diverges_ends_with_what_it_recorded():
     assert np.isfinite(rolled.record["state"]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "setting"),
     [

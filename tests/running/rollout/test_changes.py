@@ -10,7 +10,7 @@ from polishing import CLIMB, push, run_on, started, task_loop
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from runs import run, scenario
+from runs import first_quick, run, scenario
 
 from drake_dae import (
     Approach,
@@ -156,6 +156,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("name", TASKS)
 def test_tasks_are_those_of_drake(name, compiled):
@@ -231,7 +232,7 @@ FALLING = {
 
 
 @both
-@pytest.mark.parametrize("name", FALLING)
+@pytest.mark.parametrize("name", first_quick(FALLING))
 def test_bodies_fall_as_in_drake(name, compiled):
     """To 1e-9 at the end, of a plant without a law and without a loop."""
     make, state, duration = FALLING[name]

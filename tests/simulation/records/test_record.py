@@ -247,6 +247,7 @@ def test_a_dataframe_has_the_numbers_below_names_and_units(run):
     assert small().to_dataframe().shape == (3, 2)
 
 
+@pytest.mark.slow
 def test_a_dataset_has_the_numbers_with_names_and_units(run):
     _, _, record = run
     data = record.to_xarray()

@@ -89,6 +89,7 @@ def run(plant: ContactPlant, start, control, duration: float):
 SPRINGS = FlexibleJoints(STIFFNESS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.1, 1.0, 1.95])
 def test_spring_without_damping_swings_as_symplectic_euler_does(share):
     """d_n = d_0 cos((2 n + 1) a) / cos a with sin a = w h / 2, by its recursion in n.
