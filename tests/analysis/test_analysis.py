@@ -194,6 +194,7 @@ def nearly_singular(gap: float) -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 def test_a_singular_b_without_a_change_of_sign():
     system = nearly_singular(0.0)
     find_structure(system, spread=1.0)  # Does not find it.

@@ -57,6 +57,7 @@ def test_functions_in_stages_are_the_plain_ones_to_the_bit(name):
             np.testing.assert_array_equal(a.full(), b.full())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sine", "two_link_wall", "seven_joint_moving_plate"])
 def test_what_the_time_alone_determines_is_left_to_its_own_function(name):
     """No function of the state reads the time any more, and each has fewer operations."""

@@ -18,6 +18,7 @@ def scenario(*settings):
     return load_scenario(find_scenario(NAME), list(settings))
 
 
+@pytest.mark.slow
 def test_position_and_force_follow_on_a_plate_that_moves():
     """Off the prediction by the integrator's accuracy of 1e-8 in each of some 100 steps.
 

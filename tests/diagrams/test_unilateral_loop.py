@@ -114,6 +114,7 @@ def by_hand():
     return leaves, hits
 
 
+@pytest.mark.slow
 def test_an_open_contact_is_to_the_law_a_wanted_force_that_is_not_there(run):
     """Event times within windows of 1e-12 s that add up, and errors of steps of 1e-8."""
     _, _, record, predicted, *_ = run

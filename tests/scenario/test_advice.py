@@ -56,12 +56,14 @@ def test_what_is_left_out_is_advised_and_reported():
     assert loop.observer.friction_signals[0].name == "wall.friction"
 
 
+@pytest.mark.slow
 def test_advice_takes_the_noise_of_the_encoders():
     found = chosen(two_link("encoders={velocity_noise: 2.0e-3}"))
     usual = chosen(two_link())
     assert found.observer.rate == pytest.approx(usual.observer.rate / 2.0, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
     run = chosen(two_link("constraints.0.friction=0.0"))
     save_scenario(run, tmp_path / "run.yaml")
@@ -147,6 +149,7 @@ def parameters(loop, wall):
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

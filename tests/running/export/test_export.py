@@ -236,6 +236,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert "file: File exists" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     """Law, limits and observer are in the update of the loop, so that nothing is left out."""

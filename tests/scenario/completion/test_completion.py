@@ -78,6 +78,7 @@ def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_
     assert completed.notes[1].startswith("start found: {joint1: 0, joint2: -0.1938")
 
 
+@pytest.mark.slow
 def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path):
     completed = complete_scenario(left_out(duration=0.3)).scenario
     save_scenario(completed, tmp_path / "run.yaml")
@@ -90,6 +91,7 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
     assert off.max() < 1e-7  # The integrator's accuracy is 1e-8.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "held"),
     [
@@ -118,6 +120,7 @@ def test_outputs_given_in_part_are_kept_and_come_first():
     assert {name: completed.references[name] for name in part.references} == part.references
 
 
+@pytest.mark.slow
 def test_what_references_name_becomes_an_output_and_follows_them():
     """A circle of the tool is along the surface; a joint that is named is steered."""
     circle = CircleReference([0.0, 0.6], 0.1, period=5.0)

@@ -68,6 +68,7 @@ def changes(loop, context):
     return {change.phase: change for change in found}
 
 
+@pytest.mark.slow
 def test_phases_follow_each_other_and_say_why(whole):
     loop, context, record = whole
     found = loop.changes(context)

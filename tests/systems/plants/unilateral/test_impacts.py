@@ -125,6 +125,7 @@ def rubbing_bodies(seed, tangents, count=2):
     return J @ np.linalg.inv(root @ root.T + 0.5 * np.eye(6)) @ J.T, J @ velocity, contacts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tangents", "count", "seeds"),
     [(1, 1, 40), (1, 2, 40), (1, 3, 20), (2, 1, 40), (2, 2, 20), (2, 3, 10)],
