@@ -32,6 +32,7 @@ class Call:
         arguments: Its arguments as expressions.
         results: Its results as expressions.
         needed: The calls that the arguments need.
+        made: Those of its results that are computed here, and not only passed on.
         is_given: Whether it needs the time and parameters alone. Its results are then symbols of
             their own, so that they can be computed once for all that happens at a time.
         gate: What is finite if that is of use which its computation chooses, see `Computation`.
@@ -42,16 +43,16 @@ class Call:
     arguments: tuple[ca.SX, ...]
     results: tuple[ca.SX, ...]
     needed: tuple["Call", ...]
+    made: tuple[ca.SX, ...]
     is_given: bool
     gate: ca.SX
 
     @property
     def valid(self) -> ca.SX:
-        """What is finite if the results are of use; what is but passed on was checked before."""
+        """Finite if the results are valid; values that are passed on were checked before."""
         if self.computation.traced is not None:
             return self.results[-1]
-        made = [result for result in self.results if not result.is_valid_input()]
-        return ca.sum1(ca.vertcat(self.gate, *made))
+        return ca.sum1(ca.vertcat(self.gate, *self.made))
 
 
 class Expressions:
@@ -166,11 +167,14 @@ class Expressions:
             is_one = arguments[computation.sources.index(flag)] > 0.5
             gate = ca.if_else(is_one, chosen[one], chosen[other])
         results = computation.function.call(arguments)
+        is_passed_on = [result.is_valid_input() for result in results]
         is_given = not {STATE, HELD, NOISE} & set(computation.sources)
         is_given = is_given and not chosen and all(one.is_given for one in needed)
         if is_given:
             results = [self._named(result) for result in results]
-        found = Call(block, computation, tuple(arguments), tuple(results), needed, is_given, gate)
+        made = tuple(one for one, old in zip(results, is_passed_on, strict=True) if not old)
+        given = block, computation, tuple(arguments), tuple(results), needed, made
+        found = Call(*given, is_given, gate)
         self._found[key] = found
         self.calls.append(found)
         self._note(found)

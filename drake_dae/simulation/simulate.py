@@ -27,10 +27,10 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import show_state
-from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
+from drake_dae.systems.blocks.failures import cannot_go_on
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""
@@ -158,15 +158,7 @@ def simulate(
             if not isinstance(error, InconsistentStateError | RuntimeError):
                 raise
             state = context.get_continuous_state_vector().CopyToVector()
-            raise SimulationError(
-                f"the simulation cannot go on at t = {context.get_time():.6g} s, state "
-                f"{show_state(state)}: "
-                f"{str(error).rstrip('.')}. Where the state grows without bound or a reference "
-                "leaves what the robot can reach, change these; otherwise choose other integrator "
-                "settings",
-                context.get_time(),
-                state,
-            ) from error
+            raise cannot_go_on(context.get_time(), state, str(error)) from error
         shown.finish(context.get_time() - start)
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 

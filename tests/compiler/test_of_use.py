@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from arms import touching
 from blocks_of_users import Guarded, Latch
+from pydrake.symbolic import Variable
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import Adder, ConstantVectorSource, Gain, Integrator, ZeroOrderHold
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantVectorSource,
+    Gain,
+    Integrator,
+    SymbolicVectorSystem,
+    ZeroOrderHold,
+)
 
 from drake_dae import RobotModel, RobotPlant
 from drake_dae.compiler.compile import compile_diagram
@@ -35,6 +43,22 @@ def test_useless_values_are_reported_wherever_they_lead(leads_to, u, is_of_use):
         "update": lambda: compiled.rates[0].function(*given, []),
     }[leads_to]()
     assert float(value) == 4.0 * u
+    assert np.isfinite(float(valid)) == is_of_use
+
+
+@pytest.mark.parametrize(("u", "is_of_use"), [(0.5, True), (0.0, False)])
+def test_a_value_of_drakes_blocks_that_is_not_finite_is_of_no_use(u, is_of_use):
+    """Such a block cannot say so itself: 1 / u, at u = 0."""
+    given = Variable("u")
+    builder = DiagramBuilder()
+    inverse = builder.AddSystem(SymbolicVectorSystem(input=[given], output=[1 / given]))
+    builder.ExportInput(inverse.get_input_port(), "u")
+    builder.ExportOutput(inverse.get_output_port(), "out")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    diagram.get_input_port().FixValue(context, [u])
+    compiled = compile_diagram(diagram, context=context)
+    _, valid = compiled.row(0.0, *compiled.start(context), compiled.values(context))
     assert np.isfinite(float(valid)) == is_of_use
 
 

@@ -58,7 +58,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
             values |= whole_values(whole, (at_start[0], held), state)
             values["loop_parameters"] = of_blocks
         for name, call in calls.items():
-            # The residual on N* is but round-off.
+            # The residual on N* is only round-off.
             values["state"] = near if name == "residual" else state
             results = call.function(*(values[source] for source in call.inputs))
             if not call.function.is_valid:

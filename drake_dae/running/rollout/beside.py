@@ -1,4 +1,4 @@
-"""Runs beside a plant that Drake steps: all else of a sample is one call."""
+"""Runs of a plant that Drake steps, where one call computes everything else of a sample."""
 
 import ctypes
 from collections.abc import Callable
@@ -12,23 +12,24 @@ from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
 from drake_dae.running.rollout.stepping.fused import Called, Fused
 from drake_dae.running.rollout.stepping.machine import Library
+from drake_dae.systems.blocks.failures import cannot_go_on
 
 LOOKED = 64
-"""After so many samples Python looks for Ctrl-C."""
+"""The number of samples after which a run checks for Ctrl-C and divergence."""
 
 
 def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: Settings) -> Run:
-    """A run of a diagram without continuous states, but for a block that Drake steps.
+    """Runs a diagram in which Drake steps one block, and no block has a continuous state.
 
-    At each sample the input of that block and the unrestricted updates are computed from what was
-    before it; then Drake steps the block; then come the discrete updates. Rows of the record are
-    computed afterwards, from what was held.
+    At each sample, the input of that block and the unrestricted updates are computed from the
+    values before the sample. Then Drake steps the block, and then come the discrete updates. The
+    rows of the record are computed at the end, from the values that were held.
 
     Args:
         fused: The diagram.
         code: Its machine code; None if there is none.
         problem: What to run.
-        settings: Whether to stop.
+        settings: Its `look` says whether to stop.
     """
     plant = _Steps(fused, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
@@ -59,6 +60,10 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
             good = good and take(moment, count, due, False, plant.input)
         except SimulationError as found:
             ending, error = Ending.STUCK, found
+            break
+        except RuntimeError as found:  # Of Drake, as where its contact solver finds no step.
+            state = held[plant.places]
+            ending, error = Ending.STUCK, cannot_go_on(moment, state, str(found))
             break
         if not good:
             ending = Ending.INVALID
@@ -100,7 +105,7 @@ class _Steps:
 def _sampler(
     fused: Fused, code: Library | None, problem: Problem, held: FloatArray
 ) -> Callable[[float, int, int, bool, FloatArray], bool]:
-    """What changes `held` by updates, and says whether all has values.
+    """A function that makes the updates in `held` and returns whether all values are valid.
 
     It takes the time, the number of the event, which rates are due, whether the updates are the
     unrestricted ones or the discrete ones, and an array for what Drake's block reads, which comes

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, show_state
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run
 from drake_dae.systems.blocks.failures import (
+    cannot_go_on,
     endless_steps,
     no_step_leads_on,
     off_manifold,
@@ -46,17 +47,11 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
         case Ending.STUCK if trial is not None:
             return no_step_leads_on(name, run.time, state, trial, str(trial))
         case Ending.STUCK:
-            return SimulationError(
-                f"the simulation cannot go on at t = {run.time:.6g} s, state {show_state(state)}: "
-                "no step, however short, is as accurate as it should be. Where the state grows "
-                "without bound or a reference leaves what the robot can reach, change these; "
-                "otherwise choose a lower accuracy",
-                run.time,
-                state,
-            )
-    reason = _reason(program, run.time, run.state, *given) or trial
-    if reason is not None:
-        return reason
+            reason = "no step, however short, is as accurate as it should be"
+            return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
+    found = _reason(program, run.time, run.state, *given) or trial
+    if found is not None:
+        return found
     return NonFiniteError(f"{name}: a signal has no value at t = {run.time:.6g} s", run.time, state)
 
 

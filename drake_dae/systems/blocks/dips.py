@@ -24,7 +24,7 @@ def lowest(
         c = 3.0 * rise - step * (2.0 * rates[i] + last_rates[i])
         d = step * (rates[i] + last_rates[i]) - 2.0 * rise
         root = c + np.sqrt(max(c * c - 3.0 * b * d, 0.0))
-        if root > -b:  # Not where all that is but round-off.
+        if root > -b:  # Not where all of it is only round-off.
             s = -b / root  # There b + 2 c s + 3 d s^2 = 0, and it rises.
             found[i] = gaps[i] + s * (b + s * (c + s * d))
     return found

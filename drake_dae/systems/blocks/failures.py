@@ -20,6 +20,26 @@ from drake_dae.errors import (
 from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, Fault
 
 
+def cannot_go_on(
+    time: float, state: FloatArray, reason: str, remedy: str = "choose other integrator settings"
+) -> SimulationError:
+    """The exception of a run that ends for a reason of the integrator, or of Drake.
+
+    Args:
+        time: The time, in s.
+        state: The state, shape (n,).
+        reason: The reason, in words.
+        remedy: What to do if neither the loop nor its reference is the cause.
+    """
+    return SimulationError(
+        f"the simulation cannot go on at t = {time:.6g} s, state {show_state(state)}: "
+        f"{reason.rstrip('.')}. Where the state grows without bound or a reference leaves what the "
+        f"robot can reach, change these; otherwise {remedy}",
+        time,
+        state,
+    )
+
+
 def simulation_error(
     failure: Failure,
     time: float,

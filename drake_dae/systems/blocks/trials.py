@@ -36,7 +36,7 @@ FAILURES = 1000
 takes some stages, or a Jacobian by finite differences."""
 
 SHORTEST = 1e-12
-"""A trial that is but this ahead of the accepted state, relative to the time, is the last one."""
+"""A trial no further ahead of the accepted state than this, relative to the time, is the last."""
 
 STEPS = 1000
 SLOWEST = 1e-8
@@ -127,7 +127,7 @@ class StepWatch:
         """
         progress = self._progress(context)
         step = error.time - progress.time
-        # After other trials one of no length is but rounded: steps are that short by now.
+        # After other trials, a step of length zero is only rounded: steps are that short by now.
         if not (step > 0.0 or progress.failures):
             raise error from None
         progress.failures += 1

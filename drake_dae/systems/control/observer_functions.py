@@ -106,12 +106,12 @@ class ObserverFunctions:
         parameters = self._parameters(ca.SX.zeros(mu.numel()))
         acted = late * memory.control + (1.0 - late) * u
         momentum = observation.momentum.function(x, acted, v, parameters)
-        rubbed = observation.friction.function(_faster(observation, x), v, parameters)
+        of_friction = observation.friction.function(_faster(observation, x), v, parameters)
         directions = observation.directions.function(x, v, parameters)
-        (p, drift, inputs), (rubbing, speeds) = momentum[:3], rubbed[:2]
+        (p, drift, inputs), (frictional, speeds) = momentum[:3], of_friction[:2]
         metric, free, planes = directions[:3]
         d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
-        d -= ca.mtimes(rubbing, mu)
+        d -= ca.mtimes(frictional, mu)
 
         # Each lag is a column. What a contact that sticks may hold is not believed.
         fast, slow = self._lags
@@ -128,15 +128,15 @@ class ObserverFunctions:
         # Friction takes its share of it.
         gain = -np.expm1(-observing.friction_rate * self._period)
         is_sure = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
-        found = mu + is_sure * gain * shares(rubbing, metric, chain[:, -1])
+        found = mu + is_sure * gain * shares(frictional, metric, chain[:, -1])
         found = ca.fmin(ca.fmax(found, 0.0), observing.largest_friction)
         change = ca.if_else(hold != 0, 0, found - mu)
-        chain -= ca.repmat(ca.mtimes(rubbing, change), 1, chain.shape[1])
+        chain -= ca.repmat(ca.mtimes(frictional, change), 1, chain.shape[1])
         moves = ca.mtimes(free, chain)
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         after = [chain[:, -1], mu + change, ca.vec(rates), ca.vec(chain[:, :-1]), p, drift, u, 1.0]
         # What is not finite may end at a limit.
-        valid = momentum[-1] + rubbed[-1] + directions[-1]
+        valid = momentum[-1] + of_friction[-1] + directions[-1]
         return self._system.trace(
             "sample of the observer",
             {"held": ca.vertcat(*after), "valid": valid},

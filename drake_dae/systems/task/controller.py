@@ -53,8 +53,8 @@ class TaskController(Diagram, Controller):
     before, as a force when the robot touches, begins with what is measured.
 
     The control itself may jump where the law changes, since the other law explains the same motion
-    by other forces. Where a robot touches what does not rub, and the free law presses with lambda,
-    so that phi'' = w = -A lambda is what it wants there, it is
+    by other forces. Where a robot touches a surface without friction, and the free law presses with
+    lambda, so that phi'' = w = -A lambda is what it wants there, it is
 
         B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
 

@@ -50,7 +50,7 @@ class Phase(ABC):
     1. `begins_in_contact` and `ends_in_contact` say whether the robot touches then; None is as in
        the phase before. From its begin on the law acts that fits.
     2. `goals` are references in s after the phase began. All other outputs come to rest where they
-       are, within `over`, but for the distance, which at last falls with `speed_of_approach`.
+       are, within `over`; the distance alone falls in the end with `speed_of_approach`.
     3. A phase takes over without a bump: its references are those of the phase before, with all
        derivatives that the law has, and lead to the goals within `over`.
     4. `margin` is positive until the phase is over. Where it is not over `within` that time,

@@ -1,13 +1,18 @@
 """Loops on Drake's own contact, rolled out, against Drake's Simulator."""
 
+import shutil
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pydrake.systems.analysis import Simulator
 from runs import first_quick, run_scenario, scenario
 
 from drake_dae import build_scenario, rollout, start_values
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.parts import parts_of
+from drake_dae.running.rollout import beside
+from drake_dae.running.rollout.program import program_of
 from drake_dae.scenario.rolled import roll_scenario, rollout_times
 
 STIFF = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, radius: 1.0e-5}"
@@ -26,6 +31,7 @@ LOOPS = {
     "hydroelastic contact": ("wall_hydroelastic",),
     "behind springs": ("wall_flexible_contact",),
     "a continuous law": ("two_link_wall", *CONTINUOUS),
+    "a continuous law whose references move": ("two_link_wall", *CONTINUOUS[:3]),
     "a law that acts late, at another period": ("two_link_wall", *CONTINUOUS, LATE),
     "encoders": ("wall_point_contact", ENCODERS),
     "noise": (
@@ -41,13 +47,20 @@ LOOPS = {
 }
 
 
+with_compiler = pytest.param(
+    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+)
+both = pytest.mark.parametrize("compiled", [False, with_compiler])
+
+
 def chosen(name, duration=0.06):
     robot, *settings = LOOPS[name]
     return scenario(robot, *settings, f"duration={duration}")
 
 
+@both
 @pytest.mark.parametrize("name", first_quick(LOOPS))
-def test_the_record_is_that_of_simulate(name):
+def test_the_record_is_that_of_simulate(name, compiled):
     """Drake makes the same steps of the plant in both, so that only round-off differs.
 
     Contact multiplies it: by 1e5 N/m in the forces, and by some 10 in each of 60 steps at worst;
@@ -56,8 +69,10 @@ def test_the_record_is_that_of_simulate(name):
     found = chosen(name)
     loop, _, expected = run_scenario(found)
     loop, context = build_scenario(found)
+    program_of(loop).choice = compiled
     rolled = roll_scenario(found, loop, context)
     assert rolled.failure is None
+    assert (program_of(loop).library is not None) == compiled
     record = rolled.record
     # Between steps Drake logs nothing, at a start or an end there, but at samples of the law.
     rows, own = np.nonzero(np.abs(expected.time[:, None] - record.time) < 1e-12)
@@ -66,20 +81,6 @@ def test_the_record_is_that_of_simulate(name):
     for signal in record.signals:
         size = np.abs(expected[signal]).max(initial=1e-6)
         assert_allclose(record[signal][own], expected[signal][rows], rtol=0, atol=1e-9 * size)
-
-
-@pytest.mark.slow
-def test_machine_code_and_interpreter_agree():
-    found = chosen("a law with observer and integrals")
-    loop, context = build_scenario(found)
-    start, parameters = start_values(loop, context)
-    times = rollout_times(found, loop.plant.time_step)
-    (fast,), (slow,) = (
-        rollout(loop, start, parameters, times, compiled=choice) for choice in ("auto", False)
-    )
-    for signal in fast.record.signals:
-        size = np.abs(slow.record[signal]).max(initial=1e-6)
-        assert_allclose(fast.record[signal], slow.record[signal], rtol=0, atol=1e-9 * size)
 
 
 @pytest.mark.slow
@@ -135,3 +136,21 @@ def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported():
     with pytest.raises(ModelError, match="no export knows"):
         parts_of(loop.diagram)
     assert parts_of(loop).compiled is None
+
+
+def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch):
+    """Its contact solver may find no step; what was recorded is kept."""
+
+    class Failing(Simulator):
+        def AdvanceTo(self, time):
+            if time > 0.0105:
+                raise RuntimeError("no convergence.")
+            return super().AdvanceTo(time)
+
+    monkeypatch.setattr(beside, "Simulator", Failing)
+    found = chosen("a law with observer and integrals")
+    rolled = roll_scenario(found, *build_scenario(found))
+    assert isinstance(rolled.failure, SimulationError)
+    assert "at t = 0.01 s" in str(rolled.failure)
+    assert "no convergence. Where" in str(rolled.failure)
+    assert rolled.record.time[-1] == pytest.approx(0.01)

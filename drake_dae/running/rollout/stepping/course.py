@@ -266,7 +266,7 @@ class Course:
         return min(end, float(events[self.event])) if self.event < events.size else end
 
     def so_far(self) -> FloatArray:
-        """The rows of the record up to now, but for the last ones, which may still change."""
+        """The rows of the record up to now, without the last ones, which may still change."""
         *whole, last = self.rows
         self.rows[:] = whole
         try:
