@@ -120,7 +120,9 @@ from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
+from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
+from .systems.plants.contact.contact_material import PointMaterial as PointMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
 from .systems.plants.contact_events import ContactChange as ContactChange

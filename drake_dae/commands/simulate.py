@@ -80,12 +80,16 @@ def _simulate(
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
-    began = time.perf_counter()
+    began, remark = time.perf_counter(), ""
+    if options.rollout:
+        from drake_dae.scenario.rolled import for_rollout
+
+        scenario, remark = for_rollout(scenario)
     completed, loop = build_completed(scenario, meshcat)
     scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
     simulate_by = _roll if options.rollout else _step
     print(f"{name}: built in {time.perf_counter() - began:.2f} s", flush=True)
-    for note in completed.notes:
+    for note in (*completed.notes, *filter(None, [remark])):
         print(note, flush=True)
     folder = options.out or _unused(f"{name}-{datetime.now():%Y%m%d-%H%M%S}")
     with ending_signals(end_at_once), run_folder(folder) as kept:
@@ -326,7 +330,7 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "disturbance forces act on the plant, unknown to the law": bool(
             scenario.plant_disturbances
         ),
-        "Drake's own contact is compliant": not loop.plant.is_ideal,
+        "the contact is compliant": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,

@@ -11,7 +11,6 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
@@ -59,9 +58,17 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         )
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
+    if not period:
+        raise ScenarioError(
+            (
+                "gains",
+                "for a continuous compliant plant without `sampling` no gains are recommended; "
+                "give some, or a sampling",
+            )
+        )
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
-    stiffness = _stiffness(material)
+    stiffness = material.stiffness_at(_FORCE)
     noise = _NOISE
     if scenario.encoders is not None:
         noise = float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
@@ -126,15 +133,3 @@ def _moved(model: RobotModel) -> list[str]:
         for signal in output.signals(model.links)
         if signal.unit == "m"
     ]
-
-
-def _stiffness(material: ContactMaterial) -> float:
-    """The stiffness of a contact, in N/m.
-
-    A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a patch
-    of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
-    """
-    if material.contact_model == "point":
-        return material.stiffness
-    pressure = np.pi * material.modulus * material.radius / material.thickness
-    return float(2.0 * np.sqrt(pressure * _FORCE))

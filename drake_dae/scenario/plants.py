@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, positive
@@ -17,7 +18,8 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
+from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
@@ -56,14 +58,30 @@ class ScenarioPlant(ABC):
        the scenario makes a model with these payloads and disturbances, and sets the parameters in
        the context.
     3. `material` is the material of compliant contacts; None for ideal ones.
+    4. `rolled` is the member that a rollout runs in its place: itself, or one with a traced plant.
+    5. `in_context` are the keys of numbers that `begin` sets in the context of a plant that was
+       made with others.
     """
 
     carries: ClassVar[bool] = False
+    in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
-    def material(self) -> ContactMaterial | None:
+    def material(self) -> PointMaterial | None:
         """The material of compliant contacts; None for ideal ones."""
         return None
+
+    @property
+    def rolled(self) -> "ScenarioPlant":
+        """What a rollout runs in its place."""
+        return self
+
+    def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
+        """Sets the numbers of `in_context` in a context of the plant.
+
+        Raises:
+            ModelError: They do not fit the plant.
+        """
 
     @abstractmethod
     def plant(self, robot: RobotToSimulate) -> Plant:
@@ -145,6 +163,12 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     def material(self) -> ContactMaterial:
         return self
 
+    @property
+    def rolled(self) -> ScenarioPlant:
+        if self.contact_model != "point":
+            return self
+        return CompliantContact(**{f.name: getattr(self, f.name) for f in fields(PointMaterial)})
+
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters"):
             return ContactPlant(
@@ -154,6 +178,35 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 structure=robot.structure,
                 parameters=robot.parameters,
                 disturbances=robot.disturbances,
+            )
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class CompliantContact(PointMaterial, ScenarioPlant):
+    """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
+
+    It takes no MultibodyPlant, so that rollouts are hundreds of times as fast as Drake's plant, and
+    knows what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
+    signals, exports. It has no stops at the limits of joints. With a time_step of 0 it is
+    continuous.
+    """
+
+    in_context: ClassVar[frozenset[str]] = frozenset(
+        {"stiffness", "dissipation", "friction", "radius"}
+    )
+
+    @property
+    def material(self) -> PointMaterial:
+        return self
+
+    def begin(self, plant: Plant, context: Context) -> None:
+        cast(CompliantPlant, plant).set_contact(context, self)
+
+    def plant(self, robot: RobotToSimulate) -> Plant:
+        with at("plant or plant_parameters"):
+            return CompliantPlant(
+                robot.model, self, structure=robot.structure, parameters=robot.parameters
             )
 
 

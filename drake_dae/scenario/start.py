@@ -44,6 +44,8 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
                 plant.set_parameter(own, name, numbers)
+    with at("plant"):
+        scenario.plant.begin(plant, own)
     if controller.takes_over:
         with at("start"):
             plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))

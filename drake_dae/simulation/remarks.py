@@ -59,7 +59,7 @@ def ball_remarks(radius: float | None) -> list[str]:
     if radius is None:
         return []
     return [
-        f"Drake's own contact is that of a ball of {1e3 * radius:.3g} mm. Where the robot tilts by "
+        f"Compliant contact is that of a ball of {1e3 * radius:.3g} mm. Where the robot tilts by "
         "an angle a the ball rolls,\nand touches 2 * radius * sin(a / 2) beside the point of the "
         "constraint; no stiffness changes that, a smaller\nplant.radius does."
     ]

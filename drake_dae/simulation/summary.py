@@ -93,7 +93,7 @@ def summary(
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    # Drake's own contact is compliant, and the state is not projected.
+    # Of compliant contact the state is not projected.
     kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]

@@ -126,7 +126,15 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     own = dict(data)
     for key in ("description", "plant_parameters", "duration", "integrator", "write"):
         own[key] = base[key]
-    if plant_kind(own["plant"]).carries:  # It is built with its own parameters.
+    kind, plant = plant_kind(own["plant"]), base["plant"]
+    if kind is plant_kind(plant):
+        same = {
+            key: plant[key]
+            for key in kind.in_context
+            if (plant[key] is None) is (own["plant"][key] is None)
+        }
+        own["plant"] = {**own["plant"], **same}
+    if kind.carries:  # It is built with its own parameters.
         own["plant_parameters"] = data["plant_parameters"]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():

@@ -74,6 +74,10 @@ def sweep(
         ModelError: The file belongs to another study, or cannot be written; processes or cluster
             cannot be used.
     """
+    if rollout:
+        from drake_dae.scenario.rolled import for_rollout
+
+        scenario, _ = for_rollout(scenario)
     with suppress(ScenarioError):  # It is reported by each run, which may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)

@@ -29,6 +29,7 @@ class Fault(Enum):
     OVERFLOW = "an input is beyond all measure"
     VALUE = "the function is not finite: it left its domain, or a matrix in it is singular"
     SINGULAR = "a matrix that must be regular is singular"
+    OUTSIDE = "the function does not hold there"
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class Failure:
         fault: The kind of failure.
         inputs: Name of an input -> its entries that are not finite, or beyond `HUGE`; empty unless
             `fault` is INPUT or OVERFLOW.
-        singular: The matrix that must be regular, which is singular if `fault` is SINGULAR.
+        singular: The matrix that must be regular, which is singular if `fault` is SINGULAR; or why
+            the function does not hold, if it is OUTSIDE.
     """
 
     function: str
@@ -70,6 +72,8 @@ class TracedFunction:
             `trace.compiled`.
         doubt: A scalar that is negative where the values are not valid though the pivot is large
             enough; the caller may have other values there, see `is_regular`.
+        outside: Why values are not valid where the doubt is negative, for messages; if it is empty
+            the matrix is called singular there.
 
     Attributes:
         arguments: The arrays that a call reads, for `run`.
@@ -89,9 +93,10 @@ class TracedFunction:
         compiled: Compiled = False,
         doubt: ca.SX | None = None,
         lean: bool = False,
+        outside: str = "",
     ) -> None:
         self.name = name
-        self._regular = regular
+        self._regular, self._outside = regular, outside
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
@@ -227,6 +232,8 @@ class TracedFunction:
             if bad:
                 return Failure(self.name, fault, bad)
         # A value may not be finite because the matrix is singular.
+        if self.is_regular and self._outside:
+            return Failure(self.name, Fault.OUTSIDE, {}, self._outside)
         is_singular = self.is_finite or self._pivot[0] < SINGULAR_PIVOT
         fault = Fault.SINGULAR if is_singular else Fault.VALUE
         return Failure(self.name, fault, {}, self._regular)

@@ -108,12 +108,18 @@ class Plan:
 def measured(seed: int, folder: Path) -> Outcome:
     """The robot of a seed under a law that samples, late, and sees encoders.
 
-    Where that is too slow for it, it diverges, and the run says so.
+    Where that is too slow for it, it diverges, and the run says so. Bad encoders shake the robot,
+    so that a step leaves a larger residual before its projection; with half of the step an error of
+    the integrator is 2^6 times smaller.
     """
-    return attempt(seed, folder, is_measured=True)
+    found = attempt(seed, folder, is_measured=True)
+    if found.kind == WRONG and np.isfinite(found.residual):
+        finer = attempt(seed, folder, is_measured=True, step=0.5 * STEP)
+        return finer if finer.residual < found.residual / 32.0 else found
+    return found
 
 
-def attempt(seed: int, folder: Path, is_measured: bool = False) -> Outcome:
+def attempt(seed: int, folder: Path, is_measured: bool = False, step: float = STEP) -> Outcome:
     """Makes, checks and runs a random robot."""
     random = np.random.default_rng(seed)
     plan = _plan(random)
@@ -141,7 +147,7 @@ def attempt(seed: int, folder: Path, is_measured: bool = False) -> Outcome:
         own = loop.plant.GetMyMutableContextFromRoot(context)
         loop.plant.set_consistent_state(own, model.rest_state(configuration, wanted[count:]))
         config = SimulatorConfig(
-            integration_scheme="runge_kutta5", max_step_size=STEP, use_error_control=False
+            integration_scheme="runge_kutta5", max_step_size=step, use_error_control=False
         )
         simulate(loop.diagram, context, DURATION, config)
         record = loop.record(context)

@@ -59,12 +59,14 @@ class Touch:
         point: The point in the frame, m, shape (3,).
         normal: The unit normal toward the free side there, in the world, shape (3, 1).
         clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
+        velocity: A point in the world, shape (3, 1) -> the velocity of the object there, in m/s.
     """
 
     frame: str
     point: Vector
     normal: ca.SX
     clearance: Callable[[ca.SX], ca.SX]
+    velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,15 +124,19 @@ class PointOnSurface(Constraint):
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         if self.is_ideal:
             return None
-        surface = self.parameters[0].rate
-        if self.rpy is not None:
-            turn = self.parameters[1]
-            offset = ca.SX.sym("offset", 3)
-            turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
-            surface = surface + ca.substitute(turning, offset, self.offset(kinematics))
-        velocity = kinematics.velocity(self.frame, self.point) - surface
+        moved = self._surface_velocity(kinematics.position(self.frame, self.point))
+        velocity = kinematics.velocity(self.frame, self.point) - moved
         normal = self._normal(kinematics)
         return velocity - normal * ca.dot(normal, velocity)
+
+    def _surface_velocity(self, point: ca.SX) -> ca.SX:
+        """The velocity of the surface at a point in the world, m/s, shape (3, 1)."""
+        moved = self.parameters[0].rate
+        if self.rpy is None:
+            return moved
+        turn, offset = self.parameters[1], ca.SX.sym("offset", 3)
+        turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
+        return moved + ca.substitute(turning, offset, self._offset(point))
 
     @property
     def is_ideal(self) -> bool:
@@ -167,6 +171,7 @@ class PointOnSurface(Constraint):
             self.point,
             self._normal(frames),
             lambda point: self.surface.distance(self._offset(point)),
+            self._surface_velocity,
         )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:

@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.events import Seed, events_of, noise_of
+from drake_dae.running.rollout.events import Events, Seed, events_of, noise_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Problem
 from drake_dae.systems.blocks.traced import Block
@@ -89,6 +89,9 @@ def problems_of(
     """
     compiled, size = program.compiled, program.size
     events = events_of(compiled, times)
+    if not program.ends_updated:
+        is_before = events.times < times[-1]
+        events = Events(events.times[is_before], events.due[is_before])
     if parameters is None:
         parameters = compiled.values(compiled.context)
     hint = "see start_values"

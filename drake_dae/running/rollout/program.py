@@ -32,6 +32,8 @@ class Program:
             blocks reacted to what happened.
         name: What messages call it.
         choice: Whether it becomes machine code, where nobody says otherwise.
+        ends_updated: Whether the last row comes after the updates of its time: as in Drake's logs
+            of each step, but not in those of the steps of a discrete plant.
         library: Its machine code, if there is any by now.
     """
 
@@ -40,6 +42,7 @@ class Program:
     complete: Callable[[Record, Context | None], Record]
     name: str
     choice: Compiled = "auto"
+    ends_updated: bool = True
     library: ctypes.CDLL | None = None
     _made: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -117,7 +120,9 @@ def program_of(loop: ClosedLoop | Diagram) -> Program:
         compiled = compile_diagram(loop.diagram, list(loop.signals))
         name, choice = loop.plant.get_name(), loop.plant.dae.compiled
         complete = partial(_completed, loop)
-        loop.memory["program"] = Program(compiled, loop.signals, complete, name, choice)
+        ends_updated = not loop.plant.time_step
+        given = compiled, loop.signals, complete, name, choice, ends_updated
+        loop.memory["program"] = Program(*given)
     found: Program = loop.memory["program"]
     return found
 

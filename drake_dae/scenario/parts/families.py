@@ -90,7 +90,11 @@ Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
-    plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral | plants.OwnPlant,
+    plants.IdealConstraints
+    | plants.MultibodyPlant
+    | plants.CompliantContact
+    | plants.Unilateral
+    | plants.OwnPlant,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]

@@ -79,6 +79,10 @@ def simulation_error(
                 time,
                 state,
             )
+        case Fault.OUTSIDE:
+            return SimulationError(
+                f"{failure.function} has no value {where}: {failure.singular}", time, state
+            )
         case Fault.SINGULAR:
             return SingularityError(
                 f"{failure.singular} is singular {where}, so {failure.function} is not determined "

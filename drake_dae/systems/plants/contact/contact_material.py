@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddCompliantHydroelasticPropertiesForHalfSpace,
@@ -13,18 +14,14 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import CoulombFriction
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive
+from drake_dae.arrays import FloatArray, positive
 from drake_dae.errors import ModelError
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class ContactMaterial:
-    """The contact model of Drake's MultibodyPlant for a robot.
-
-    The robot touches with a ball; the surfaces are those of its constraints. With point contact the
-    force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness.
+class PointMaterial:
+    """The point contact of a robot's balls with surfaces.
 
     If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
@@ -32,13 +29,11 @@ class ContactMaterial:
     stiffer contact. A tool that stays normal to its surface does not roll.
 
     Attributes:
-        time_step: The step of the plant, s.
-        contact_model: "point" or "hydroelastic".
+        time_step: The step of the plant in s; 0 for a continuous plant.
         stiffness: The stiffness of point contact, N/m.
-        modulus: The hydroelastic modulus, Pa.
-        thickness: The thickness of the compliant layer, m; hydroelastic contact only.
         dissipation: The Hunt-Crossley dissipation, s/m.
         friction: The coefficient of friction of all contacts; None for those of the constraints.
+        stiction_tolerance: v_s of Drake's regularized friction, m/s.
         radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
             constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
             radius.
@@ -48,21 +43,70 @@ class ContactMaterial:
     """
 
     time_step: float = 1e-3
-    contact_model: Literal["point", "hydroelastic"] = "point"
     stiffness: float = 1e5
-    modulus: float = 1e7
-    thickness: float = 0.01
     dissipation: float = 0.0
     friction: float | None = None
+    stiction_tolerance: float = 1e-4
     radius: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("time_step", "stiffness", "modulus", "thickness", "radius"):
+        for name in ("stiffness", "stiction_tolerance", "radius"):
             positive(name, getattr(self, name))
-        for name in ("dissipation", "friction"):
+        for name in ("time_step", "dissipation", "friction"):
             value = getattr(self, name)
             if value is not None and not value >= 0.0:
                 raise ModelError(f"{name} must be 0 or more, got {value:g}")
+
+    def stiffness_at(self, force: float) -> float:
+        """The slope of the normal force over depth, in N/m, at a normal force in N."""
+        return self.stiffness
+
+    @property
+    def values(self) -> FloatArray:
+        """The numbers that are parameters of a `CompliantPlant`: k, d, mu and the radius."""
+        friction = 0.0 if self.friction is None else self.friction
+        return np.array([self.stiffness, self.dissipation, friction, self.radius])
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class ContactMaterial(PointMaterial):
+    """The contact model of Drake's MultibodyPlant for a robot.
+
+    The robot touches with a ball; the surfaces are those of its constraints. With point contact the
+    force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
+    the pressure modulus times depth / thickness. Where the robot tilts, the ball rolls: see
+    `PointMaterial`.
+
+    Attributes:
+        time_step: The step of the plant, s, positive.
+        contact_model: "point" or "hydroelastic".
+        modulus: The hydroelastic modulus, Pa.
+        thickness: The thickness of the compliant layer, m; hydroelastic contact only.
+        stiffness, dissipation, friction, stiction_tolerance, radius: As for `PointMaterial`.
+
+    Raises:
+        ModelError: A number makes no sense.
+    """
+
+    contact_model: Literal["point", "hydroelastic"] = "point"
+    modulus: float = 1e7
+    thickness: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("time_step", "modulus", "thickness"):
+            positive(name, getattr(self, name))
+
+    def stiffness_at(self, force: float) -> float:
+        """The slope of the normal force over depth, in N/m, at a normal force in N.
+
+        A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a
+        patch of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
+        """
+        if self.contact_model == "point":
+            return self.stiffness
+        return float(2.0 * np.sqrt(np.pi * self.modulus * self.radius / self.thickness * force))
 
 
 def ball_properties(material: ContactMaterial, friction: float) -> ProximityProperties:

@@ -135,7 +135,9 @@ class ContactPlant(Diagram, Plant):
         logging.getLogger("drake").addFilter(_is_of_use)
         inner = DiagramBuilder()
         config = MultibodyPlantConfig(
-            time_step=material.time_step, contact_model=material.contact_model
+            time_step=material.time_step,
+            contact_model=material.contact_model,
+            stiction_tolerance=material.stiction_tolerance,
         )
         plant, scene_graph = AddMultibodyPlant(config, inner)
         self.multibody = plant

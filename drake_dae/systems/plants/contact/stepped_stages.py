@@ -62,13 +62,8 @@ class SteppedStages(LeafSystem):
         self._parameters = parameters
         self._size = size = _num_link_states(model)
         control = ca.SX.sym("u", dae.num_controls)
-        driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
-        # Stages do not share a mass with the links.
-        rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
-        after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rate)
-        for position, velocity in _shafts(model).items():
-            after[position] = dae.state[position] + time_step * after[velocity]
-        self._step = dae.trace("step of the stages", {"s": after[size:]}, {"control": control})
+        after = stages_after(model, time_step, control)
+        self._step = dae.trace("step of the stages", {"s": after}, {"control": control})
         self._torque = dae.trace("joint torque", {"torque": model.joint_force})
 
         self._links = self.DeclareVectorInputPort("link_state", size)
@@ -137,6 +132,24 @@ class SteppedStages(LeafSystem):
         if function.is_valid:
             return values[0]
         raise simulation_error(function.failure(), context.get_time(), state, self._signals)
+
+
+def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
+    """s after a step of `SteppedStages` as an expression of x and u, shape (k, 1).
+
+    Args:
+        model: The robot.
+        time_step: h in s.
+        control: u, shape (p, 1).
+    """
+    dae, size = model.dae, _num_link_states(model)
+    driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
+    # Stages do not share a mass with the links.
+    rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
+    after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rate)
+    for position, velocity in _shafts(model).items():
+        after[position] = dae.state[position] + time_step * after[velocity]
+    return after[size:]
 
 
 def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:

@@ -1,0 +1,176 @@
+"""The equations of a robot in compliant point contact, as traced functions."""
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.contact.contact_laws import (
+    Compliance,
+    contact_force,
+    contact_step,
+)
+from drake_dae.systems.plants.contact.contact_material import PointMaterial
+from drake_dae.systems.plants.contact.point_contact import point_contacts, touching
+from drake_dae.systems.plants.contact.stepped_stages import stages_after
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+OUTSIDE = (
+    "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
+    "not found; `plant: !MultibodyPlant` has stops"
+)
+"""Why a `CompliantPlant` does not go on."""
+
+
+class CompliantEquations:
+    """The functions of a `CompliantPlant`, of (state, control, parameters).
+
+    The state is x, or (x, F) for a discrete plant. Parameters are those of the system, followed by
+    `PointMaterial.values` and `ball_normals`.
+
+    Args:
+        model: The robot.
+        structure: The structure of its system.
+        material: The contact material.
+
+    Attributes:
+        advanced: x', or (x, F) after a step, as a function of state, control and parameters.
+        shown: Name of an output port -> its function of state and parameters.
+        expressions: All of these as expressions.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        structure: ConstraintStructure,
+        material: PointMaterial,
+    ) -> None:
+        dae, self._model, self._h = model.dae, model, material.time_step
+        numbers = ca.SX.sym("material", 4)
+        normals = ca.SX.sym("normals", 3 * len(model.constraints))
+        self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
+        friction = None if material.friction is None else numbers[2]
+        self._contacts = point_contacts(model, normals, numbers[3], friction)
+        control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._contacts))
+        advanced, slack = (self._step if self._h else self._rate)(control)
+        now = force if self._h else self._forces()
+        outputs = self._outputs(structure, now)
+        self.expressions = [advanced, slack, *outputs.values()]
+        state = ca.vertcat(dae.state, force) if self._h else dae.state
+        parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
+        self.advanced = TracedFunction(
+            "the contact",
+            {"state": state, "control": control, "parameters": parameters},
+            {"value": advanced},
+            doubt=slack,
+            outside=OUTSIDE,
+            compiled=dae.compiled,
+        )
+        inputs = {"state": state, "parameters": parameters}
+        self.shown: Mapping[str, TracedFunction] = {
+            name: TracedFunction(name, inputs, {"value": value}, compiled=dae.compiled)
+            for name, value in outputs.items()
+        }
+
+    def _balance(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M and tau - H without contact, with torques within the limits of the actuators."""
+        model, dae, links = self._model, self._model.dae, self._model.links
+        nq, nv = links.q.numel(), links.v.numel()
+        part = slice(nq, nq + nv)
+        viscous = [
+            parameter.symbol
+            for constraint in model.constraints
+            for parameter in constraint.parameters
+            if parameter.name == f"{constraint.name}.viscous_friction"
+        ]
+        # Viscous friction belongs to the contacts here.
+        forces = dae.f[part]
+        if viscous:
+            forces = ca.substitute(forces, ca.vertcat(*viscous), ca.DM.zeros(len(viscous)))
+        limits = ca.DM(links.effort_limits)
+        torque = control if model.joint_force is None else model.joint_force
+        within = ca.fmin(ca.fmax(torque, -limits), limits)
+        if model.joint_force is not None:
+            within -= model.joint_force  # Which is in f, too.
+        drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
+        return dae.mass_matrix[part, part], forces + drive
+
+    def _forces(self) -> ca.SX:
+        """The contact forces of a continuous plant."""
+        v = self._model.links.v
+        return ca.vertcat(*(contact_force(one, v, self._compliance) for one in self._contacts))
+
+    def _rate(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """x' of a continuous plant, and what is negative where it has none."""
+        model, links = self._model, self._model.links
+        mass, forces = self._balance(control)
+        jacobian = ca.vertcat(*(one.jacobian for one in self._contacts))
+        forces += ca.mtimes(jacobian.T, self._forces())
+        change = PositiveDefiniteFactorization(mass).solve(forces)
+        size = links.q.numel() + links.v.numel()
+        dae = model.dae
+        driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
+        rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
+        velocity = ca.mtimes(links.velocity_map, links.v)
+        return ca.vertcat(velocity, change, rate), self._within_limits(links.q)
+
+    def _step(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """(x, F) after a step, and what is negative where there is none."""
+        model, links, h = self._model, self._model.links, self._h
+        mass, forces = self._balance(control)
+        mass += h * ca.diag(ca.DM(_damping(model)))
+        free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
+        found = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
+        velocity = ca.mtimes(links.velocity_map, found.velocities)
+        # Drake's stops push from where the next step but one would pass the limit.
+        ahead = self._within_limits(links.q + 2.0 * h * velocity)
+        stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
+        after = ca.vertcat(links.q + h * velocity, found.velocities, stages, found.forces)
+        return after, ca.fmin(found.slack, ahead)
+
+    def _within_limits(self, q: ca.SX) -> ca.SX:
+        """The least distance of joints from their limits; negative beyond one."""
+        low, high = self._model.links.position_limits
+        gaps = [q[i] - low[i] for i in np.flatnonzero(np.isfinite(low)).tolist()]
+        gaps += [high[i] - q[i] for i in np.flatnonzero(np.isfinite(high)).tolist()]
+        least = ca.SX(1)
+        for gap in gaps:
+            least = ca.fmin(least, gap)
+        return least
+
+    def _outputs(self, structure: ConstraintStructure, contact: ca.SX) -> dict[str, ca.SX]:
+        """The output ports as expressions of the state and of the contact forces."""
+        model, dae = self._model, self._model.dae
+        normals = ca.horzcat(*(touch.normal for _, touch in touching(model)))
+        force = ca.sum1(normals * ca.reshape(contact, 3, -1)).T
+        size = model.links.q.numel() + model.links.v.numel()
+        found = {
+            "state": dae.state,
+            "link_state": dae.state[:size],
+            "contact_force": contact,
+            "constraint_force": force,
+            "constraint_residual": structure.manifold.residual_expression,
+            "controlled_output": dae.outputs(force),
+        }
+        if model.joint_force is not None:
+            found["joint_torque"] = model.joint_force
+        for stage in model.stages:
+            for name, part in stage.ports.items():
+                found[name] = dae.state[size + part.start : size + part.stop]
+            size += stage.state.numel()
+        return found
+
+
+def _damping(model: RobotModel) -> FloatArray:
+    """The damping of the joints, which Drake takes implicitly, shape (nv,)."""
+    found, plant = np.zeros(model.links.v.numel()), model.links.plant
+    if plant is not None:
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            first = joint.velocity_start()
+            found[first : first + joint.num_velocities()] = joint.default_damping_vector()
+    return found

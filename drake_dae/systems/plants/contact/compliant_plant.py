@@ -1,0 +1,280 @@
+"""A robot in compliant point contact, as Drake computes it, as traced functions."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    ContinuousState,
+    DependencyTicket,
+    EventStatus,
+    State,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    PARAMETERS,
+    STATE,
+    Block,
+    Computation,
+    Update,
+)
+from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.plants.contact.compliance import CompliantEquations
+from drake_dae.systems.plants.contact.contact_checks import changed_parameters
+from drake_dae.systems.plants.contact.contact_material import PointMaterial
+from drake_dae.systems.plants.contact.point_contact import ball_normals
+from drake_dae.systems.plants.contact.stepped_stages import check_step
+from drake_dae.systems.plants.contract import Plant
+
+
+@checked(ModelError)
+class CompliantPlant(ParameterizedSystem, Plant):
+    """A robot whose contacts are compliant, by Drake's equations of point contact.
+
+    It is what a `ContactPlant` is, without a MultibodyPlant: its equations are traced, so that
+    rollouts, exports and linear models know it, surfaces may have any shape and move, and studies
+    change its parameters in a context. Each `PointOnSurface` touches with a ball; nothing else of
+    the robot collides.
+
+    With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,
+
+        A (v_+ - v*) = J^T gamma,    v* = v + h A^-1 (tau - H),    q_+ = q + h N(q) v_+,
+
+    A = M + h D with the damping D of the joints, and the impulses gamma of `contact_step`: Drake's
+    discrete MultibodyPlant with its default, the "lagged" approximation. Stages of actuation step
+    as `SteppedStages`. With `time_step` = 0 it is continuous,
+
+        M v' + H = tau + J^T F,
+
+    with the forces F of `contact_force`, those of a continuous MultibodyPlant. Torques beyond the
+    effort limits of the actuators are cut to them, as Drake does. Drake stops a joint at its
+    limits; this plant has no such stops, and a run that reaches one ends with an error.
+
+    Input ports:
+        control: u, shape (p,).
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
+
+    Output ports:
+        state, link_state, joint_torque, and the ports of the stages: as for `RobotPlant`.
+        contact_force: The force F of each contact on the robot in the world, in N, including
+            friction, shape (3 m,); of a discrete plant the mean force of the step to t_n.
+        constraint_force: lambda = n(q) . F, N, shape (m,).
+        constraint_residual: phi and phi' of the point of the constraint, as for `DaePlant`; not
+            zero, since compliant surfaces are penetrated.
+        controlled_output: z = l(x) + m(x) lambda.
+
+    The context holds all parameters of the system as one numeric parameter, followed by those of
+    `set_contact`.
+
+    Args:
+        model: The robot; each constraint a `PointOnSurface`.
+        material: The contact material.
+        structure: The structure of the model's system; found if None.
+        parameters: Parameter name -> the default of the plant; that of the model if left out.
+
+    Attributes:
+        material: The contact material.
+        contact_force_signals: Names and units of `contact_force`.
+
+    Raises:
+        ModelError: A constraint is no contact of a point with a surface, or the step is too long
+            for the stages.
+        SimulationError: A joint reaches its limit during a run, or a step has no solution; the
+            exception has time and state.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+    is_ideal = False
+
+    def __init__(
+        self,
+        model: RobotModel,
+        material: PointMaterial,
+        *,
+        structure: ConstraintStructure | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        dae = model.dae
+        structure = constraint_structure_of(type(self).__name__, dae, structure)
+        values = dae.parameter_vector(changed_parameters(model, parameters or {}))
+        if model.stages and material.time_step:
+            check_step(model, material.time_step, values)
+        own = np.concatenate([values, material.values, ball_normals(model, structure, values)])
+        signals = {"state": dae.state_signals, "control": dae.control_signals}
+        super().__init__(dae, own, signals, sees_steps=not material.time_step)
+        self.model: RobotModel = model
+        self.structure, self.material = structure, material
+        self.time_step = material.time_step
+        self.set_name(dae.name)
+        equations = CompliantEquations(model, structure, material)
+        self.contact_force_signals = tuple(
+            Signal(f"{constraint.name}.contact_f{axis}", "N")
+            for constraint in model.constraints
+            for axis in "xyz"
+        )
+        self._shown, self._advanced = equations.shown, equations.advanced
+        degrees = dae.exogenous.degrees(*equations.expressions)
+        self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
+        tickets = self._declare_exogenous(degrees) | self._declare_state()
+        for name, function in self._shown.items():
+            size, calc = function.outputs[0].size, weakly(self._calc, name)
+            self.DeclareVectorOutputPort(name, size, calc, tickets)
+
+    def _declare_state(self) -> set[DependencyTicket]:
+        """Declares state and steps; what outputs depend on."""
+        start = BasicVector(self.structure.manifold.project(self.dae.nominal_state))
+        if not self.time_step:
+            self.DeclareContinuousState(start)
+            return state_tickets(self)
+        self.DeclareDiscreteState(start.value())
+        self.DeclareDiscreteState(np.zeros(len(self.contact_force_signals)))
+        # Unrestricted, as the step of a discrete MultibodyPlant, so that both see the same instant.
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.time_step, 0.0, weakly(self._advance))
+        return {self.xd_ticket()}
+
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        return {"contact_force": self.contact_force_signals}
+
+    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        along = super().parameters_along(context, times)
+        return along[:, : self.dae.parameter_symbol.numel()]
+
+    def state(self, context: Context) -> FloatArray:
+        self.check_context(context)
+        if not self.time_step:
+            return super().state(context)
+        return context.get_discrete_state(0).CopyToVector()
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets x as given, shape (n,), in contact or not.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        self.check_context(context)
+        if not self.time_step:
+            super().set_state(context, state)
+            return
+        context.SetDiscreteState(0, self.dae.state_vector(state))
+        context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
+
+    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
+        """Sets the state on N* next to a guess, shape (n,), and returns it.
+
+        The robot then touches without force, and penetrates when the run starts.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
+        self.check_context(context)
+        return super().set_consistent_state(context, guess)
+
+    def set_contact(self, context: Context, material: PointMaterial) -> None:
+        """Sets stiffness, dissipation, friction and radius, and places the balls on the robot.
+
+        In the nominal configuration, with the parameters of the context, a ball touches at the
+        point of its constraint.
+
+        Args:
+            context: The context of the plant.
+            material: The material, with the time_step and stiction_tolerance of the plant, and a
+                friction if and only if that of the plant has one.
+
+        Raises:
+            ModelError: The material does not fit.
+        """
+        own = self.material
+        kept = material.time_step, material.stiction_tolerance, material.friction is None
+        if kept != (own.time_step, own.stiction_tolerance, own.friction is None):
+            raise ModelError(
+                f"{self.dae.name}: the plant was made with {own}; only its stiffness, dissipation, "
+                f"radius and a number of its friction may change, got {material}"
+            )
+        values = context.get_numeric_parameter(0).CopyToVector()
+        first = self.dae.parameter_symbol.numel()
+        normals = ball_normals(self.model, self.structure, values[:first])
+        values[first:] = np.concatenate([material.values, normals])
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+    def _held(self, context: Context) -> FloatArray:
+        """What functions take as the state: x, and of a discrete plant the contact forces."""
+        if not self.time_step:
+            return context.get_continuous_state_vector().value()
+        return np.concatenate([context.get_discrete_state(i).value() for i in range(2)])
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if self.time_step:
+            return
+        control = self._control_port.Eval(context)
+        found = self._checked(self._advanced, context, self._held(context), control)
+        derivatives.SetFromVector(found[0])
+
+    def _advance(self, context: Context, state: State) -> EventStatus:
+        control, held = self._control_port.Eval(context), self._held(context)
+        function = self._advanced
+        found = function.evaluate(held, control, self._values(context))[0]
+        if not function.is_valid:
+            x = held[: self.dae.num_states].copy()
+            raise simulation_error(function.failure(), context.get_time(), x, self._signals)
+        values = state.get_mutable_discrete_state()
+        values.set_value(0, found[: self.dae.num_states])
+        values.set_value(1, found[self.dae.num_states :])
+        return EventStatus.Succeeded()
+
+    def _calc(self, name: str, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._checked(self._shown[name], context, self._held(context))[0])
+
+    def _formulas(self) -> dict[str, Formula]:
+        if self.time_step:
+            raise ModelError(
+                f"{self.dae.name}: a discrete CompliantPlant does not convert to AutoDiffXd; take "
+                "a time_step of 0"
+            )
+        found: dict[str, Any] = {"derivative": self._advanced, **self._shown}
+        return {n: TracedFormula(each, signals=self._signals) for n, each in found.items()}
+
+    def traced(self) -> Block:
+        is_discrete = bool(self.time_step)
+        source = HELD if is_discrete else STATE
+        computations = [
+            Computation.of(function, (source, PARAMETERS), (name,))
+            for name, function in self._shown.items()
+        ]
+        into = (HELD,) if is_discrete else (DERIVATIVE,)
+        advanced = Computation.of(self._advanced, (source, "control", PARAMETERS), into)
+        updates = [Update(advanced, self.time_step, 0.0, True)] if is_discrete else []
+        computations += [] if is_discrete else [advanced]
+        dae = self.dae
+        ports = {
+            "state": tuple(dae.state_signals),
+            "contact_force": self.contact_force_signals,
+            "constraint_force": tuple(dae.force_signals),
+            "constraint_residual": tuple(self.structure.manifold.residual_signals),
+            "controlled_output": tuple(dae.output_signals),
+        }
+        return Block(
+            self,
+            tuple(computations),
+            tuple(updates),
+            scale=None if is_discrete else dae.scale,
+            moving=tuple(self.exogenous_places),
+            signals=self._signals,
+            ports=ports,
+        )

@@ -1,0 +1,206 @@
+"""Drake's laws of point contact, continuous and discrete, as expressions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from drake_dae.systems.plants.contact.point_contact import PointContact
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+
+ITERATIONS = 10
+"""The number of Newton steps for the velocities of contacts. Of random problems far beyond those
+of robots (W over 2.5 decades, impulses over 6, sliding from 0.1 to 1000 v_s), one contact of 1,000
+and one pair of 200 needs more; a robot in contact needs 3 to 5."""
+
+SOLVED = 1e-9
+"""The allowed residual of these velocities, relative to the velocities themselves."""
+
+AT_REST = 1e-6
+"""Velocities below this, in m/s, count as this large there."""
+
+SOFT = 1e-3
+"""Drake's `sigma`: impulses soften friction by this share of the speed that they change."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compliance:
+    """What all contacts of a plant have in common.
+
+    Attributes:
+        stiffness: k in N/m.
+        dissipation: d of Hunt and Crossley in s/m.
+        stiction_tolerance: v_s in m/s.
+    """
+
+    stiffness: ca.SX
+    dissipation: ca.SX
+    stiction_tolerance: float
+
+
+def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca.SX:
+    """The force on the robot of a continuous MultibodyPlant, in N, shape (3, 1):
+
+        f_n = k x max(0, 1 + d x'),    f_t = -mu f_n step5(|v_t| / v_s) v_t / |v_t| - c v_t,
+
+    with the depth x > 0 and step5(s) = s^3 (10 - 15 s + 6 s^2) up to s = 1, and 1 beyond. Viscous
+    friction c is not Drake's.
+
+    Args:
+        contact: The contact.
+        v: The generalized velocities, shape (nv, 1).
+        compliance: Its numbers.
+    """
+    relative = ca.mtimes(contact.jacobian, v) - contact.velocity
+    sliding, tolerance = contact.along(relative), compliance.stiction_tolerance
+    approach = -ca.dot(contact.normal, relative)
+    damping = ca.fmax(0, 1 + compliance.dissipation * approach)
+    push = compliance.stiffness * contact.depth * damping
+    speed = ca.sqrt(ca.sumsqr(sliding))
+    s = speed / tolerance
+    slow = s**2 * (10 - 15 * s + 6 * s**2) / tolerance
+    slope = ca.if_else(s < 1, slow, 1 / ca.fmax(speed, tolerance))
+    along = -(contact.friction * push * slope + contact.viscous_friction) * sliding
+    return ca.if_else(contact.depth > 0, contact.normal * push + along, ca.SX(3, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ContactStep:
+    """A step of velocities through contact.
+
+    Attributes:
+        velocities: The generalized velocities after the step, shape (nv, 1).
+        forces: The mean forces of the contacts on the robot in the step, in N, shape (3 k, 1).
+        slack: Negative where Newton's method did not find them.
+    """
+
+    velocities: ca.SX
+    forces: ca.SX
+    slack: ca.SX
+
+
+def contact_step(
+    contacts: Sequence[PointContact],
+    v: ca.SX,
+    free: ca.SX,
+    mass: ca.SX,
+    time_step: float,
+    compliance: Compliance,
+) -> ContactStep:
+    """The step of a discrete MultibodyPlant with Drake's default, the "lagged" approximation:
+
+        A (v_+ - v*) = J^T gamma(v_c),    v_c = J v_+ - v_surface,
+        gamma_n = h (k x - h k v_n)_+ (1 - d v_n)_+,    gamma_t = -mu gamma_0 v_t / |v_t|_s,
+
+    with |v_t|_s = sqrt(|v_t|^2 + e^2), e = max(v_s, sigma mu w gamma_0), and gamma_0 = h k x (1 - d
+    v_n0)_+ and x of the state before the step, for contacts with x > 0 there (Castro et al. 2024,
+    "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
+    solves for v_c to round-off, by a primal-dual Newton's method: with p = v_t / |v_t|_s as
+    unknowns of their own it also converges where the sliding direction turns (Chan, Golub and Mulet
+    1999).
+
+    Args:
+        contacts: The contacts.
+        v: The velocities before the step.
+        free: v*, the velocities after a step without contact.
+        mass: A = M + h D, with the damping D of the joints.
+        time_step: h in s.
+        compliance: The numbers of the contacts.
+    """
+    h, count = time_step, len(contacts)
+    factored = PositiveDefiniteFactorization(mass)
+    jacobian = ca.vertcat(*(one.jacobian for one in contacts))
+    response = factored.solve(jacobian.T)
+    delassus = ca.mtimes(jacobian, response)
+    surface = ca.vertcat(*(one.velocity for one in contacts))
+    before = ca.mtimes(jacobian, v) - surface
+    wanted = ca.mtimes(jacobian, free) - surface
+    parts = [slice(3 * i, 3 * i + 3) for i in range(count)]
+    laws = [
+        (p, _Lagged.of(one, before[p], mass, h, compliance))
+        for p, one in zip(parts, contacts, strict=True)
+    ]
+
+    def impulses(velocity: ca.SX) -> ca.SX:
+        return ca.vertcat(*(law.impulse(velocity[p]) for p, law in laws))
+
+    def residual(velocity: ca.SX) -> ca.SX:
+        return velocity - wanted - ca.mtimes(delassus, impulses(velocity))
+
+    velocity = before
+    shares = ca.vertcat(*(law.share(before[p]) for p, law in laws))
+    for _ in range(ITERATIONS):
+        slope = ca.diagcat(*(law.slope(velocity[p], shares[p]) for p, law in laws))
+        matrix = Factorization(ca.SX.eye(3 * count) - ca.mtimes(delassus, slope))
+        change = -matrix.solve(residual(velocity))
+        moved = [law.next_share(velocity[p], shares[p], change[p]) for p, law in laws]
+        velocity, shares = velocity + change, ca.vertcat(*moved)
+    slack = SOLVED * ca.fmax(ca.norm_2(wanted), AT_REST) - ca.norm_2(residual(velocity))
+    found = impulses(velocity)
+    return ContactStep(free + ca.mtimes(response, found), found / h, slack)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lagged:
+    """The impulse of one contact as a function of its velocity."""
+
+    contact: PointContact
+    elastic: ca.SX
+    lagged: ca.SX
+    softness: ca.SX
+    time_step: float
+    compliance: Compliance
+
+    @classmethod
+    def of(
+        cls, contact: PointContact, before: ca.SX, mass: ca.SX, h: float, compliance: Compliance
+    ) -> "_Lagged":
+        """The impulse with what is taken from the state before the step."""
+        elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
+        damping = ca.fmax(0, 1 - compliance.dissipation * ca.dot(contact.normal, before))
+        lagged = contact.friction * h * elastic * damping
+        J = contact.jacobian
+        own = ca.mtimes(J / ca.repmat(ca.diag(mass).T, 3, 1), J.T)
+        softness = ca.fmax(compliance.stiction_tolerance, SOFT * ca.norm_fro(own) / 3 * lagged)
+        return cls(contact, elastic, lagged, softness, h, compliance)
+
+    def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """v_t and |v_t|_s."""
+        sliding = self.contact.along(velocity)
+        return sliding, ca.sqrt(ca.sumsqr(sliding) + self.softness**2)
+
+    def share(self, velocity: ca.SX) -> ca.SX:
+        """p = v_t / |v_t|_s."""
+        sliding, size = self._size(velocity)
+        return sliding / size
+
+    def next_share(self, velocity: ca.SX, share: ca.SX, change: ca.SX) -> ca.SX:
+        """p after a Newton step, no longer than 1."""
+        sliding, size = self._size(velocity)
+        moved = self.contact.along(change)
+        found = (sliding + moved - share * ca.dot(sliding / size, moved)) / size
+        return found / ca.fmax(1, ca.norm_2(found))
+
+    def impulse(self, velocity: ca.SX) -> ca.SX:
+        """gamma in N s, shape (3, 1)."""
+        push, _ = self._push(velocity)
+        viscous = self.time_step * self.contact.viscous_friction * self.contact.along(velocity)
+        along = -self.lagged * self.share(velocity) - ca.if_else(self.elastic > 0, viscous, 0)
+        return self.contact.normal * push + along
+
+    def _push(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """gamma_n and its derivative."""
+        h, k, d = self.time_step, self.compliance.stiffness, self.compliance.dissipation
+        leaving = ca.dot(self.contact.normal, velocity)
+        elastic, damping = self.elastic - h * k * leaving, 1 - d * leaving
+        touches = (self.elastic > 0) * (elastic > 0) * (damping > 0)
+        return touches * h * elastic * damping, -touches * h * (h * k * damping + d * elastic)
+
+    def slope(self, velocity: ca.SX, share: ca.SX) -> ca.SX:
+        """The derivative of the impulse, with p in place of one of its directions, shape (3, 3)."""
+        sliding, size = self._size(velocity)
+        n, t = self.contact.normal, sliding / size
+        plane = ca.SX.eye(3) - ca.mtimes(n, n.T)
+        viscous = self.time_step * self.contact.viscous_friction * (self.elastic > 0)
+        along = self.lagged / size * (plane - ca.mtimes(share, t.T)) + viscous * plane
+        return ca.mtimes(n, n.T) * self._push(velocity)[1] - along

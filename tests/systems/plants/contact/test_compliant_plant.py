@@ -1,0 +1,370 @@
+"""Compliant contact as traced equations, against Drake's MultibodyPlant and closed forms."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from arms import arm, fixed_step, parse
+from numpy.testing import assert_allclose
+from pydrake.geometry import (
+    AddContactMaterial,
+    CollisionFilterDeclaration,
+    GeometrySet,
+    HalfSpace,
+    ProximityProperties,
+    Role,
+    SceneGraph,
+)
+from pydrake.geometry import Sphere as Ball
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import (
+    PrismaticJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+from runs import run_scenario, scenario
+
+from drake_dae import (
+    CoincidentPoints,
+    CompliantPlant,
+    Plane,
+    PointCoordinates,
+    PointMaterial,
+    PointOnSurface,
+    RobotModel,
+    Sphere,
+    build_scenario,
+    rollout,
+    simulate,
+    start_values,
+)
+from drake_dae.errors import ModelError, ScenarioError, SimulationError
+from drake_dae.scenario.shipped import FOLDER
+
+MATERIAL = {"stiffness": 1e5, "dissipation": 2.0, "friction": 0.3, "radius": 0.01}
+
+
+class Pair(NamedTuple):
+    """A CompliantPlant, and the same robot in a MultibodyPlant."""
+
+    plant: CompliantPlant
+    diagram: object
+    drake: MultibodyPlant
+
+    def drake_context(self, state, control):
+        context = self.diagram.CreateDefaultContext()
+        own = self.drake.GetMyMutableContextFromRoot(context)
+        self.drake.SetPositionsAndVelocities(own, state)
+        self.drake.get_actuation_input_port().FixValue(own, control)
+        return context
+
+
+def drawn(shape: str):
+    """The seven-joint arm on a plane or on the outside of a sphere, and the solid of it."""
+    point, radius = np.array([0.7, 0.0, 0.6]), 0.4
+    if shape == "plane":
+        tilt = np.array([-1.0, 0.1, 0.2]) / np.linalg.norm([-1.0, 0.1, 0.2])
+        solid = HalfSpace(), HalfSpace.MakePose(tilt, point)
+        return Plane(point=point, normal=tilt), solid
+    center = point + np.array([radius, 0.0, 0.0])
+    return Sphere(center=center, radius=radius), (Ball(radius), RigidTransform(center))
+
+
+@cache
+def pair(shape: str, time_step: float, dissipation: float = 2.0) -> Pair:
+    surface, (form, pose) = drawn(shape)
+    links = arm("seven_joint").model
+    model = RobotModel(
+        links.links,
+        [PointOnSurface("tool", surface, name="wall", friction=0.3)],
+        links.outputs,
+        links.nominal_positions,
+        forces=["wall.force"],
+    )
+    material = PointMaterial(time_step, **{**MATERIAL, "dissipation": dissipation})
+    plant = CompliantPlant(model, material)
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=time_step, contact_model="point")
+    drake, scene = AddMultibodyPlant(config, builder)
+    parser = Parser(drake)
+    parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    parser.AddModelsFromUrl("package://drake_dae_models/seven_joint_arm.dmd.yaml")
+    add_ball(plant, drake, scene, form, pose, dissipation)
+    drake.Finalize()
+    return Pair(plant, builder.Build(), drake)
+
+
+def add_ball(plant, drake, scene: SceneGraph, form, pose, dissipation) -> None:
+    """A ball that touches at the tool in the nominal configuration, and the solid."""
+    properties = ProximityProperties()
+    friction = CoulombFriction(0.3, 0.3)
+    AddContactMaterial(dissipation, 2e5, friction, properties)
+    own = parse("seven_joint_arm")
+    context = own.CreateDefaultContext()
+    state = plant.structure.manifold.project(plant.dae.nominal_state)
+    own.SetPositions(context, state[: own.num_positions()])
+    tool = own.GetFrameByName("tool")
+    at = tool.CalcPoseInWorld(context)
+    if isinstance(form, HalfSpace):
+        normal = pose.rotation().matrix()[:, 2]
+    else:
+        normal = at.translation() - pose.translation()
+        normal /= np.linalg.norm(normal)
+    center = at.rotation().matrix().T @ normal * MATERIAL["radius"]
+    frame = drake.GetFrameByName("tool")
+    on_body = frame.GetFixedPoseInBodyFrame() @ RigidTransform(center)
+    body, world = frame.body(), drake.world_body()
+    both = [
+        drake.RegisterCollisionGeometry(body, on_body, Ball(0.01), "ball", properties),
+        drake.RegisterCollisionGeometry(world, pose, form, "solid", properties),
+    ]
+    every = scene.model_inspector().GetAllGeometryIds(Role.kProximity)
+    manager = scene.collision_filter_manager()
+    manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
+    allowed = (GeometrySet([one]) for one in both)
+    manager.Apply(CollisionFilterDeclaration().AllowBetween(*allowed))
+
+
+def near_contact(plant, count: int, seed: int):
+    """States in and near contact at speeds from a creep to a blow, and torques."""
+    random, size = np.random.default_rng(seed), plant.model.links.q.numel()
+    start = plant.structure.manifold.project(plant.dae.nominal_state)
+    for _ in range(count):
+        speed = random.choice([1e-5, 1e-3, 0.1])
+        change = np.concatenate([random.normal(0.0, 2e-4, size), random.normal(0.0, speed, size)])
+        yield start + change, random.normal(0.0, 20.0, size)
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
+    """To 1e-9 of the largest acceleration: both are a few thousand operations of round-off."""
+    both, pressed = pair(shape, 0.0), 0
+    context = both.plant.CreateDefaultContext()
+    for state, control in near_contact(both.plant, 100, 1):
+        both.plant.set_state(context, state)
+        both.plant.GetInputPort("control").FixValue(context, control)
+        found = both.plant.EvalTimeDerivatives(context).CopyToVector()
+        theirs = both.drake_context(state, control)
+        wanted = both.diagram.EvalTimeDerivatives(theirs).CopyToVector()
+        assert_allclose(found, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
+        pressed += both.plant.GetOutputPort("constraint_force").Eval(context)[0] > 1.0
+    assert 20 < pressed < 80
+
+
+@pytest.mark.parametrize("dissipation", [0.0, 2.0])
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+def test_a_step_is_that_of_a_discrete_multibody_plant(shape, dissipation):
+    """Its solver stops at a relative residual of 1e-6; without contact only round-off is left."""
+    both, pressed = pair(shape, 1e-3, dissipation), 0
+    size = both.plant.model.links.q.numel()
+    for state, control in near_contact(both.plant, 100, 2):
+        found, force = stepped(both.plant, state, control)
+        simulator = Simulator(both.diagram, both.drake_context(state, control))
+        simulator.AdvanceTo(0.5e-3)
+        own = both.drake.GetMyContextFromRoot(simulator.get_context())
+        wanted = both.drake.GetPositionsAndVelocities(own)
+        moved = np.abs(wanted[size:] - state[size:]).max()
+        limit = 1e-5 if force.any() else 1e-12
+        assert_allclose(found[size:], wanted[size:], rtol=0.0, atol=limit * moved)
+        assert_allclose(found[:size], wanted[:size], rtol=0.0, atol=1e-3 * limit * moved + 1e-15)
+        pressed += bool(force.any())
+    assert 20 < pressed < 80
+
+
+def stepped(plant, state, control):
+    """The state and the contact forces after a step."""
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, state)
+    plant.GetInputPort("control").FixValue(context, control)
+    simulator = Simulator(plant, context)
+    simulator.AdvanceTo(0.5 * plant.time_step)
+    return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
+
+
+def sled(stop: float = np.inf) -> RobotModel:
+    """A block that slides along x and z, on a floor at z = 0, pulled along x and pressed by u."""
+    plant = MultibodyPlant(0.0)
+    inertia = SpatialInertia(2.0, np.zeros(3), UnitInertia.SolidCube(0.1))
+    rail = plant.AddRigidBody("rail", SpatialInertia(0.1, np.zeros(3), UnitInertia.SolidCube(0.1)))
+    block = plant.AddRigidBody("block", inertia)
+    world = plant.world_frame()
+    along = PrismaticJoint("x", world, rail.body_frame(), [1.0, 0.0, 0.0], -np.inf, stop)
+    along = plant.AddJoint(along)
+    up = plant.AddJoint(PrismaticJoint("z", rail.body_frame(), block.body_frame(), [0, 0, 1.0]))
+    for joint in (along, up):
+        plant.AddJointActuator(f"{joint.name()}_motor", joint, 1e3)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+    plant.Finalize()
+    floor = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
+    contact = PointOnSurface("block", floor, name="floor", friction=0.5)
+    return RobotModel.from_multibody(plant, [contact], [], forces=[])
+
+
+def run_sled(time_step, pull, duration, **material):
+    """The state of the sled under a pull and a press of 10 N, after a time."""
+    plant = CompliantPlant(sled(), PointMaterial(time_step, stiffness=1e4, **material))
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([pull, -10.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_state(own, [0.0, -1e-3, 0.0, 0.0])  # Pressed in by 10 N / 1e4 N/m.
+    simulate(diagram, context, duration, fixed_step(1e-4))
+    return plant.state(own)
+
+
+def test_creep_at_half_the_friction_limit_tells_the_two_laws_apart():
+    """step5(s) = 1/2 at s = 1/2, and s / sqrt(1 + s^2) = 1/2 at 1 / sqrt(3).
+
+    After 0.1 s the start has decayed by e^-100 and more.
+    """
+    tolerance = 1e-3
+    for time_step, share in ((0.0, 0.5), (1e-4, 1.0 / np.sqrt(3.0))):
+        state = run_sled(time_step, 2.5, 0.1, stiction_tolerance=tolerance)
+        assert_allclose(state[2], share * tolerance, rtol=1e-8)
+
+
+def test_steps_tend_to_the_continuous_motion_at_first_order():
+    """Sliding at 1.5 times the limit, where both laws of friction are full from 0.1 s on."""
+    exact = 0.1 * (7.5 - 5.0) / 2.1
+    found = [run_sled(step, 7.5, 0.1)[2] - exact for step in (1e-3, 5e-4, 2.5e-4)]
+    for coarse, fine in pairwise(found):
+        assert 1.8 < coarse / fine < 2.2, found
+
+
+def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley():
+    """A falling sled, without dissipation, rises to where it fell from: energy is conserved.
+
+    Steps of 1e-5 s of RK5 leave 1e-6 of it.
+    """
+    plant = CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, friction=0.0))
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([0.0, -20.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_state(own, [0.0, 0.05, 0.0, 0.0])
+    fall = np.sqrt(2 * 0.05 / 10.0)
+    simulate(diagram, context, fall, fixed_step(1e-5))
+    assert_allclose(plant.state(own)[3], -np.sqrt(2 * 10.0 * 0.05), rtol=1e-6)
+    simulate(diagram, context, 0.1, fixed_step(1e-5))
+    state = plant.state(own)
+    assert state[3] > 0.0
+    energy = 0.5 * 2.0 * state[3] ** 2 + 20.0 * state[1]
+    assert_allclose(energy, 20.0 * 0.05, rtol=1e-5)
+
+
+@pytest.mark.parametrize("time_step", [0.0, 1e-3])
+def test_a_moving_floor_takes_the_sled_along(time_step):
+    """A floor at 0.2 m/s pulls the sled with mu N = 5 N until it is as fast, to within v_s."""
+    plant = CompliantPlant(
+        RobotModel(
+            sled().links,
+            [PointOnSurface("block", Plane([0, 0, 0], [0, 0, 1]), name="floor", friction=0.5)],
+            [],
+            forces=[],
+            exogenous=["floor.position"],
+        ),
+        PointMaterial(time_step, stiffness=1e4),
+    )
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([0.0, -10.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    layout = plant.exogenous_layout
+    moving = np.zeros(layout.reference_size)
+    moving[1] = 0.2  # x, x', ...
+    floor = builder.AddSystem(ConstantVectorSource(moving))
+    builder.Connect(floor.get_output_port(), plant.GetInputPort("exogenous"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_state(own, [0.0, -1e-3, 0.0, 0.0])
+    simulate(diagram, context, 0.05, fixed_step(1e-4))
+    assert_allclose(plant.state(own)[2], 0.05 * 5.0 / 2.1, rtol=0.03)
+    simulate(diagram, context, 0.2, fixed_step(1e-4))
+    assert_allclose(plant.state(own)[2], 0.2, atol=1e-4)
+
+
+def test_numbers_of_the_contact_change_in_a_context():
+    """As if the plant had been made with them."""
+    model = arm("two_link").model
+    plant = CompliantPlant(model, PointMaterial(friction=0.2))
+    other = PointMaterial(friction=0.6, stiffness=3e4, radius=0.02)
+    made = CompliantPlant(model, other)
+    context = plant.CreateDefaultContext()
+    plant.set_contact(context, other)
+    wanted = made.CreateDefaultContext().get_numeric_parameter(0).value()
+    np.testing.assert_array_equal(context.get_numeric_parameter(0).value(), wanted)
+    with pytest.raises(ModelError, match="may change"):
+        plant.set_contact(context, PointMaterial(time_step=0.0, friction=0.6))
+
+
+def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
+    """The sled slides up to the stop of its rail."""
+    plant = CompliantPlant(sled(stop=0.2), PointMaterial(1e-3, stiffness=1e4))
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([6.0, -10.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_state(own, [0.0, -1e-3, 0.5, 0.0])
+    with pytest.raises(SimulationError, match=r"joint reaches its limit.*!MultibodyPlant") as found:
+        simulate(diagram, context, 1.0)
+    assert 0.15 < found.value.state[0] < 0.2
+    assert 0.0 < found.value.time < 1.0
+
+
+def test_a_constraint_that_is_no_contact_is_refused():
+    links = arm("two_link").model.links
+    pin = CoincidentPoints("world", (1.2, 0.0, 0.0), "tool", (0.0, 0.0, 0.0), "x")
+    model = RobotModel(links, [pin], [PointCoordinates("tool", "z")])
+    with pytest.raises(ModelError, match="no contact of a point with a surface"):
+        CompliantPlant(model, PointMaterial())
+
+
+def test_gains_of_a_continuous_contact_need_a_period():
+    found = scenario(
+        "wall_point_contact", "plant=!CompliantContact {time_step: 0}", "sampling=null"
+    )
+    with pytest.raises(ScenarioError, match="or a sampling"):
+        run_scenario(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wall_point_contact", "wall_flexible_contact"])
+def test_a_run_of_a_shipped_scenario_is_that_of_drakes_plant(name):
+    """What Drake's solver leaves, 1e-6 of each step's change, stays so small in a closed loop.
+
+    The law's gains, 16 1/s for positions, forget it.
+    """
+    drakes = scenario(name, "duration=0.5")
+    _, _, wanted = run_scenario(drakes)
+    own = replace(drakes, plant=drakes.plant.rolled)
+    _, _, found = run_scenario(own)
+    assert_allclose(found["state"], wanted["state"], atol=1e-5)
+    assert_allclose(found["constraint_force"], wanted["constraint_force"], atol=2e-3)
+    loop, context = build_scenario(own)
+    (run,) = rollout(loop, *start_values(loop, context), found.time)
+    assert run.failure is None
+    for signal in ("state", "contact_force", "control"):
+        assert_allclose(run.record[signal], found[signal], atol=1e-9, err_msg=signal)
