@@ -44,6 +44,7 @@ PURE = {
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),
     ("!MeasuredForce", "gain"),
+    ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),
     ("SimulatorConfig", "accuracy"),

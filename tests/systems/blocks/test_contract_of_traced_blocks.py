@@ -11,10 +11,12 @@ from problems import PROBLEMS
 from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
+    CompliantPlant,
     DaePlant,
     DisturbanceObserver,
     ForceSensor,
     Observing,
+    PointMaterial,
     ReferenceGenerator,
     RobotModel,
     RobotPlant,
@@ -85,6 +87,13 @@ BLOCKS = {
     "RobotPlant with springs": lambda: robot("flexible"),
     "RobotPlant with motors": lambda: robot("motor"),
     "RobotPlant with hydraulic servos": lambda: robot("hydraulic"),
+    "CompliantPlant": lambda: CompliantPlant(arm("two_link").model, PointMaterial(0.01)),
+    "CompliantPlant that is continuous": lambda: CompliantPlant(
+        arm("two_link").model, PointMaterial(0.0, dissipation=1.0)
+    ),
+    "CompliantPlant with springs": lambda: CompliantPlant(
+        actuated("two_link", "flexible").model, PointMaterial(0.01, friction=0.3)
+    ),
     "ReferenceGenerator": references,
     "TrackingController": lambda: TrackingController(law("two_link")),
     "TrackingController that knows its references": lambda: TrackingController(
@@ -175,7 +184,8 @@ def test_outputs_derivatives_and_updates_are_those_of_the_block(name):
         simulator.Initialize()
         simulator.AdvancePendingEvents()
         own = system.GetMyContextFromRoot(simulator.get_context())
-        assert_same(held, own.get_discrete_state(0).value())
+        groups = range(own.num_discrete_state_groups())
+        assert_same(held, np.concatenate([own.get_discrete_state(i).value() for i in groups]))
 
 
 @pytest.mark.parametrize("name", BLOCKS)

@@ -13,10 +13,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_dae import (
+    CompliantPlant,
     ConstantReference,
     ContactMaterial,
     ContactPlant,
     DaePlant,
+    PointMaterial,
     RobotPlant,
     TrackingLaw,
     UnilateralRobotPlant,
@@ -62,6 +64,12 @@ MEMBERS = {
         arm("two_link").model, {"wall": 0.0}, structure=arm("two_link").structure
     ),
     "contact": contact,
+    "compliant": lambda: CompliantPlant(
+        arm("two_link").model, PointMaterial(), structure=arm("two_link").structure
+    ),
+    "compliant, continuous": lambda: CompliantPlant(
+        arm("two_link").model, PointMaterial(0.0), structure=arm("two_link").structure
+    ),
     "springy": lambda: SpringyPlant(arm("two_link").model, arm("two_link").structure),
 }
 

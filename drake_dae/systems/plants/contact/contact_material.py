@@ -83,7 +83,6 @@ class ContactMaterial(PointMaterial):
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer, m; hydroelastic contact only.
-        stiffness, dissipation, friction, stiction_tolerance, radius: As for `PointMaterial`.
 
     Raises:
         ModelError: A number makes no sense.
