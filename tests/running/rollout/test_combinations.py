@@ -39,6 +39,8 @@ PLANTS = {
     "ideal": "",
     "opening": "plant: !Unilateral {restitution: {wall: 0.5}}\n",
     "Drake's contact": "plant: !MultibodyPlant {time_step: 0.001}\n",
+    "compliant": "plant: !CompliantContact {time_step: 0.001}\n",
+    "continuous": "plant: !CompliantContact {time_step: 0, stiffness: 1.0e+4}\n",
 }
 REFERENCES = """gains: {all: [-10]}
 references:
@@ -70,7 +72,7 @@ CASES = list(product(*PARTS))
 @pytest.mark.parametrize(
     "names",
     [
-        pytest.param(names, marks=[] if index % 7 == 0 else [pytest.mark.thorough])
+        pytest.param(names, marks=[] if index % 11 == 0 else [pytest.mark.thorough])
         for index, names in enumerate(CASES)
     ],
     ids=", ".join,
