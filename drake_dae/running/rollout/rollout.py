@@ -19,9 +19,11 @@ from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.problems import checked_times, problems_of
+from drake_dae.running.rollout.lanes import library as lanes
+from drake_dae.running.rollout.lanes.batch import run_many
+from drake_dae.running.rollout.problems import Problems, checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
-from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
+from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.fused import Fused
 from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
@@ -30,6 +32,12 @@ from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
 STAGES_PER_SECOND = 500
 """About so many evaluations takes a simulated second under error control."""
+
+SEVERAL = 8
+"""So many runs go side by side, and fewer after each other: then these have the same bits as one."""
+
+FASTER = 0.05
+"""What runs side by side save of each evaluation, in the times of one that is interpreted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +130,7 @@ def run_loop(
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
-    look: Callable[[RecordAfter], bool] = lambda record: False,
+    look: Callable[[RecordAfter], bool] | None = None,
 ) -> list[Rollout]:
     """`rollout`, where these runs may be some of many, and may be stopped.
 
@@ -141,30 +149,38 @@ def run_loop(
     moments = checked_times(times)
 
     def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+        if look is None:
+            return False
         return look(lambda after: _record(program, moments, rows(), after, context))
 
     settings = Settings.of(config, program.compiled.scale, looked)
     problems = problems_of(program, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
-    kinds = [program.compiled.has_twins(problem.parameters) for problem in problems]
+    has_twins = problems.with_twins()
     found: dict[int, Rollout] = {}
-    for kind in set(kinds):
-        chosen = [index for index, each in enumerate(kinds) if each is kind]
-        own = program.twins if kind else program
+    for kind in set(has_twins.tolist()):
+        chosen = np.flatnonzero(has_twins == kind)
+        own, some = program.twins if kind else program, problems.chosen(chosen)
         code = _machine_code(own, choice, settings, seconds, look=lasting is None)
-        runs = _runs(own, [problems[index] for index in chosen], settings, code)
-        for index, run in zip(chosen, runs, strict=True):
-            found[index] = _result(program, problems[index], run)
+        side_by_side = None
+        if code is not None and look is None and len(some) >= SEVERAL:
+            side_by_side = _lanes(own, choice, settings, seconds, look=lasting is None)
+        runs = _runs(own, some, settings, code, side_by_side)
+        for index, run in zip(chosen.tolist(), runs, strict=True):
+            found[index] = _result(program, problems, index, run)
     return [found[index] for index in range(len(problems))]
 
 
 def _runs(
     program: Program,
-    problems: Sequence[Problem],
+    problems: Problems,
     settings: Settings,
     code: machine.Library | None,
+    side_by_side: machine.Library | None,
 ) -> list[Run]:
-    """What runs come to, by machine code if there is any."""
+    """What runs come to, by machine code if there is any, and side by side if they can."""
+    if code is not None and side_by_side is not None:
+        return run_many(side_by_side, code, program, problems, settings)
     if code is None or program.compiled.changes or program.compiled.has_stepped:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
@@ -175,10 +191,10 @@ def _runs(
     if program.compiled.has_stepped:
         run = partial(run_beside, fused, code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:
-        return [run(problem) for problem in problems]
+        return [run(problems[index]) for index in range(len(problems))]
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:
-        return list(pool.map(run, problems))
+        return list(pool.map(lambda index: run(problems[index]), range(len(problems))))
 
 
 def _machine_code(
@@ -196,24 +212,42 @@ def _machine_code(
         return None
     if program.library is not None:
         return program.library
-    make = True
-    if compiled == "auto":
-        stages = STAGES_PER_SECOND
-        if settings.tableau is not None:
-            stages = int(len(settings.tableau.b) / settings.longest)
-        pays = attempts("auto", program.num_operations)
-        make = any(each.make and stages * seconds >= each.calls for each in pays)
-        if not (make or look):
-            return None
+    pays = attempts("auto", program.num_operations)
+    stages = _stages(settings, seconds)
+    make = compiled is True or any(each.make and stages >= each.calls for each in pays)
+    if not (make or look):
+        return None
     program.library = machine.load(program, compiled, make)
     return program.library
 
 
-def _result(program: Program, problem: Problem, run: Run) -> Rollout:
+def _lanes(
+    program: Program, compiled: Compiled, settings: Settings, seconds: float, look: bool
+) -> machine.Library | None:
+    """A diagram as machine code for runs side by side, by the choice as `_machine_code`."""
+    if not program.kept("can run side by side", lambda: lanes.can_run(program)):
+        return None
+    calls = _stages(settings, seconds) * FASTER
+    make = compiled is True or any(
+        each.make and calls >= each.calls for each in attempts("auto", program.num_operations)
+    )
+    if not (make or look):
+        return None
+    return program.kept(f"lanes {make}", lambda: lanes.load(program, compiled, make))
+
+
+def _stages(settings: Settings, seconds: float) -> float:
+    """About how often runs evaluate the derivative."""
+    if settings.tableau is None:
+        return STAGES_PER_SECOND * seconds
+    return len(settings.tableau.b) / settings.longest * seconds
+
+
+def _result(program: Program, problems: Problems, index: int, run: Run) -> Rollout:
     failure = None
     if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
-        failure = failure_of(program, problem, run)
-    return Rollout(run.steps, failure, program, problem.times, run.rows, run.context)
+        failure = failure_of(program, problems[index], run)
+    return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)
 
 
 def _record(
