@@ -187,8 +187,16 @@ def problems_of(
     for system, part in compiled.held:
         if system in drawn:
             held[:, part] = noise[:, 0, drawn[system]]
-    tables = (np.ascontiguousarray(each) for each in (states[:, :size], held, given))
-    found = Problems(compiled, times, *tables, *events, np.ascontiguousarray(noise[:, 1:]))
+    found = Problems(
+        compiled,
+        times,
+        np.ascontiguousarray(states[:, :size]),
+        held,
+        np.ascontiguousarray(given),
+        events.times,
+        events.due,
+        np.ascontiguousarray(noise[:, 1:]),
+    )
     found.check()
     return found
 

@@ -34,7 +34,7 @@ STAGES_PER_SECOND = 500
 """About so many evaluations takes a simulated second under error control."""
 
 SEVERAL = 8
-"""So many runs go side by side, and fewer after each other: then these have the same bits as one."""
+"""So many runs go side by side; fewer go one after the other, with the bits of a single one."""
 
 FASTER = 0.05
 """What runs side by side save of each evaluation, in the times of one that is interpreted."""
