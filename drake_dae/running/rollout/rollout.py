@@ -20,7 +20,7 @@ from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.lanes import library as lanes
-from drake_dae.running.rollout.lanes.batch import run_many
+from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
 from drake_dae.running.rollout.problems import Problems, checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
@@ -35,6 +35,9 @@ STAGES_PER_SECOND = 500
 
 SEVERAL = 8
 """So many runs go side by side; fewer go one after the other, with the bits of a single one."""
+
+USUAL = 20_000
+"""More steps than a run of a study takes, unless it diverges."""
 
 FASTER = 0.05
 """What runs side by side save of each evaluation, in the times of one that is interpreted."""
@@ -141,34 +144,138 @@ def run_loop(
         look: Called now and then with a function from a time in s, or None, to what a run has
             recorded later; whether to stop where it is. Its record goes up to there.
     """
-    config = config or SimulatorConfig()
-    check_config(config)
-    program = program_of(loop)
-    choice: Compiled = program.choice if compiled is None else compiled
-    check_choice("rollout", choice)
-    moments = checked_times(times)
-
-    def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
-        if look is None:
-            return False
-        return look(lambda after: _record(program, moments, rows(), after, context))
-
-    settings = Settings.of(config, program.compiled.scale, looked)
-    problems = problems_of(program, starts, parameters, moments, seeds)
-    seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
-    has_twins = problems.with_twins()
+    asked = _Asked.of(loop, times, config, compiled, lasting, look)
+    program = asked.program
+    problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: dict[int, Rollout] = {}
-    for kind in set(has_twins.tolist()):
-        chosen = np.flatnonzero(has_twins == kind)
-        own, some = program.twins if kind else program, problems.chosen(chosen)
-        code = _machine_code(own, choice, settings, seconds, look=lasting is None)
+    for own, chosen in _kinds(program, problems):
+        some = problems.chosen(chosen)
+        code = asked.machine_code(own, len(problems))
         side_by_side = None
         if code is not None and look is None and len(some) >= SEVERAL:
-            side_by_side = _lanes(own, choice, settings, seconds, look=lasting is None)
-        runs = _runs(own, some, settings, code, side_by_side)
+            side_by_side = asked.lanes(own, len(problems))
+        runs = _runs(own, some, asked.settings, code, side_by_side)
         for index, run in zip(chosen.tolist(), runs, strict=True):
             found[index] = _result(program, problems, index, run)
     return [found[index] for index in range(len(problems))]
+
+
+def run_together(
+    loop: ClosedLoop,
+    starts: ArrayLike,
+    parameters: ArrayLike,
+    times: ArrayLike,
+    *,
+    config: SimulatorConfig,
+    seeds: Sequence[Seed],
+    lasting: float,
+) -> list[Rollout | None]:
+    """What `run_loop` returns, of runs that come to their end side by side in a usual time.
+
+    Returns:
+        A run for each start; None for one that fails, that takes more than `USUAL` steps, or whose
+        loop has no such machine code. These are left to `run_loop`.
+
+    Raises:
+        InconsistentStateError: A start is not on N*.
+    """
+    asked = _Asked.of(loop, times, config, None, lasting)
+    program = asked.program
+    problems = problems_of(program, starts, parameters, asked.times, seeds)
+    found: list[Rollout | None] = [None] * len(problems)
+    for own, chosen in _kinds(program, problems):
+        side_by_side = asked.lanes(own, len(problems)) if asked.machine_code(own, 1) else None
+        if side_by_side is None:
+            continue
+        runs = run_briefly(side_by_side, own, problems.chosen(chosen), asked.settings, USUAL)
+        for index, run in zip(chosen.tolist(), runs, strict=True):
+            found[index] = _result(program, problems, index, run) if run is not None else None
+    return found
+
+
+def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarray]]:
+    """The runs in which plant and law have the same numbers, and the others; each its program."""
+    has_twins = problems.with_twins()
+    kinds = (program.twins if kind else program for kind in (True, False))
+    places = (np.flatnonzero(has_twins == kind) for kind in (True, False))
+    return [each for each in zip(kinds, places, strict=True) if each[1].size]
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """How runs are made, as `run_loop` is asked.
+
+    Attributes:
+        program: What is run.
+        times: When rows are written, in s.
+        choice: Whether to make machine code.
+        settings: How to step.
+        lasting: As of `run_loop`.
+    """
+
+    program: Program
+    times: FloatArray
+    choice: Compiled
+    settings: Settings
+    lasting: float | None
+
+    @classmethod
+    def of(
+        cls,
+        loop: ClosedLoop | Diagram,
+        times: ArrayLike,
+        config: SimulatorConfig | None,
+        compiled: Compiled | None,
+        lasting: float | None,
+        look: Callable[[RecordAfter], bool] | None = None,
+    ) -> Self:
+        config = config or SimulatorConfig()
+        check_config(config)
+        program = program_of(loop)
+        choice: Compiled = program.choice if compiled is None else compiled
+        check_choice("rollout", choice)
+        moments = checked_times(times)
+
+        def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+            if look is None:
+                return False
+            return look(lambda after: _record(program, moments, rows(), after, context))
+
+        settings = Settings.of(config, program.compiled.scale, looked)
+        return cls(program, moments, choice, settings, lasting)
+
+    def machine_code(self, program: Program, count: int) -> machine.Library | None:
+        """A diagram as machine code, by the choice and by what its runs take without.
+
+        Where it does not pay to make it, the cache is looked into if these runs are all.
+        """
+        if self.choice is False:
+            return None
+        if program.library is None and self._is_sought(program, count, 1.0):
+            program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
+        return program.library
+
+    def lanes(self, program: Program, count: int) -> machine.Library | None:
+        """The same for runs side by side."""
+        can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
+        if not can_run or not self._is_sought(program, count, FASTER):
+            return None
+        make = self._pays(program, count, FASTER)
+        return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
+
+    def _is_sought(self, program: Program, count: int, saved: float) -> bool:
+        return self.lasting is None or self._pays(program, count, saved)
+
+    def _pays(self, program: Program, count: int, saved: float) -> bool:
+        """Whether to make machine code that saves a part of each interpreted evaluation."""
+        if self.choice is True:
+            return True
+        seconds = count * float(np.ptp(self.times)) if self.lasting is None else self.lasting
+        calls = STAGES_PER_SECOND * seconds
+        if self.settings.tableau is not None:
+            calls = len(self.settings.tableau.b) / self.settings.longest * seconds
+        pays = attempts("auto", program.num_operations)
+        return any(each.make and saved * calls >= each.calls for each in pays)
 
 
 def _runs(
@@ -195,52 +302,6 @@ def _runs(
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:
         return list(pool.map(lambda index: run(problems[index]), range(len(problems))))
-
-
-def _machine_code(
-    program: Program,
-    compiled: Compiled,
-    settings: Settings,
-    seconds: float,
-    look: bool = True,
-) -> machine.Library | None:
-    """A diagram as machine code, by the choice and by what its runs take without.
-
-    Where it does not pay to make it, the cache is looked into if `look` says so.
-    """
-    if compiled is False:
-        return None
-    if program.library is not None:
-        return program.library
-    pays = attempts("auto", program.num_operations)
-    stages = _stages(settings, seconds)
-    make = compiled is True or any(each.make and stages >= each.calls for each in pays)
-    if not (make or look):
-        return None
-    program.library = machine.load(program, compiled, make)
-    return program.library
-
-
-def _lanes(
-    program: Program, compiled: Compiled, settings: Settings, seconds: float, look: bool
-) -> machine.Library | None:
-    """A diagram as machine code for runs side by side, by the choice as `_machine_code`."""
-    if not program.kept("can run side by side", lambda: lanes.can_run(program)):
-        return None
-    calls = _stages(settings, seconds) * FASTER
-    make = compiled is True or any(
-        each.make and calls >= each.calls for each in attempts("auto", program.num_operations)
-    )
-    if not (make or look):
-        return None
-    return program.kept(f"lanes {make}", lambda: lanes.load(program, compiled, make))
-
-
-def _stages(settings: Settings, seconds: float) -> float:
-    """About how often runs evaluate the derivative."""
-    if settings.tableau is None:
-        return STAGES_PER_SECOND * seconds
-    return len(settings.tableau.b) / settings.longest * seconds
 
 
 def _result(program: Program, problems: Problems, index: int, run: Run) -> Rollout:

@@ -1,7 +1,6 @@
 """Many runs side by side: what C is given, and what comes back."""
 
 import ctypes
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -47,65 +46,98 @@ def run_many(
         problems: What to run.
         settings: How to step; nothing looks at these runs while they go on.
     """
-    count, num_rows = len(problems), problems.times.size
-    states, held = problems.states.copy(), problems.held.copy()
-    rows = np.empty((count, num_rows, program.width))
-    runs, endings = (RunState * count)(), np.zeros(count, dtype=np.intc)
-    following = np.zeros(1, dtype=np.longlong)
-    a, b, c = settings.tableau or (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
-    arrays: dict[str, Any] = {
-        "states": states,
-        "held": held,
-        "parameters": problems.parameters,
-        "noise": problems.noise,
-        "times": problems.times,
-        "events": problems.events,
-        "due": problems.due,
-        "rows": rows,
-        "a": a,
-        "b": b,
-        "c": c,
-        "absolute": settings.absolute,
-        "endings": endings,
-        "next": following,
-    }
-    batch = _Batch(
-        num_runs=count,
-        most=ENDLESS,
-        parameter_step=_row(problems.parameters),
-        noise_step=_row(problems.noise),
-        num_rows=num_rows,
-        num_events=problems.events.size,
-        stages=b.size,
-        longest=settings.longest,
-        relative=settings.relative,
-        runs=ctypes.addressof(runs),
-        **{name: array.ctypes.data for name, array in arrays.items()},
-    )
-    _run(lanes, batch, following)
+    many = _Many(lanes, program, problems, settings, ENDLESS)
 
-    def result(index: int) -> Run:
-        own = runs[index]
-        if not endings[index]:
-            given = own.time, states[index], held[index], own.event, own.steps, own.before
-            return Run(rows[index], Ending.DONE, *given, own.next, np.inf, _NOWHERE)
-        problem = problems[index]
-        return go_on(code, problem, settings, own, states[index], held[index], rows[index])
+    def go_on_with(index: int) -> Run:
+        own, rows = many.runs[index], many.rows[index]
+        states, held = many.states[index], many.held[index]
+        return go_on(code, problems[index], settings, own, states, held, rows)
 
-    return _each(result, range(count), endings)
+    others = np.flatnonzero(many.endings).tolist()
+    found = {}
+    if others:
+        with ThreadPoolExecutor(num_cores()) as pool:
+            found = dict(zip(others, pool.map(go_on_with, others), strict=True))
+    return [found.get(index) or many.done(index) for index in range(len(problems))]
+
+
+def run_briefly(
+    lanes: Library, program: Program, problems: Problems, settings: Settings, most: int
+) -> list[Run | None]:
+    """The same of runs that come to their end side by side; None for the others.
+
+    Args:
+        lanes, program, problems, settings: As of `run_many`.
+        most: A run that takes more steps is none of them.
+    """
+    many = _Many(lanes, program, problems, settings, most)
+    return [
+        None if ending else many.done(index) for index, ending in enumerate(many.endings.tolist())
+    ]
+
+
+class _Many:
+    """Runs that went side by side.
+
+    Attributes:
+        runs, endings: Where each ended, and whether it is to go on elsewhere, as lanes.c has it.
+        states, held: What it came to.
+        rows: The rows of its record, shape (k, j, width).
+    """
+
+    def __init__(
+        self,
+        lanes: Library,
+        program: Program,
+        problems: Problems,
+        settings: Settings,
+        most: int,
+    ) -> None:
+        count, num_rows = len(problems), problems.times.size
+        self.states, self.held = problems.states.copy(), problems.held.copy()
+        self.rows = np.empty((count, num_rows, program.width))
+        self.runs, self.endings = (RunState * count)(), np.zeros(count, dtype=np.intc)
+        following = np.zeros(1, dtype=np.longlong)
+        a, b, c = settings.tableau or (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
+        arrays: dict[str, Any] = {
+            "states": self.states,
+            "held": self.held,
+            "parameters": problems.parameters,
+            "noise": problems.noise,
+            "times": problems.times,
+            "events": problems.events,
+            "due": problems.due,
+            "rows": self.rows,
+            "a": a,
+            "b": b,
+            "c": c,
+            "absolute": settings.absolute,
+            "endings": self.endings,
+            "next": following,
+        }
+        batch = _Batch(
+            num_runs=count,
+            most=most,
+            parameter_step=_row(problems.parameters),
+            noise_step=_row(problems.noise),
+            num_rows=num_rows,
+            num_events=problems.events.size,
+            stages=b.size,
+            longest=settings.longest,
+            relative=settings.relative,
+            runs=ctypes.addressof(self.runs),
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        _run(lanes, batch, following)
+
+    def done(self, index: int) -> Run:
+        """A run that has come to its end."""
+        own = self.runs[index]
+        given = own.time, self.states[index], self.held[index], own.event, own.steps, own.before
+        return Run(self.rows[index], Ending.DONE, *given, own.next, np.inf, _NOWHERE)
 
 
 _NOWHERE = np.zeros(0)
-
-
-def _each(result: Any, indices: Sequence[int], endings: np.ndarray) -> list[Run]:
-    """What runs came to; those that are handed over go on, on all cores."""
-    found = {}
-    others = np.flatnonzero(endings).tolist()
-    if others:
-        with ThreadPoolExecutor(num_cores()) as pool:
-            found = dict(zip(others, pool.map(result, others), strict=True))
-    return [found[i] if i in found else result(i) for i in indices]
 
 
 def _run(lanes: Library, batch: _Batch, following: np.ndarray) -> None:
