@@ -26,7 +26,7 @@ from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.fused import Fused
-from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
+from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
@@ -324,7 +324,7 @@ def _record(
     stops = np.cumsum([len(signals) for signals in columns.values()])
     parts = np.split(rows[first:], stops[:-1], axis=1)
     signals = {
-        name: Recorded(part, tuple(columns[name]))
+        name: recorded_values(part, tuple(columns[name]))
         for name, part in zip(columns, parts, strict=True)
     }
     return program.complete(Record(times[first : len(rows)], signals), context)
