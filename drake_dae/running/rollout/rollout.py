@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,32 +15,26 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running.rollout.asked import Asked, record_of
 from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.lanes import library as lanes
 from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
-from drake_dae.running.rollout.problems import Problems, checked_times, problems_of
-from drake_dae.running.rollout.program import Program, program_of
+from drake_dae.running.rollout.lanes.device import find_device, run_on_device
+from drake_dae.running.rollout.problems import Problems, problems_of
+from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.fused import Fused
-from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
-from drake_dae.simulation.simulate import check_config
-from drake_dae.trace.compiled import Compiled, attempts, check_choice
-
-STAGES_PER_SECOND = 500
-"""About so many evaluations takes a simulated second under error control."""
+from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.trace.compiled import Compiled
 
 SEVERAL = 8
 """So many runs go side by side; fewer go one after the other, with the bits of a single one."""
 
 USUAL = 20_000
 """More steps than a run of a study takes, unless it diverges."""
-
-FASTER = 0.05
-"""What runs side by side save of each evaluation, in the times of one that is interpreted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +58,7 @@ class Rollout:
     @cached_property
     def record(self) -> Record:
         """Its signals at the given times, up to where it came."""
-        return _record(self._program, self._times, self._rows, context=self.context)
+        return record_of(self._program, self._times, self._rows, context=self.context)
 
     def ended(self, failure: SimulationError) -> Self:
         """The same where it ended with a failure; its record goes up to the failure's time."""
@@ -82,6 +76,7 @@ def rollout(
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> list[Rollout]:
     """Runs a diagram from one start or from thousands, without Drake, on all cores.
 
@@ -109,18 +104,22 @@ def rollout(
             for a diagram. "auto" makes it if that pays for the runs at hand.
         seeds: The seed of the noise in each run, or name of a RandomSource -> its seed, for several
             of them; the same noise for all if None.
+        device: "cuda" runs them on an NVIDIA GPU, by CuPy, one in each thread; those that fail, or
+            that need more than the usual Newton steps, go on here.
 
     Returns:
         A run for each start. One that fails has its failure, and its record up to there.
 
     Raises:
-        ModelError: Arguments have wrong shapes, or a block cannot be traced: its name and why.
+        ModelError: Arguments have wrong shapes, or a block cannot be traced: its name and why; or
+            there is no GPU, or the diagram does not run on it.
         InconsistentStateError: A start is not on N*.
 
     Warns:
         MachineCodeWarning: Machine code should be made and cannot be.
     """
-    return run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
+    settings: dict[str, Any] = {"config": config, "compiled": compiled, "seeds": seeds}
+    return run_loop(loop, starts, parameters, times, **settings, on_device=device == "cuda")
 
 
 def run_loop(
@@ -134,6 +133,7 @@ def run_loop(
     seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] | None = None,
+    on_device: bool = False,
 ) -> list[Rollout]:
     """`rollout`, where these runs may be some of many, and may be stopped.
 
@@ -143,8 +143,11 @@ def run_loop(
             these are all.
         look: Called now and then with a function from a time in s, or None, to what a run has
             recorded later; whether to stop where it is. Its record goes up to there.
+        on_device: Whether they run on a GPU.
     """
-    asked = _Asked.of(loop, times, config, compiled, lasting, look)
+    if on_device:
+        find_device()
+    asked = Asked.of(loop, times, config, compiled, lasting, look)
     program = asked.program
     problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: dict[int, Rollout] = {}
@@ -152,6 +155,12 @@ def run_loop(
         some = problems.chosen(chosen)
         code = asked.machine_code(own, len(problems))
         side_by_side = None
+        if on_device:
+            many = run_on_device(own, some, asked.settings)
+            go_on = partial(machine.go_on, code) if code else _interpreted(own, asked.settings)
+            for index, run in zip(chosen.tolist(), many.ended(go_on, 1), strict=True):
+                found[index] = _result(program, problems, index, run)
+            continue
         if code is not None and look is None and len(some) >= SEVERAL:
             side_by_side = asked.lanes(own, len(problems))
         runs = _runs(own, some, asked.settings, code, side_by_side)
@@ -179,7 +188,7 @@ def run_together(
     Raises:
         InconsistentStateError: A start is not on N*.
     """
-    asked = _Asked.of(loop, times, config, None, lasting)
+    asked = Asked.of(loop, times, config, None, lasting)
     program = asked.program
     problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: list[Rollout | None] = [None] * len(problems)
@@ -201,81 +210,10 @@ def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarr
     return [each for each in zip(kinds, places, strict=True) if each[1].size]
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """How runs are made, as `run_loop` is asked.
-
-    Attributes:
-        program: What is run.
-        times: When rows are written, in s.
-        choice: Whether to make machine code.
-        settings: How to step.
-        lasting: As of `run_loop`.
-    """
-
-    program: Program
-    times: FloatArray
-    choice: Compiled
-    settings: Settings
-    lasting: float | None
-
-    @classmethod
-    def of(
-        cls,
-        loop: ClosedLoop | Diagram,
-        times: ArrayLike,
-        config: SimulatorConfig | None,
-        compiled: Compiled | None,
-        lasting: float | None,
-        look: Callable[[RecordAfter], bool] | None = None,
-    ) -> Self:
-        config = config or SimulatorConfig()
-        check_config(config)
-        program = program_of(loop)
-        choice: Compiled = program.choice if compiled is None else compiled
-        check_choice("rollout", choice)
-        moments = checked_times(times)
-
-        def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
-            if look is None:
-                return False
-            return look(lambda after: _record(program, moments, rows(), after, context))
-
-        settings = Settings.of(config, program.compiled.scale, looked)
-        return cls(program, moments, choice, settings, lasting)
-
-    def machine_code(self, program: Program, count: int) -> machine.Library | None:
-        """A diagram as machine code, by the choice and by what its runs take without.
-
-        Where it does not pay to make it, the cache is looked into if these runs are all.
-        """
-        if self.choice is False:
-            return None
-        if program.library is None and self._is_sought(program, count, 1.0):
-            program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
-        return program.library
-
-    def lanes(self, program: Program, count: int) -> machine.Library | None:
-        """The same for runs side by side."""
-        can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
-        if not can_run or not self._is_sought(program, count, FASTER):
-            return None
-        make = self._pays(program, count, FASTER)
-        return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
-
-    def _is_sought(self, program: Program, count: int, saved: float) -> bool:
-        return self.lasting is None or self._pays(program, count, saved)
-
-    def _pays(self, program: Program, count: int, saved: float) -> bool:
-        """Whether to make machine code that saves a part of each interpreted evaluation."""
-        if self.choice is True:
-            return True
-        seconds = count * float(np.ptp(self.times)) if self.lasting is None else self.lasting
-        calls = STAGES_PER_SECOND * seconds
-        if self.settings.tableau is not None:
-            calls = len(self.settings.tableau.b) / self.settings.longest * seconds
-        pays = attempts("auto", program.num_operations)
-        return any(each.make and saved * calls >= each.calls for each in pays)
+def _interpreted(program: Program, settings: Settings) -> Callable[..., Run]:
+    """What runs a problem from its start, whatever it came to elsewhere."""
+    run = interpreted.runner(program.kept("fused", lambda: Fused(program)), settings)
+    return lambda problem, *given: run(problem)
 
 
 def _runs(
@@ -309,22 +247,3 @@ def _result(program: Program, problems: Problems, index: int, run: Run) -> Rollo
     if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
         failure = failure_of(program, problems[index], run)
     return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)
-
-
-def _record(
-    program: Program,
-    times: FloatArray,
-    rows: FloatArray,
-    after: float | None = None,
-    context: Context | None = None,
-) -> Record:
-    """The rows of a run as a record, or those that are later than a time in s."""
-    first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
-    columns = program.signals
-    stops = np.cumsum([len(signals) for signals in columns.values()])
-    parts = np.split(rows[first:], stops[:-1], axis=1)
-    signals = {
-        name: recorded_values(part, tuple(columns[name]))
-        for name, part in zip(columns, parts, strict=True)
-    }
-    return program.complete(Record(times[first : len(rows)], signals), context)

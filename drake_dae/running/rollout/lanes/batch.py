@@ -1,7 +1,9 @@
 """Many runs side by side: what C is given, and what comes back."""
 
 import ctypes
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,19 +48,9 @@ def run_many(
         problems: What to run.
         settings: How to step; nothing looks at these runs while they go on.
     """
-    many = _Many(lanes, program, problems, settings, ENDLESS)
-
-    def go_on_with(index: int) -> Run:
-        own, rows = many.runs[index], many.rows[index]
-        states, held = many.states[index], many.held[index]
-        return go_on(code, problems[index], settings, own, states, held, rows)
-
-    others = np.flatnonzero(many.endings).tolist()
-    found = {}
-    if others:
-        with ThreadPoolExecutor(num_cores()) as pool:
-            found = dict(zip(others, pool.map(go_on_with, others), strict=True))
-    return [found.get(index) or many.done(index) for index in range(len(problems))]
+    many = Many(program, problems, settings, ENDLESS)
+    _run(lanes, many)
+    return many.ended(partial(go_on, code), num_cores())
 
 
 def run_briefly(
@@ -70,85 +62,112 @@ def run_briefly(
         lanes, program, problems, settings: As of `run_many`.
         most: A run that takes more steps is none of them.
     """
-    many = _Many(lanes, program, problems, settings, most)
-    return [
-        None if ending else many.done(index) for index, ending in enumerate(many.endings.tolist())
-    ]
+    many = Many(program, problems, settings, most)
+    _run(lanes, many)
+    endings = many.arrays["endings"].tolist()
+    return [None if ending else many.done(index) for index, ending in enumerate(endings)]
 
 
-class _Many:
-    """Runs that went side by side.
+class Many:
+    """Runs that go side by side.
+
+    Args:
+        program: The diagram.
+        problems: What to run.
+        settings: How to step.
+        most: A run that takes more steps is to go on elsewhere.
 
     Attributes:
-        runs, endings: Where each ended, and whether it is to go on elsewhere, as lanes.c has it.
-        states, held: What it came to.
-        rows: The rows of its record, shape (k, j, width).
+        arrays: What C reads and writes, by the names that lanes.c has: of each run "runs", where it
+            is, "endings", whether it is to go on elsewhere, "states", "held", and "rows", shape
+            (k, j, width).
     """
 
-    def __init__(
-        self,
-        lanes: Library,
-        program: Program,
-        problems: Problems,
-        settings: Settings,
-        most: int,
-    ) -> None:
-        count, num_rows = len(problems), problems.times.size
-        self.states, self.held = problems.states.copy(), problems.held.copy()
-        self.rows = np.empty((count, num_rows, program.width))
-        self.runs, self.endings = (RunState * count)(), np.zeros(count, dtype=np.intc)
-        following = np.zeros(1, dtype=np.longlong)
+    def __init__(self, program: Program, problems: Problems, settings: Settings, most: int) -> None:
+        self._problems, self._settings, self._most = problems, settings, most
+        count = len(problems)
         a, b, c = settings.tableau or (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
-        arrays: dict[str, Any] = {
-            "states": self.states,
-            "held": self.held,
+        self.arrays: dict[str, Any] = {
+            "states": problems.states.copy(),
+            "held": problems.held.copy(),
             "parameters": problems.parameters,
             "noise": problems.noise,
             "times": problems.times,
             "events": problems.events,
             "due": problems.due,
-            "rows": self.rows,
+            "rows": np.empty((count, problems.times.size, program.width)),
             "a": a,
             "b": b,
             "c": c,
             "absolute": settings.absolute,
-            "endings": self.endings,
-            "next": following,
+            "runs": np.zeros((count, ctypes.sizeof(RunState)), dtype=np.uint8),
+            "endings": np.zeros(count, dtype=np.intc),
+            "next": np.zeros(1, dtype=np.longlong),
         }
-        batch = _Batch(
-            num_runs=count,
-            most=most,
+
+    def batch(self, places: Mapping[str, int]) -> ctypes.Structure:
+        """What C takes.
+
+        Args:
+            places: The addresses of `arrays`.
+        """
+        problems, settings = self._problems, self._settings
+        return _Batch(
+            num_runs=len(problems),
+            most=self._most,
             parameter_step=_row(problems.parameters),
             noise_step=_row(problems.noise),
-            num_rows=num_rows,
+            num_rows=problems.times.size,
             num_events=problems.events.size,
-            stages=b.size,
+            stages=self.arrays["b"].size,
             longest=settings.longest,
             relative=settings.relative,
-            runs=ctypes.addressof(self.runs),
-            **{name: array.ctypes.data for name, array in arrays.items()},
+            **places,
         )
-        _run(lanes, batch, following)
 
     def done(self, index: int) -> Run:
         """A run that has come to its end."""
-        own = self.runs[index]
-        given = own.time, self.states[index], self.held[index], own.event, own.steps, own.before
-        return Run(self.rows[index], Ending.DONE, *given, own.next, np.inf, _NOWHERE)
+        own = RunState.from_buffer(self.arrays["runs"][index])
+        state, held = self.arrays["states"][index], self.arrays["held"][index]
+        given = own.time, state, held, own.event, own.steps, own.before, own.next
+        return Run(self.arrays["rows"][index], Ending.DONE, *given, np.inf, _NOWHERE)
+
+    def ended(self, go_on: Callable[..., Run], threads: int) -> list[Run]:
+        """What all runs come to.
+
+        Args:
+            go_on: (problem, settings, where it is, state, held, rows) -> a run that goes on
+                elsewhere.
+            threads: How many of these go on at once.
+        """
+
+        def other(index: int) -> Run:
+            own = RunState.from_buffer(self.arrays["runs"][index])
+            given = (self.arrays[name][index] for name in ("states", "held", "rows"))
+            return go_on(self._problems[index], self._settings, own, *given)
+
+        others = np.flatnonzero(self.arrays["endings"]).tolist()
+        found = {}
+        if others:
+            with ThreadPoolExecutor(threads) as pool:
+                found = dict(zip(others, pool.map(other, others), strict=True))
+        return [found.get(index) or self.done(index) for index in range(len(self._problems))]
 
 
 _NOWHERE = np.zeros(0)
 
 
-def _run(lanes: Library, batch: _Batch, following: np.ndarray) -> None:
+def _run(lanes: Library, many: Many) -> None:
     """Runs all in threads, which need no lock of Python's; Ctrl-C ends them."""
-    threads = max(1, min(num_cores(), batch.num_runs // 8))
+    arrays = many.arrays
+    batch = many.batch({name: array.ctypes.data for name, array in arrays.items()})
+    threads = max(1, min(num_cores(), len(arrays["endings"]) // 8))
     with ThreadPoolExecutor(threads) as pool:
         try:
             for done in [pool.submit(lanes.run_lanes, ctypes.byref(batch)) for _ in range(threads)]:
                 done.result()
         except BaseException:
-            following[0] = STOPPED
+            arrays["next"][0] = STOPPED
             raise
 
 

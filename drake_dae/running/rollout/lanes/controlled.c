@@ -267,7 +267,7 @@ ON_DEVICE static void run_apart(const Batch *b) {
       }
     }
     good &= write_ends(b, &p, accepted & good, end) | ~accepted;
-    if (*b->next >= STOPPED) return;
+    if (IS_STOPPED(b)) return;
     finished = alive & ~good;
     for (lane = 0; lane < LANES; lane++) {
       if (LANE(finished, lane)) {

@@ -57,7 +57,7 @@ ON_DEVICE static void run_together(const Batch *b, long long first) {
         if (end - run[0].before < 1e-8 * (end - run[0].start)) good = none();
       }
     }
-    if (*b->next >= STOPPED) return;
+    if (IS_STOPPED(b)) return;
     if (any(alive & ~good)) {
       for (lane = 0; lane < LANES; lane++) {
         if (LANE(alive, lane) && !LANE(good, lane)) save(b, &l, lane, x, held, before, HANDED_OVER);

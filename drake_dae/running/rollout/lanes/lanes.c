@@ -15,7 +15,13 @@ enum { DONE, HANDED_OVER };
 /* So many trials of a step may be rejected. */
 enum { TRIALS = 30 };
 
+/* The first run that nobody has taken yet, where Python was interrupted. */
 #define STOPPED (1LL << 62)
+#ifdef __CUDACC__
+#define IS_STOPPED(b) 0
+#else
+#define IS_STOPPED(b) (*(b)->next >= STOPPED)
+#endif
 
 /* What Python gives; an array of runs stands row by row. A step of 0 means that all have one row. */
 typedef struct {
@@ -32,7 +38,7 @@ typedef struct {
   const double *absolute;   /* of error control */
   Run *runs;
   int *endings;
-  volatile long long *next; /* the first run that nobody has taken yet; STOPPED to end early */
+  volatile long long *next; /* the first run that nobody has taken yet */
 } Batch;
 
 /* Runs under way, and what does not change within a step. */
@@ -213,6 +219,20 @@ ON_DEVICE static void weigh(real step, int count, const double *b, const real *x
 }
 $fixed
 $controlled
+#ifdef __CUDACC__
+/* One run, or under error control one after the other, in each thread of a device. */
+#ifdef __cplusplus
+extern "C"
+#endif
+__global__ void run_on_device(const Batch *b) {
+  const long long first = (long long)blockIdx.x * blockDim.x + threadIdx.x;
+  if (!b->stages) {
+    run_apart(b);
+  } else if (first < b->num_runs) {
+    run_together(b, first);
+  }
+}
+#else
 /* What Python calls, from any number of threads at once. */
 __attribute__((visibility("default"))) void run_lanes(const Batch *b) {
   long long first;
@@ -222,3 +242,4 @@ __attribute__((visibility("default"))) void run_lanes(const Batch *b) {
   }
   while ((first = take(b, LANES)) < b->num_runs) run_together(b, first);
 }
+#endif

@@ -14,7 +14,10 @@
 #ifdef __CUDACC__
 #define ON_DEVICE __device__
 #define APART __noinline__
-#define CONSTANT __device__ const
+#define CONSTANT static __device__ const
+#ifndef NAN
+#define NAN (0.0 / 0.0)
+#endif
 #else
 #include <math.h>
 #include <string.h>
