@@ -34,11 +34,13 @@ class _Rule(NamedTuple):
         words: As in "must be ...".
         holds: Whether a value satisfies it, without its parts.
         inside: (place, value, rule) of the parts of a value, for containers.
+        is_of_type: Whether the type of a value alone decides.
     """
 
     words: str
     holds: Callable[[Any], bool]
     inside: Callable[[str, Any], Iterator[tuple[str, Any, "_Rule"]]] | None = None
+    is_of_type: bool = False
 
 
 def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
@@ -86,12 +88,17 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
                 if parameter.kind is not parameter.KEYWORD_ONLY:
                     rules.append(entry)
 
+    valid: set[tuple[str, type]] = set()  # Arguments and types that were found to be valid.
+
     def check(entry: tuple[str, _Rule, Any], value: Any) -> None:
         name, rule, default = entry
-        if value is not default:
-            wrong = _wrong(name, value, rule)
-            if wrong:
-                raise error(f"{owner}: {wrong}")
+        if value is default or (name, type(value)) in valid:
+            return
+        wrong = _wrong(name, value, rule)
+        if wrong:
+            raise error(f"{owner}: {wrong}")
+        if rule.is_of_type:
+            valid.add((name, type(value)))
 
     @wraps(function)
     def call(*arguments: Any, **options: Any) -> Any:
@@ -161,8 +168,8 @@ def _rule(hint: Any) -> _Rule:
     if getattr(hint, "_is_protocol", False):
         return _protocol(hint)
     if inspect.isclass(hint) and hint is not Any:
-        return _Rule(_article(hint.__name__), lambda value: isinstance(value, hint))
-    return _Rule("anything", lambda value: True)
+        return _Rule(_article(hint.__name__), lambda value: isinstance(value, hint), None, True)
+    return _Rule("anything", lambda value: True, None, True)
 
 
 _CALLABLE = get_origin(Callable[[], None])
@@ -187,7 +194,8 @@ def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
     def holds(value: Any) -> bool:
         return any(rule.holds(value) for rule in rules)
 
-    return _Rule(words, holds, inside if has_parts else None)
+    is_of_type = all(rule.is_of_type for rule in rules)
+    return _Rule(words, holds, inside if has_parts else None, is_of_type)
 
 
 def _list(entry: _Rule) -> _Rule:
@@ -298,7 +306,7 @@ _ARRAYS = _Rule("finite real numbers", _is_array)
 _PLAIN = {
     float: _Rule("a finite number", _is_real),
     int: _Rule("a whole number", _is_whole),
-    bool: _Rule("True or False", _is_bool),
+    bool: _Rule("True or False", _is_bool, None, True),
     complex: _Rule(
         "a finite number",
         lambda value: (
@@ -307,7 +315,7 @@ _PLAIN = {
             else isinstance(value, Complex) and isfinite(abs(complex(value)))
         ),
     ),
-    str: _Rule("text", lambda value: isinstance(value, str)),
-    NoneType: _Rule("None", lambda value: value is None),
+    str: _Rule("text", lambda value: isinstance(value, str), None, True),
+    NoneType: _Rule("None", lambda value: value is None, None, True),
     ca.SX: _Rule("a CasADi SX expression", _is_expression),
 }

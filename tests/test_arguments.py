@@ -54,7 +54,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction

@@ -12,7 +12,7 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.errors import ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.runs import Outcome
+from drake_dae.studies.results import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
 from drake_dae.studies.variations import parse_variations

@@ -226,20 +226,21 @@ class CompiledDiagram:
             if block.under is None and block.model is not None and id(block.model) in laws
         }
 
-    def has_twins(self, parameters: FloatArray) -> bool:
-        """Whether plants and laws that have one model have the same numbers, too.
+    def have_twins(self, parameters: FloatArray) -> np.ndarray:
+        """In which rows plants and laws that have one model have the same numbers, too, shape (k,).
 
         Args:
-            parameters: As `values` returns them.
+            parameters: As `values` returns them, a row for each run, shape (k, m).
         """
         parts = dict(self.parameters)
+        found = np.full(len(parameters), bool(self.twins))
         for plant, controller in self.twins.items():
             own, of_law = parts[plant], parts[controller]
-            same = parameters[own] == parameters[of_law][: own.stop - own.start]
-            same[list(self.blocks[plant].moving)] = True
-            if not same.all():
-                return False
-        return bool(self.twins)
+            size = own.stop - own.start
+            same = parameters[:, own] == parameters[:, of_law][:, :size]
+            same[:, list(self.blocks[plant].moving)] = True
+            found &= same.all(axis=1)
+        return found
 
     @cached_property
     def moved_parameters(self) -> Mapping[System, ca.Function]:

@@ -17,7 +17,7 @@ from drake_dae.diagrams.force_feedback import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.records.afterwards import completed
-from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.simulation.records.record import Record, recorded_values
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.phase_change import PhaseChange
@@ -151,7 +151,7 @@ class ClosedLoop:
             )
             values["parameters"] = self.plant.parameters_along(at_plant, record.time)
         derived = {
-            name: Recorded(found, signals)
+            name: recorded_values(found, tuple(signals))
             for name, (found, signals) in self.controller.derived(own, record.time, values).items()
         }
         return Record(record.time, {**record.signals, **derived})

@@ -1,7 +1,8 @@
 """The run of a scenario by `rollout`, for the command and for studies."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from math import ceil
 
@@ -11,9 +12,9 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.state_feedback import encoder_seed
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
-from drake_dae.running.rollout.rollout import Rollout, run_loop
+from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.divergence import RecordWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
@@ -101,11 +102,6 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    seeds = (
-        {"force_noise": scenario.force_feedback.seed} if scenario.force_feedback.is_measured else {}
-    )
-    if scenario.encoders is not None:
-        seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
     watched = _Watched(scenario, loop, look)
     (found,) = run_loop(
         loop,
@@ -113,18 +109,71 @@ def roll_scenario(
         parameters,
         rollout_times(scenario, loop.plant.time_step),
         config=scenario.integrator,
-        seeds=[seeds],
+        seeds=[_seeds(scenario)],
         lasting=lasting,
         look=watched,
     )
     return watched.judged(found)
 
 
+def roll_together(
+    scenarios: Sequence[Scenario], loop: ClosedLoop, contexts: Sequence[Context], lasting: float
+) -> list[Rollout | None]:
+    """`roll_scenario` of several scenarios of one loop, those with the same times side by side.
+
+    Args:
+        scenarios: The scenarios.
+        loop: The closed loop of all.
+        contexts: Their starts, by `start_scenario`.
+        lasting: As of `roll_scenario`.
+
+    Returns:
+        A run for each; None for one that is left to `roll_scenario`, as `run_together` has it.
+
+    Raises:
+        ModelError: The loop cannot be rolled out.
+    """
+    groups: dict[str, list[int]] = {}
+    for index, each in enumerate(scenarios):
+        groups.setdefault(repr((each.duration, each.integrator)), []).append(index)
+    together: list[Rollout | None] = [None] * len(scenarios)
+    for places in groups.values():
+        first = scenarios[places[0]]
+        starts, parameters = zip(*(start_values(loop, contexts[i]) for i in places), strict=True)
+        with suppress(InconsistentStateError):  # That run says so itself.
+            found = run_together(
+                loop,
+                np.array(starts),
+                np.array(parameters),
+                rollout_times(first, loop.plant.time_step),
+                config=first.integrator,
+                seeds=[_seeds(scenarios[i]) for i in places],
+                lasting=lasting,
+            )
+            for index, run in zip(places, found, strict=True):
+                if run is not None:
+                    together[index] = _Watched(scenarios[index], loop).judged(run)
+    return together
+
+
+def _seeds(scenario: Scenario) -> dict[str, int]:
+    """The seed of each source of noise."""
+    found = {}
+    if scenario.force_feedback.is_measured:
+        found["force_noise"] = scenario.force_feedback.seed
+    if scenario.encoders is not None:
+        found["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+    return found
+
+
 class _Watched:
     """Ends a rollout that diverges."""
 
     def __init__(
-        self, scenario: Scenario, loop: ClosedLoop, look: Callable[[RecordAfter], bool]
+        self,
+        scenario: Scenario,
+        loop: ClosedLoop,
+        look: Callable[[RecordAfter], bool] = lambda record: False,
     ) -> None:
         self._watch = RecordWatch(loop.plant, scenario.duration)
         self._look, self._may_diverge = look, scenario.may_diverge

@@ -1,17 +1,20 @@
 """The start of the runs of a scenario."""
 
 from contextlib import suppress
+from typing import cast
 
 import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.tracking.gains import FeedbackGains
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
+from drake_dae.scenario.parts.families import Gains
 from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
@@ -75,7 +78,7 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     if scenario.gains is not None:  # Recommended gains are in the law.
         with at("gains"):
             of_law = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(of_law, scenario.gains.design())
+            controller.set_gains(of_law, _designed(scenario.gains, loop))
     own = plant.GetMyMutableContextFromRoot(context)
     parameters = plant.current_parameters(own)
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
@@ -91,6 +94,15 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     if loop.sensor is not None:
         force = model.rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
+
+
+def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
+    """The gains of a scenario; many runs of a study have those of the last one."""
+    key, (known, found) = repr(gains), loop.memory.get("gains", ("", None))
+    if known != key:
+        found = loop.controller.law.design(gains.design())
+        loop.memory["gains"] = key, found
+    return cast(FeedbackGains, found)
 
 
 def _in_motion(

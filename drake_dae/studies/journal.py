@@ -16,7 +16,7 @@ from typing import Any
 
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
-from drake_dae.studies.runs import RunResult
+from drake_dae.studies.results import RunResult
 from drake_dae.studies.variations import Variation
 
 FORMAT = 1

@@ -3,13 +3,12 @@
 import json
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from enum import StrEnum
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import isfinite
 from threading import Lock
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from pydrake.systems.framework import Context
 
@@ -33,77 +32,15 @@ from drake_dae.simulation.figures import exceeded, run_figures
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
+from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.variations import Variation
 
-
-class Outcome(StrEnum):
-    """How a run of a study ended."""
-
-    FINISHED = "finished"
-    FAILED = "failed"
-    """During the run; figures are up to the failure."""
-    NO_START = "no start"
-    """No consistent state satisfies the start."""
-    REFUSED = "refused"
-    """The scenario is inconsistent, or violates an assumption."""
-    CRASHED = "crashed"
-    """The process ended, or failed unexpectedly."""
-    TIMED_OUT = "timed out"
-    """The process was ended, since the run exceeded its time limit."""
-
-    @property
-    def is_final(self) -> bool:
-        """Whether it is a property of the run itself; otherwise it may be tried again."""
-        return self not in (Outcome.CRASHED, Outcome.TIMED_OUT)
+if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
+    from drake_dae.running.rollout.rollout import Rollout
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """The result of a run of a study.
-
-    Attributes:
-        run: Its number in the study.
-        outcome: How it ended.
-        reason: The reason, if it did not finish.
-        figures: Name with unit -> value, as `run_figures` has them.
-        exceeded: Names of the signals beyond their limits.
-        seconds: The elapsed time, including the build.
-    """
-
-    run: int
-    outcome: Outcome
-    reason: str = ""
-    figures: Mapping[str, float] = field(default_factory=dict)
-    exceeded: tuple[str, ...] = ()
-    seconds: float = 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The result of plain data.
-
-        Raises:
-            KeyError, TypeError, ValueError: The data are those of something else.
-        """
-        values = dict(data)
-        values["outcome"] = Outcome(values["outcome"])
-        values["exceeded"] = tuple(values["exceeded"])
-        found = cls(**values)
-        numbers = [*found.figures.values(), found.seconds]
-        if not (
-            type(found.run) is int
-            and found.run >= 0
-            and all(type(number) in (int, float) and isfinite(number) for number in numbers)
-            and all(isinstance(text, str) for text in (found.reason, *found.exceeded))
-            and isinstance(found.figures, dict)
-            and found.seconds >= 0.0
-        ):
-            raise ValueError("no result of a run")
-        return found
-
+TOGETHER = 32
+"""At most so many rollouts are made at once."""
 
 Batch = Sequence[tuple[int, Variation]]
 """Runs of one structure, with their numbers."""
@@ -214,17 +151,26 @@ class Runner:
         return None
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
-        """Simulates runs; yields each result."""
-        for number, variation in batch:
-            began = time.perf_counter()
-            try:
-                result = self._run(number, variation)
-            except Exception as error:  # A study of thousands of runs continues.
-                text = f"{type(error).__name__}: {brief(str(error))}"
-                result = RunResult(number, Outcome.CRASHED, text)
-            yield RunResult(**{**vars(result), "seconds": time.perf_counter() - began})
+        """Simulates runs; yields each result, in their order."""
+        size = 1 if self._lasting is None else TOGETHER
+        for first in range(0, len(batch), size):
+            begun = [self._timed(self._begin, *pair) for pair in batch[first : first + size]]
+            self._roll_together([each for each in begun if isinstance(each, _Begun)])
+            for each in begun:
+                yield self._timed(self._end, each) if isinstance(each, _Begun) else each
 
-    def _run(self, number: int, variation: Variation) -> RunResult:
+    def _timed(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What a part of a run comes to, with the time that its run has taken up to then."""
+        began, given = time.perf_counter(), arguments[0]
+        number, before = (given.number, given.seconds) if isinstance(given, _Begun) else (given, 0)
+        try:
+            found = function(*arguments)
+        except Exception as error:  # A study of thousands of runs continues.
+            text = f"{type(error).__name__}: {brief(str(error))}"
+            found = RunResult(number, Outcome.CRASHED, text)
+        return replace(found, seconds=before + time.perf_counter() - began)
+
+    def _begin(self, number: int, variation: Variation) -> "_Begun | RunResult":
         try:
             data = varied_data(self._base, variation)
             scenario = read_scenario(data)
@@ -233,7 +179,75 @@ class Runner:
                 loop = self.loop(data)
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
-        return _simulated(number, scenario, loop, self._lasting)
+        try:
+            return _Begun(number, scenario, loop, start_scenario(scenario, loop))
+        except DrakeDaeError as error:
+            return _not_started(number, error)
+
+    def _roll_together(self, begun: Sequence["_Begun"]) -> None:
+        """Makes rollouts of one loop at once, where they can be made."""
+        if self._lasting is None:
+            return
+        from drake_dae.scenario.rolled import roll_together
+
+        for loop in dict.fromkeys(each.loop for each in begun):
+            own = [each for each in begun if each.loop is loop]
+            scenarios, contexts = [each.scenario for each in own], [each.context for each in own]
+            began = time.perf_counter()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                with suppress(Exception):  # Each run says so itself.
+                    found = roll_together(scenarios, loop, contexts, self._lasting)
+                    for each, rollout in zip(own, found, strict=True):
+                        each.rollout = rollout
+            share = (time.perf_counter() - began) / len(own)
+            for each in own:
+                each.seconds += share
+
+    def _end(self, begun: "_Begun") -> RunResult:
+        """The result of a run that has a start."""
+        number, scenario, loop, context = begun.number, begun.scenario, begun.loop, begun.context
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                if self._lasting is None:
+                    record, steps, failure = _stepped(scenario, loop, context)
+                else:
+                    from drake_dae.scenario.rolled import roll_scenario
+
+                    found = begun.rollout or roll_scenario(scenario, loop, context, self._lasting)
+                    record, steps, failure = found.record, found.steps, found.failure
+        except DrakeDaeError as error:
+            return _not_started(number, error)
+        limits = Limits.of(loop.plant.robot("a study"))
+        figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
+        if failure is not None:
+            return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
+        return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
+
+
+@dataclass(eq=False)
+class _Begun:
+    """A run that has a start.
+
+    Attributes:
+        number: Its number in the study.
+        scenario, loop, context: What is run.
+        rollout: What it came to, if that is known by now.
+        seconds: The time that it has taken up to now.
+    """
+
+    number: int
+    scenario: Scenario
+    loop: ClosedLoop
+    context: Context
+    rollout: "Rollout | None" = None
+    seconds: float = 0.0
+
+
+def _not_started(number: int, error: DrakeDaeError) -> RunResult:
+    outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
+    return RunResult(number, outcome, str(error))
 
 
 def _is_about_states(error: BaseException | None) -> bool:
@@ -243,31 +257,6 @@ def _is_about_states(error: BaseException | None) -> bool:
             return True
         error = error.__cause__
     return False
-
-
-def _simulated(
-    number: int, scenario: Scenario, loop: ClosedLoop, lasting: float | None
-) -> RunResult:
-    """The result of a run, from a new context of the loop."""
-    try:
-        context = start_scenario(scenario, loop)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if lasting is None:
-                record, steps, failure = _stepped(scenario, loop, context)
-            else:
-                from drake_dae.scenario.rolled import roll_scenario
-
-                found = roll_scenario(scenario, loop, context, lasting)
-                record, steps, failure = found.record, found.steps, found.failure
-    except DrakeDaeError as error:
-        outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
-        return RunResult(number, outcome, str(error))
-    limits = Limits.of(loop.plant.robot("a study"))
-    figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
-    if failure is not None:
-        return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
-    return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
 
 
 def _stepped(
@@ -341,7 +330,7 @@ def batches(
         key = structure_key(varied_data(base, variation), base)
         groups.setdefault(key, []).append((number, variation))
     total = sum(map(len, groups.values()))
-    size = max(1, min(32, total // (32 * workers)))
+    size = max(1, min(TOGETHER, total // (32 * workers)))
     return [
         group[first : first + size]
         for group in groups.values()

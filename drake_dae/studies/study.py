@@ -14,7 +14,7 @@ from drake_dae.analysis.tables import Part, Table, count_of, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.variations import Variation
 
 FILES = ("runs.csv", "summary.txt", "histograms.png", "map.png")

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drake_dae.arrays import Booleans, FloatArray
-from drake_dae.studies.runs import Outcome
+from drake_dae.studies.results import Outcome
 
 MOST_PLOTS = 24
 """The largest number of figures in a plot, the first ones that vary."""

@@ -13,6 +13,7 @@ better choice. Calls are counted instead of reading a clock, so that each run do
 import hashlib
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -112,7 +113,9 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
         return None
 
 
-def library(source: str, operations: int, compiled: Compiled, make: bool) -> Path | None:
+def library(
+    source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
+) -> Path | None:
     """C source as a shared library in the cache; None if there is none.
 
     Args:
@@ -120,12 +123,13 @@ def library(source: str, operations: int, compiled: Compiled, make: bool) -> Pat
         operations: The approximate number of operations, for the expected time to compile.
         compiled: The choice, True or "auto".
         make: Whether to make it where the cache has none.
+        options: Options of the compiler, which outdo others.
 
     Warns:
         MachineCodeWarning: It should be made and cannot be.
     """
     try:
-        return _library(source, operations, compiled, make)
+        return _library(source, operations, compiled, make, tuple(options))
     except MachineCodeError as error:
         _warn(error, make)
         return None
@@ -142,11 +146,13 @@ def _warn(error: MachineCodeError, make: bool) -> None:
         )
 
 
-def _library(source: str, operations: int, compiled: Compiled, make: bool) -> Path | None:
+def _library(
+    source: str, operations: int, compiled: Compiled, make: bool, options: tuple[str, ...]
+) -> Path | None:
     compiler = find_compiler()
     levels = ("-O1", "-O0") if compiled == "auto" else ("-O1",)
     for level in levels:
-        path = files.find(_key(source, compiler, level))
+        path = files.find(_key(source, compiler, level, options))
         if path is not None:
             return path
     level = _level(compiled, operations)
@@ -156,11 +162,11 @@ def _library(source: str, operations: int, compiled: Compiled, make: bool) -> Pa
         usual = STARTING + COMPILING[level] * operations
         seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
         try:
-            compiler.compile(source, place / "code", level, seconds)
+            compiler.compile(source, place / "code", level, seconds, options)
         except CompilerHangs as error:
             give_up(compiler, error)
             raise
-        return files.store(_key(source, compiler, level), place / "code.so")
+        return files.store(_key(source, compiler, level, options), place / "code.so")
 
 
 def without_branches(source: str) -> str:
@@ -190,8 +196,9 @@ def _level(compiled: Compiled, operations: int) -> str:
     return next(fast, "")
 
 
-def _key(source: str, compiler: Compiler, level: str) -> str:
-    parts = (source, *compiler.command, compiler.identity, *FLAGS, *compiler.target, level)
+def _key(source: str, compiler: Compiler, level: str, options: tuple[str, ...]) -> str:
+    given = *FLAGS, *compiler.target, level, *options
+    parts = (source, *compiler.command, compiler.identity, *given)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 

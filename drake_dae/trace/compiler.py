@@ -64,7 +64,14 @@ class Compiler(NamedTuple):
     identity: str
     target: tuple[str, ...] = ()
 
-    def compile(self, source: str, file: Path, level: str, seconds: float) -> None:
+    def compile(
+        self,
+        source: str,
+        file: Path,
+        level: str,
+        seconds: float,
+        more: tuple[str, ...] = (),
+    ) -> None:
         """Writes a source to file.c and its machine code to file.so.
 
         Raises:
@@ -73,7 +80,7 @@ class Compiler(NamedTuple):
         """
         code, library = file.with_suffix(".c"), file.with_suffix(".so")
         code.write_text(source)
-        options = [*FLAGS, *self.target, level, str(code), "-o", str(library), "-lm"]
+        options = [*FLAGS, *self.target, level, *more, str(code), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
         if done.returncode == 0 and library.exists():
             return

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dpotrs, dtrtrs
+from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
 
@@ -142,12 +142,22 @@ def shortest_steps(
     length = np.linalg.norm(gradients, axis=1)
     length[length == 0.0] = 1.0
     rows = gradients / length[:, None]
-    q, r = scipy.linalg.qr(rows.T, mode="economic", check_finite=False)
+    q, r = _orthogonalized(rows.T)
     if len(rows) > len(q) or np.min(np.abs(np.diag(r)), initial=1.0) <= DEPENDENT:
         inverse = np.linalg.pinv(rows, DEPENDENT)
         return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
     # LAPACK itself: SciPy's solve_triangular takes ten times as long around the same call.
     return NewtonModel(lambda x: -q @ dtrtrs(r.T, residual(x) / length, lower=1)[0], True)
+
+
+def _orthogonalized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Q and R of a matrix, shapes (n, l) and (l, k) with l = min(n, k).
+
+    LAPACK itself: SciPy's `qr` takes several times as long around the same calls.
+    """
+    least = min(matrix.shape)
+    factors, tau, *_ = dgeqrf(matrix)
+    return dorgqr(factors[:, :least], tau)[0], np.triu(factors[:least])
 
 
 def steps_along(

@@ -7,7 +7,7 @@ import pytest
 
 from drake_dae.errors import ModelError
 from drake_dae.studies.journal import open_journal, study_head
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.results import Outcome, RunResult
 
 RESULTS = [
     RunResult(2, Outcome.FINISHED, "", {"end [s]": 0.1 + 0.2}, ("wall.force",), 1.5),

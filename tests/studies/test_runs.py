@@ -8,14 +8,8 @@ from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
-from drake_dae.studies.runs import (
-    Outcome,
-    Runner,
-    RunResult,
-    batches,
-    lasting,
-    structure_key,
-)
+from drake_dae.studies.results import Outcome, RunResult
+from drake_dae.studies.runs import Runner, batches, lasting, structure_key
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
 

@@ -14,7 +14,7 @@ from runs import scenario
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.study import FILES, Study
 
 KEYS = {

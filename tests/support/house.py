@@ -71,7 +71,7 @@ LONG = {
 }
 
 # Distributions whose modules bear another name.
-IMPORT_NAMES = {"drake": "pydrake", "pyyaml": "yaml"}
+IMPORT_NAMES = {"cupy-cuda12x": "cupy", "drake": "pydrake", "pyyaml": "yaml"}
 
 
 def declared_modules() -> set[str]:

@@ -1,8 +1,10 @@
 """What a rollout runs, from the arguments that it was given."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -74,13 +76,86 @@ def _table(what: str, given: ArrayLike, size: int, hint: str) -> FloatArray:
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class Problems:
+    """Many runs of one diagram over the same times.
+
+    Attributes:
+        compiled: The diagram.
+        times: When rows are written, in s, shape (j,).
+        states, held: Where runs start, shapes (k, n) and (k, m).
+        parameters: Their parameters, shape (k, p), or (1, p) for all.
+        events, due: When there are updates, in s, and which rates are due, as bits.
+        noise: The random numbers of each update, shape (k, len(events), q), or one for all.
+    """
+
+    compiled: CompiledDiagram
+    times: FloatArray
+    states: FloatArray
+    held: FloatArray
+    parameters: FloatArray
+    events: FloatArray
+    due: np.ndarray
+    noise: FloatArray
+    _lock: Any = field(default_factory=Lock, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, index: int) -> Problem:
+        row = self._row(self.parameters, index)
+        return Problem(
+            self.times,
+            self.states[index],
+            self.held[index],
+            row,
+            self.events,
+            self.due,
+            self._row(self.noise, index),
+            partial(_project, self.compiled, self._lock, row),
+        )
+
+    def with_twins(self) -> np.ndarray:
+        """In which runs plants and laws that have one model have the same numbers, shape (k,)."""
+        return np.broadcast_to(self.compiled.have_twins(self.parameters), len(self))
+
+    def chosen(self, places: np.ndarray) -> "Problems":
+        """Some of them."""
+        if len(places) == len(self):
+            return self
+        parameters, noise = (
+            each if len(each) == 1 else each[places] for each in (self.parameters, self.noise)
+        )
+        own = {"states": self.states[places], "held": self.held[places]}
+        return replace(self, **own, parameters=parameters, noise=noise)
+
+    def check(self) -> None:
+        """Refuses starts off N*.
+
+        Raises:
+            InconsistentStateError: A start is not on N*.
+        """
+        time = float(self.times[0])
+        for index in range(len(self)):
+            state, held = self.states[index], self.held[index]
+            row = self._row(self.parameters, index)
+            for part, now, block in _plants(self.compiled, time, state, held, row):
+                assert block.check_start is not None
+                block.check_start(state[part], now)
+
+    @staticmethod
+    def _row(table: FloatArray, index: int) -> FloatArray:
+        found: FloatArray = table[index if len(table) > 1 else 0]
+        return found
+
+
 def problems_of(
     program: Program,
     starts: ArrayLike,
     parameters: ArrayLike | None,
     times: FloatArray,
     seeds: Sequence[Seed] | None,
-) -> list[Problem]:
+) -> Problems:
     """The runs that `rollout` was asked for, whose arguments these are.
 
     Raises:
@@ -106,22 +181,27 @@ def problems_of(
     bad = [seed for each in numbers_of for seed in each if not 0 <= seed < 2**32]
     if bad:
         raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
-    problems, lock = [], Lock()
-    for index, start in enumerate(states):
-        row = given[min(index, len(given) - 1)].copy()
-        noise = noise_of(compiled, events, times[0], None if seeds is None else seeds[index])
-        held = np.zeros(compiled.sizes["held"])
-        held[program.kept_places] = start[size:]
-        drawn = dict(compiled.noise)
-        for system, part in compiled.held:
-            if system in drawn:
-                held[part] = noise[0, drawn[system]]
-        for part, now, block in _plants(compiled, times[0], start[:size], held, row):
-            if block.check_start is not None:
-                block.check_start(start[part], now)
-        project = partial(_project, compiled, lock, row)
-        problems.append(Problem(times, start[:size], held, row, *events, noise[1:], project))
-    return problems
+    # Without noise, or without seeds, it is the same in all runs.
+    own_seeds: Sequence[Seed | None] = seeds if seeds and compiled.noise else [None]
+    noise = np.array([noise_of(compiled, events, times[0], seed) for seed in own_seeds])
+    held = np.zeros((count, compiled.sizes["held"]))
+    held[:, program.kept_places] = states[:, size:]
+    drawn = dict(compiled.noise)
+    for system, part in compiled.held:
+        if system in drawn:
+            held[:, part] = noise[:, 0, drawn[system]]
+    found = Problems(
+        compiled,
+        times,
+        np.ascontiguousarray(states[:, :size]),
+        held,
+        np.ascontiguousarray(given),
+        events.times,
+        events.due,
+        np.ascontiguousarray(noise[:, 1:]),
+    )
+    found.check()
+    return found
 
 
 def _plants(
@@ -142,7 +222,7 @@ def _plants(
 
 def _project(
     compiled: CompiledDiagram,
-    lock: Lock,
+    lock: Any,
     row: FloatArray,
     time: float,
     state: FloatArray,

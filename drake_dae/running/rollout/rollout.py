@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,21 +15,26 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running.rollout.asked import Asked, record_of
 from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.problems import checked_times, problems_of
-from drake_dae.running.rollout.program import Program, program_of
-from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
+from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
+from drake_dae.running.rollout.lanes.device import find_device, run_on_device
+from drake_dae.running.rollout.problems import Problems, problems_of
+from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.fused import Fused
-from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
-from drake_dae.simulation.simulate import check_config
-from drake_dae.trace.compiled import Compiled, attempts, check_choice
+from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.trace.compiled import Compiled
 
-STAGES_PER_SECOND = 500
-"""About so many evaluations takes a simulated second under error control."""
+SEVERAL = 8
+"""So many runs go side by side; fewer go one after the other, with the bits of a single one."""
+
+USUAL = 20_000
+"""More steps than a run of a study takes, unless it diverges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,7 @@ class Rollout:
     @cached_property
     def record(self) -> Record:
         """Its signals at the given times, up to where it came."""
-        return _record(self._program, self._times, self._rows, context=self.context)
+        return record_of(self._program, self._times, self._rows, context=self.context)
 
     def ended(self, failure: SimulationError) -> Self:
         """The same where it ended with a failure; its record goes up to the failure's time."""
@@ -71,6 +76,7 @@ def rollout(
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> list[Rollout]:
     """Runs a diagram from one start or from thousands, without Drake, on all cores.
 
@@ -98,18 +104,22 @@ def rollout(
             for a diagram. "auto" makes it if that pays for the runs at hand.
         seeds: The seed of the noise in each run, or name of a RandomSource -> its seed, for several
             of them; the same noise for all if None.
+        device: "cuda" runs them on an NVIDIA GPU, by CuPy, one in each thread; those that fail, or
+            that need more than the usual Newton steps, go on here.
 
     Returns:
         A run for each start. One that fails has its failure, and its record up to there.
 
     Raises:
-        ModelError: Arguments have wrong shapes, or a block cannot be traced: its name and why.
+        ModelError: Arguments have wrong shapes, or a block cannot be traced: its name and why; or
+            there is no GPU, or the diagram does not run on it.
         InconsistentStateError: A start is not on N*.
 
     Warns:
         MachineCodeWarning: Machine code should be made and cannot be.
     """
-    return run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
+    settings: dict[str, Any] = {"config": config, "compiled": compiled, "seeds": seeds}
+    return run_loop(loop, starts, parameters, times, **settings, on_device=device == "cuda")
 
 
 def run_loop(
@@ -122,7 +132,8 @@ def run_loop(
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
-    look: Callable[[RecordAfter], bool] = lambda record: False,
+    look: Callable[[RecordAfter], bool] | None = None,
+    on_device: bool = False,
 ) -> list[Rollout]:
     """`rollout`, where these runs may be some of many, and may be stopped.
 
@@ -132,39 +143,89 @@ def run_loop(
             these are all.
         look: Called now and then with a function from a time in s, or None, to what a run has
             recorded later; whether to stop where it is. Its record goes up to there.
+        on_device: Whether they run on a GPU.
     """
-    config = config or SimulatorConfig()
-    check_config(config)
-    program = program_of(loop)
-    choice: Compiled = program.choice if compiled is None else compiled
-    check_choice("rollout", choice)
-    moments = checked_times(times)
-
-    def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
-        return look(lambda after: _record(program, moments, rows(), after, context))
-
-    settings = Settings.of(config, program.compiled.scale, looked)
-    problems = problems_of(program, starts, parameters, moments, seeds)
-    seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
-    kinds = [program.compiled.has_twins(problem.parameters) for problem in problems]
+    if on_device:
+        find_device()
+    asked = Asked.of(loop, times, config, compiled, lasting, look)
+    program = asked.program
+    problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: dict[int, Rollout] = {}
-    for kind in set(kinds):
-        chosen = [index for index, each in enumerate(kinds) if each is kind]
-        own = program.twins if kind else program
-        code = _machine_code(own, choice, settings, seconds, look=lasting is None)
-        runs = _runs(own, [problems[index] for index in chosen], settings, code)
-        for index, run in zip(chosen, runs, strict=True):
-            found[index] = _result(program, problems[index], run)
+    for own, chosen in _kinds(program, problems):
+        some = problems.chosen(chosen)
+        code = asked.machine_code(own, len(problems))
+        side_by_side = None
+        if on_device:
+            many = run_on_device(own, some, asked.settings)
+            go_on = partial(machine.go_on, code) if code else _interpreted(own, asked.settings)
+            for index, run in zip(chosen.tolist(), many.ended(go_on, 1), strict=True):
+                found[index] = _result(program, problems, index, run)
+            continue
+        if code is not None and look is None and len(some) >= SEVERAL:
+            side_by_side = asked.lanes(own, len(problems))
+        runs = _runs(own, some, asked.settings, code, side_by_side)
+        for index, run in zip(chosen.tolist(), runs, strict=True):
+            found[index] = _result(program, problems, index, run)
     return [found[index] for index in range(len(problems))]
+
+
+def run_together(
+    loop: ClosedLoop,
+    starts: ArrayLike,
+    parameters: ArrayLike,
+    times: ArrayLike,
+    *,
+    config: SimulatorConfig,
+    seeds: Sequence[Seed],
+    lasting: float,
+) -> list[Rollout | None]:
+    """What `run_loop` returns, of runs that come to their end side by side in a usual time.
+
+    Returns:
+        A run for each start; None for one that fails, that takes more than `USUAL` steps, or whose
+        loop has no such machine code. These are left to `run_loop`.
+
+    Raises:
+        InconsistentStateError: A start is not on N*.
+    """
+    asked = Asked.of(loop, times, config, None, lasting)
+    program = asked.program
+    problems = problems_of(program, starts, parameters, asked.times, seeds)
+    found: list[Rollout | None] = [None] * len(problems)
+    for own, chosen in _kinds(program, problems):
+        side_by_side = asked.lanes(own, len(problems)) if asked.machine_code(own, 1) else None
+        if side_by_side is None:
+            continue
+        runs = run_briefly(side_by_side, own, problems.chosen(chosen), asked.settings, USUAL)
+        for index, run in zip(chosen.tolist(), runs, strict=True):
+            found[index] = _result(program, problems, index, run) if run is not None else None
+    return found
+
+
+def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarray]]:
+    """The runs in which plant and law have the same numbers, and the others; each its program."""
+    has_twins = problems.with_twins()
+    kinds = (program.twins if kind else program for kind in (True, False))
+    places = (np.flatnonzero(has_twins == kind) for kind in (True, False))
+    return [each for each in zip(kinds, places, strict=True) if each[1].size]
+
+
+def _interpreted(program: Program, settings: Settings) -> Callable[..., Run]:
+    """What runs a problem from its start, whatever it came to elsewhere."""
+    run = interpreted.runner(program.kept("fused", lambda: Fused(program)), settings)
+    return lambda problem, *given: run(problem)
 
 
 def _runs(
     program: Program,
-    problems: Sequence[Problem],
+    problems: Problems,
     settings: Settings,
     code: machine.Library | None,
+    side_by_side: machine.Library | None,
 ) -> list[Run]:
-    """What runs come to, by machine code if there is any."""
+    """What runs come to, by machine code if there is any, and side by side if they can."""
+    if code is not None and side_by_side is not None:
+        return run_many(side_by_side, code, program, problems, settings)
     if code is None or program.compiled.changes or program.compiled.has_stepped:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
@@ -175,61 +236,14 @@ def _runs(
     if program.compiled.has_stepped:
         run = partial(run_beside, fused, code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:
-        return [run(problem) for problem in problems]
+        return [run(problems[index]) for index in range(len(problems))]
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:
-        return list(pool.map(run, problems))
+        return list(pool.map(lambda index: run(problems[index]), range(len(problems))))
 
 
-def _machine_code(
-    program: Program,
-    compiled: Compiled,
-    settings: Settings,
-    seconds: float,
-    look: bool = True,
-) -> machine.Library | None:
-    """A diagram as machine code, by the choice and by what its runs take without.
-
-    Where it does not pay to make it, the cache is looked into if `look` says so.
-    """
-    if compiled is False:
-        return None
-    if program.library is not None:
-        return program.library
-    make = True
-    if compiled == "auto":
-        stages = STAGES_PER_SECOND
-        if settings.tableau is not None:
-            stages = int(len(settings.tableau.b) / settings.longest)
-        pays = attempts("auto", program.num_operations)
-        make = any(each.make and stages * seconds >= each.calls for each in pays)
-        if not (make or look):
-            return None
-    program.library = machine.load(program, compiled, make)
-    return program.library
-
-
-def _result(program: Program, problem: Problem, run: Run) -> Rollout:
+def _result(program: Program, problems: Problems, index: int, run: Run) -> Rollout:
     failure = None
     if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
-        failure = failure_of(program, problem, run)
-    return Rollout(run.steps, failure, program, problem.times, run.rows, run.context)
-
-
-def _record(
-    program: Program,
-    times: FloatArray,
-    rows: FloatArray,
-    after: float | None = None,
-    context: Context | None = None,
-) -> Record:
-    """The rows of a run as a record, or those that are later than a time in s."""
-    first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
-    columns = program.signals
-    stops = np.cumsum([len(signals) for signals in columns.values()])
-    parts = np.split(rows[first:], stops[:-1], axis=1)
-    signals = {
-        name: Recorded(part, tuple(columns[name]))
-        for name, part in zip(columns, parts, strict=True)
-    }
-    return program.complete(Record(times[first : len(rows)], signals), context)
+        failure = failure_of(program, problems[index], run)
+    return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)

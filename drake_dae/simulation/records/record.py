@@ -39,6 +39,13 @@ class Recorded:
     signals: tuple[Signal, ...]
 
 
+def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
+    """What the library itself has recorded, without the checks of what a user gives."""
+    found = object.__new__(Recorded)
+    vars(found).update(values=values, signals=signals)
+    return found
+
+
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -119,8 +126,8 @@ class Record:
             return self
         first = int(np.searchsorted(self.time, time, side="right"))
         signals = {
-            name: Recorded(recorded.values[first:], recorded.signals)
-            for name, recorded in self.signals.items()
+            name: recorded_values(each.values[first:], each.signals)
+            for name, each in self.signals.items()
         }
         events = tuple(event for event in self.events if event.time > time)
         return type(self)(self.time[first:], signals, events, self.about)
@@ -133,8 +140,8 @@ class Record:
             return self
         count = int(np.argmax(broken))
         signals = {
-            name: Recorded(recorded.values[:count], recorded.signals)
-            for name, recorded in self.signals.items()
+            name: recorded_values(each.values[:count], each.signals)
+            for name, each in self.signals.items()
         }
         last = self.time[count - 1] if count else -np.inf
         events = tuple(event for event in self.events if event.time <= last)

@@ -36,7 +36,7 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
-from drake_dae.studies.runs import Outcome
+from drake_dae.studies.results import Outcome
 from drake_dae.systems.plants.contract import Plant
 
 FINE = 1e-10

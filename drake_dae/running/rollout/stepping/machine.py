@@ -19,6 +19,9 @@ from drake_dae.trace.compiled import Compiled, generate, library, renamed, witho
 
 SOURCE = Path(__file__).parent / "stepper.c"
 
+RUN = Path(__file__).parent / "run.h"
+"""The state of a run in C."""
+
 Library = ctypes.CDLL
 
 _PROJECTION, _ALL = 2, 7
@@ -28,8 +31,8 @@ FIRST, PAUSE = 500, 0.1
 """So many steps are taken before Python looks at the run, then as many as take this time, in s."""
 
 
-class _Run(ctypes.Structure):
-    """The Run of stepper.c."""
+class RunState(ctypes.Structure):
+    """The Run of run.h."""
 
     _fields_ = (
         *((name, ctypes.c_double) for name in ("time", "step", "start", "mark", "before")),
@@ -69,10 +72,33 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
         settings: How to step.
     """
     start = float(problem.times[0])
-    own = _Run(time=start, start=start, mark=start, pending=_ALL, reacted=int(problem.has_reacted))
-    state, held = problem.state.copy(), problem.held.copy()
-    trial = np.full_like(problem.state, np.nan)
+    own = RunState(
+        time=start, start=start, mark=start, pending=_ALL, reacted=int(problem.has_reacted)
+    )
     rows = np.empty((problem.times.size, program.width))
+    return go_on(code, problem, settings, own, problem.state.copy(), problem.held.copy(), rows)
+
+
+def go_on(
+    code: Library,
+    problem: Problem,
+    settings: Settings,
+    own: RunState,
+    state: FloatArray,
+    held: FloatArray,
+    rows: FloatArray,
+) -> Run:
+    """Goes on with a run until its end, or to where it cannot go on by machine code alone.
+
+    Args:
+        code: What `load` returned.
+        problem: What to run.
+        settings: How to step.
+        own: Where the run is.
+        state, held: The accepted state and what is held; written over.
+        rows: All rows of its record, shape (k, width), of which some are written.
+    """
+    trial = np.full_like(problem.state, np.nan)
     step, tables = code.run_controlled, [settings.longest, settings.absolute, settings.relative]
     if settings.tableau is not None:
         a, b, c = settings.tableau
@@ -149,8 +175,9 @@ def _source(program: Program) -> str:
         listed = ", ".join(map(str, [*rate.places, 0]))
         lines.append(f"static const int places_{number}[] = {{{listed}}};")
     lines.append(f"static const double TOUCHING = {TOUCHING!r};")
-    lines += [_table(name, np.asarray(values)) for name, values in tables.items()]
+    lines += [c_table(name, np.asarray(values)) for name, values in tables.items()]
     words = {
+        "run": RUN.read_text(encoding="utf-8"),
         "generated": without_branches(
             generate(*(renamed(each, f"dae_{name}") for name, each in calls.items()))
         ),
@@ -220,10 +247,16 @@ _WATCH = """\
 """The same for those that are looked at in samples."""
 
 
-def _table(name: str, values: FloatArray) -> str:
+def c_table(name: str, values: FloatArray, kind: str = "static const") -> str:
+    """A vector or a matrix as an array of C.
+
+    Args:
+        name: Its name.
+        values: Its entries.
+        kind: What stands before its type.
+    """
     if values.ndim == 1:
-        return (
-            f"static const double {name}[] = {{{', '.join(map(repr, [*values.tolist(), 0.0]))}}};"
-        )
+        listed = ", ".join(map(repr, [*values.tolist(), 0.0]))
+        return f"{kind} double {name}[] = {{{listed}}};"
     rows = ",\n".join(f"{{{', '.join(map(repr, row))}}}" for row in values.tolist())
-    return f"static const double {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}}};"
+    return f"{kind} double {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}}};"

@@ -1,0 +1,124 @@
+"""How runs are made, as `rollout` is asked: the settings, and whether machine code is made."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, Diagram
+
+from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.running.rollout.lanes import library as lanes
+from drake_dae.running.rollout.problems import checked_times
+from drake_dae.running.rollout.program import Program, program_of
+from drake_dae.running.rollout.run import Settings
+from drake_dae.running.rollout.stepping import machine
+from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
+from drake_dae.simulation.simulate import check_config
+from drake_dae.trace.compiled import Compiled, attempts, check_choice
+
+STAGES_PER_SECOND = 500
+"""About so many evaluations takes a simulated second under error control."""
+
+FASTER = 0.05
+"""What runs side by side save of each evaluation, in the times of one that is interpreted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """How runs are made, as `run_loop` is asked.
+
+    Attributes:
+        program: What is run.
+        times: When rows are written, in s.
+        choice: Whether to make machine code.
+        settings: How to step.
+        lasting: As of `run_loop`.
+    """
+
+    program: Program
+    times: FloatArray
+    choice: Compiled
+    settings: Settings
+    lasting: float | None
+
+    @classmethod
+    def of(
+        cls,
+        loop: ClosedLoop | Diagram,
+        times: ArrayLike,
+        config: SimulatorConfig | None,
+        compiled: Compiled | None,
+        lasting: float | None,
+        look: Callable[[RecordAfter], bool] | None = None,
+    ) -> Self:
+        """From the arguments of `run_loop`; errors as of `rollout`."""
+        config = config or SimulatorConfig()
+        check_config(config)
+        program = program_of(loop)
+        choice: Compiled = program.choice if compiled is None else compiled
+        check_choice("rollout", choice)
+        moments = checked_times(times)
+
+        def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+            if look is None:
+                return False
+            return look(lambda after: record_of(program, moments, rows(), after, context))
+
+        settings = Settings.of(config, program.compiled.scale, looked)
+        return cls(program, moments, choice, settings, lasting)
+
+    def machine_code(self, program: Program, count: int) -> machine.Library | None:
+        """A diagram as machine code, by the choice and by what its runs take without.
+
+        Where it does not pay to make it, the cache is looked into if these runs are all.
+        """
+        if self.choice is False:
+            return None
+        if program.library is None and self._is_sought(program, count, 1.0):
+            program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
+        return program.library
+
+    def lanes(self, program: Program, count: int) -> machine.Library | None:
+        """The same for runs side by side."""
+        can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
+        if not can_run or not self._is_sought(program, count, FASTER):
+            return None
+        make = self._pays(program, count, FASTER)
+        return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
+
+    def _is_sought(self, program: Program, count: int, saved: float) -> bool:
+        return self.lasting is None or self._pays(program, count, saved)
+
+    def _pays(self, program: Program, count: int, saved: float) -> bool:
+        """Whether to make machine code that saves a part of each interpreted evaluation."""
+        if self.choice is True:
+            return True
+        seconds = count * float(np.ptp(self.times)) if self.lasting is None else self.lasting
+        calls = STAGES_PER_SECOND * seconds
+        if self.settings.tableau is not None:
+            calls = len(self.settings.tableau.b) / self.settings.longest * seconds
+        pays = attempts("auto", program.num_operations)
+        return any(each.make and saved * calls >= each.calls for each in pays)
+
+
+def record_of(
+    program: Program,
+    times: FloatArray,
+    rows: FloatArray,
+    after: float | None = None,
+    context: Context | None = None,
+) -> Record:
+    """The rows of a run as a record, or those that are later than a time in s."""
+    first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
+    columns = program.signals
+    stops = np.cumsum([len(signals) for signals in columns.values()])
+    parts = np.split(rows[first:], stops[:-1], axis=1)
+    signals = {
+        name: recorded_values(part, tuple(columns[name]))
+        for name, part in zip(columns, parts, strict=True)
+    }
+    return program.complete(Record(times[first : len(rows)], signals), context)

@@ -1,0 +1,127 @@
+"""CasADi functions as C text on `real`, which is a number or several side by side; see lanes.h."""
+
+import casadi as ca
+
+from drake_dae.errors import ModelError
+
+_OPERATIONS: dict[int, str] = {
+    ca.OP_ASSIGN: "{0}",
+    ca.OP_NEG: "-{0}",
+    ca.OP_SQ: "{0} * {0}",
+    ca.OP_TWICE: "{0} + {0}",
+    ca.OP_INV: "K(1.0) / {0}",
+    ca.OP_ADD: "{0} + {1}",
+    ca.OP_SUB: "{0} - {1}",
+    ca.OP_MUL: "{0} * {1}",
+    ca.OP_DIV: "{0} / {1}",
+    ca.OP_SQRT: "square_root({0})",
+    ca.OP_FABS: "magnitude({0})",
+    ca.OP_FMIN: "least({0}, {1})",
+    ca.OP_FMAX: "most({0}, {1})",
+    ca.OP_LT: "ONE_IF(LESS({0}, {1}))",
+    ca.OP_LE: "ONE_IF(NOT_MORE({0}, {1}))",
+    ca.OP_EQ: "ONE_IF(SAME({0}, {1}))",
+    ca.OP_NE: "ONE_IF(~SAME({0}, {1}))",
+    ca.OP_NOT: "ONE_IF(SAME({0}, K(0.0)))",
+    ca.OP_AND: "ONE_IF(~SAME({0}, K(0.0)) & ~SAME({1}, K(0.0)))",
+    ca.OP_OR: "ONE_IF(~SAME({0}, K(0.0)) | ~SAME({1}, K(0.0)))",
+    ca.OP_IF_ELSE_ZERO: "CHOOSE(~SAME({0}, K(0.0)), {1}, K(0.0))",
+    ca.OP_SIGN: "sign({0})",
+    ca.OP_EXP: "each_exp({0})",
+    ca.OP_LOG: "each_log({0})",
+    ca.OP_TAN: "each_tan({0})",
+    ca.OP_ASIN: "each_asin({0})",
+    ca.OP_ACOS: "each_acos({0})",
+    ca.OP_ATAN: "each_atan({0})",
+    ca.OP_SINH: "each_sinh({0})",
+    ca.OP_COSH: "each_cosh({0})",
+    ca.OP_TANH: "each_tanh({0})",
+    ca.OP_FLOOR: "each_floor({0})",
+    ca.OP_CEIL: "each_ceil({0})",
+    ca.OP_POW: "each_pow({0}, {1})",
+    ca.OP_CONSTPOW: "each_pow({0}, {1})",
+    ca.OP_ATAN2: "each_atan2({0}, {1})",
+    ca.OP_COPYSIGN: "each_copysign({0}, {1})",
+}
+"""CasADi's operations in the words of lanes.h."""
+
+_TURNS = (ca.OP_SIN, ca.OP_COS)
+"""These are computed together, since most angles have both."""
+
+
+def can_be_emitted(function: ca.Function) -> bool:
+    """Whether all operations of a function are known here."""
+    known = {*_OPERATIONS, *_TURNS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+    codes = (function.instruction_id(i) for i in range(function.n_instructions()))
+    return known.issuperset(codes)
+
+
+def emitted(function: ca.Function, name: str) -> str:
+    """A function as C text: a value is named once, in the order in which CasADi computes them.
+
+    Args:
+        function: A function of expressions (SX), whose inputs and outputs are dense columns.
+        name: The name of the C function, `void name(const real *a0, ..., real *r0, ...)`.
+
+    Raises:
+        ModelError: It has an operation that `can_be_emitted` does not know.
+    """
+    if not can_be_emitted(function):
+        raise ModelError(f"{function.name()} has an operation that lanes do not know")
+    places: dict[int, str] = {}
+    turned, inverted = set[str](), set[str]()
+    often = _divisors(function)
+    lines = []
+    for i in range(function.n_instructions()):
+        code = function.instruction_id(i)
+        given, found = function.instruction_input(i), function.instruction_output(i)
+        value = f"v{i}"
+        if code == ca.OP_OUTPUT:
+            lines.append(f"r{found[0]}[{found[1]}] = {places[given[0]]};")
+            continue
+        if code == ca.OP_CONST:
+            text = f"K({_number(function.instruction_constant(i))})"
+        elif code == ca.OP_INPUT:
+            text = f"a{given[0]}[{given[1]}]"
+        elif code in _TURNS:
+            angle = places[given[0]]
+            if angle not in turned:
+                turned.add(angle)
+                lines.append(f"real sin_{angle}, cos_{angle};")
+                lines.append(f"turn({angle}, &sin_{angle}, &cos_{angle});")
+            places[found[0]] = f"{'sin' if code == ca.OP_SIN else 'cos'}_{angle}"
+            continue
+        elif code == ca.OP_DIV and i in often:
+            divided, by = (places[place] for place in given)
+            if by not in inverted:
+                inverted.add(by)
+                lines.append(f"const real over_{by} = K(1.0) / {by};")
+            text = f"{divided} * over_{by}"
+        else:
+            text = _OPERATIONS[code].format(*(places[place] for place in given))
+        lines.append(f"const real {value} = {text};")
+        places[found[0]] = value
+    arguments = [f"const real *a{i}" for i in range(function.n_in())]
+    arguments += [f"real *r{i}" for i in range(function.n_out())]
+    unused = " ".join(f"(void)a{i};" for i in range(function.n_in()))
+    body = "\n  ".join([unused, *lines])
+    return f"ON_DEVICE static APART void {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
+
+
+def _divisors(function: ca.Function) -> set[int]:
+    """The divisions whose divisor others have, too: one of them takes as long as ten products."""
+    places, divisions = dict[int, int](), dict[int, list[int]]()
+    for i in range(function.n_instructions()):
+        code, given = function.instruction_id(i), function.instruction_input(i)
+        if code == ca.OP_DIV:
+            divisions.setdefault(places[given[1]], []).append(i)
+        if code != ca.OP_OUTPUT:
+            places[function.instruction_output(i)[0]] = i
+    return {i for same in divisions.values() if len(same) > 1 for i in same}
+
+
+def _number(value: float) -> str:
+    """A constant of C; infinities and nan by division, since C99 has no literals of them."""
+    if value != value:
+        return "0.0 / 0.0"
+    return repr(float(value)) if abs(value) < float("inf") else f"{'-' * (value < 0)}1.0 / 0.0"

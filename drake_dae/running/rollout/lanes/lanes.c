@@ -1,0 +1,245 @@
+/* Many runs, LANES of them side by side. What cannot go on as a matter of course is handed over:
+   stepper.c goes on from the last accepted state, and says why a run fails. */
+
+$header
+$functions
+$constants
+/* As in stepper.c. */
+#define REACHED K(1e-8)
+#define NEAR K(1e-5)
+
+$run
+/* How a run ended here; Python has the same list. */
+enum { DONE, HANDED_OVER };
+
+/* So many trials of a step may be rejected. */
+enum { TRIALS = 30 };
+
+/* The first run that nobody has taken yet, where Python was interrupted. */
+#define STOPPED (1LL << 62)
+#ifdef __CUDACC__
+#define IS_STOPPED(b) 0
+#else
+#define IS_STOPPED(b) (*(b)->next >= STOPPED)
+#endif
+
+/* What Python gives; an array of runs stands row by row. A step of 0 means that all have one row. */
+typedef struct {
+  long long num_runs, most; /* after `most` steps a run is handed over */
+  double *states, *held;    /* where runs start, and where they end */
+  const double *parameters, *noise;
+  long long parameter_step, noise_step;
+  long long num_rows, num_events, stages;
+  const double *times, *events;
+  const long long *due;
+  double *rows;
+  double longest, relative;
+  const double *a, *b, *c;  /* of fixed steps */
+  const double *absolute;   /* of error control */
+  Run *runs;
+  int *endings;
+  volatile long long *next; /* the first run that nobody has taken yet */
+} Batch;
+
+/* Runs under way, and what does not change within a step. */
+typedef struct {
+  real x[SIZE], held[HELD + 1], parameters[PARAMETERS + 1], given[GIVEN + 1];
+  real time; /* to which `given` belongs */
+  long long run[LANES], event[LANES];
+} Lanes;
+
+ON_DEVICE static void load(const Batch *b, Lanes *l, int lane, long long run) {
+  int i;
+  l->run[lane] = run;
+  for (i = 0; i < SIZE; i++) LANE(l->x[i], lane) = b->states[run * SIZE + i];
+  for (i = 0; i < HELD; i++) LANE(l->held[i], lane) = b->held[run * HELD + i];
+  for (i = 0; i < PARAMETERS; i++) {
+    LANE(l->parameters[i], lane) = b->parameters[run * b->parameter_step + i];
+  }
+  LANE(l->time, lane) = NAN;
+}
+
+ON_DEVICE static void save(const Batch *b, const Lanes *l, int lane, const real *x, const real *held,
+                           Run state, int ending) {
+  long long run = l->run[lane];
+  int i;
+  for (i = 0; i < SIZE; i++) b->states[run * SIZE + i] = LANE(x[i], lane);
+  for (i = 0; i < HELD; i++) b->held[run * HELD + i] = LANE(held[i], lane);
+  b->runs[run] = state;
+  b->endings[run] = ending;
+}
+
+ON_DEVICE static Run begun(const Batch *b) {
+  Run run;
+  memset(&run, 0, sizeof(run));
+  run.time = run.start = run.mark = b->times[0];
+  run.pending = ALL;
+  return run;
+}
+
+/* The number of the next run, or of the first of several. */
+ON_DEVICE static long long take(const Batch *b, long long count) {
+#ifdef __CUDACC__
+  return (long long)atomicAdd((unsigned long long *)b->next, (unsigned long long)count);
+#else
+  return __atomic_fetch_add(b->next, count, __ATOMIC_RELAXED);
+#endif
+}
+
+ON_DEVICE static void set_time(real time, Lanes *l) {
+  if (!GIVEN || !any(~SAME(time, l->time))) return;
+  dae_given(&time, l->parameters, l->given);
+  l->time = time;
+}
+
+/* The derivative of the state; returns where it has a value. */
+ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
+  real valid;
+  set_time(time, l);
+  dae_rate(&time, x, l->held, l->parameters, l->given, rate, &valid);
+  return is_number(valid);
+}
+
+/* Brings some states to N*; returns which are there. */
+ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
+  real found[SIZE], at[SIZE], left;
+  const real *from = x;
+  mask open = wanted, near;
+  int i, attempt;
+  if (!PROJECTS || !any(wanted)) return wanted;
+  set_time(time, l);
+  for (attempt = 0; attempt < 8; attempt++) {
+    dae_newton(&time, from, l->held, l->parameters, l->given, found, &left);
+    near = NOT_MORE(left, REACHED) & open;
+    for (i = 0; i < SIZE; i++) {
+      at[i] = found[i];
+      x[i] = CHOOSE(near, found[i], x[i]);
+    }
+    open &= ~near;
+    if (!any(open) || (attempt && !any(open & NOT_MORE(left, NEAR)))) break;
+    from = at;
+  }
+  return wanted & ~open;
+}
+
+/* One row of the record for some runs; returns which could be written. */
+ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, const real *x,
+                            const long long *row) {
+  real values[WIDTH + 1], valid;
+  int i, lane;
+  set_time(time, l);
+  dae_row(&time, x, l->held, l->parameters, l->given, values, &valid);
+  wanted &= is_number(valid);
+  for (lane = 0; lane < LANES; lane++) {
+    double *into = b->rows + (l->run[lane] * b->num_rows + row[lane]) * WIDTH;
+    if (!LANE(wanted, lane)) continue;
+    for (i = 0; i < WIDTH; i++) into[i] = LANE(values[i], lane);
+  }
+  return wanted;
+}
+
+/* Which runs have an update of one of some rates now. */
+ON_DEVICE static mask due(const Batch *b, const Lanes *l, mask now, int number) {
+  int lane;
+  for (lane = 0; lane < LANES; lane++) {
+    if (LANE(now, lane)) LANE(now, lane) = -(b->due[l->event[lane]] >> number & 1);
+  }
+  return now;
+}
+
+/* The updates of one kind that are due; returns where they have values. */
+ON_DEVICE static mask apply(const Batch *b, real time, Lanes *l, mask now, int unrestricted) {
+  real fresh[HELD + 1], noise[NOISE + 1];
+  mask good = now;
+  int i, lane;
+  (void)time, (void)unrestricted;
+  if (!RATES || !any(now)) return now;
+  set_time(time, l);
+  for (i = 0; i < NOISE; i++) {
+    noise[i] = K(0.0);
+    for (lane = 0; lane < LANES; lane++) {
+      if (!LANE(now, lane)) continue;
+      LANE(noise[i], lane) = b->noise[l->run[lane] * b->noise_step + l->event[lane] * NOISE + i];
+    }
+  }
+  memcpy(fresh, l->held, HELD * sizeof(real));
+$updates
+  memcpy(l->held, fresh, HELD * sizeof(real));
+  return good;
+}
+
+/* What happens at the start of a step; returns where it could be done. */
+ON_DEVICE static mask update(const Batch *b, real time, Lanes *l, mask to_project, mask now) {
+  mask good = apply(b, time, l, now, 1) | ~now;
+  good &= project(time, l->x, l, to_project) | ~to_project;
+  return good & (apply(b, time, l, now, 0) | ~now);
+}
+
+/* Which runs have samples at their time. */
+ON_DEVICE static mask sampled(const Batch *b, const Lanes *l, mask wanted, const Run *run) {
+  int lane;
+  (void)l;
+  for (lane = 0; lane < LANES; lane++) {
+    long long event = run[lane].event;
+    if (event >= b->num_events || b->events[event] > run[lane].time) LANE(wanted, lane) = 0;
+  }
+  return wanted;
+}
+
+/* All that happens at the start of a step; returns where it could be done. */
+ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, mask to_project,
+                              Run *run, mask *changed) {
+  mask good = wanted, now = none();
+  int lane;
+  if (RATES) now = sampled(b, l, wanted, run);
+  *changed = now;
+  if (!any(now)) return good & (project(time, l->x, l, to_project) | ~to_project);
+  for (;;) {
+    for (lane = 0; lane < LANES; lane++) l->event[lane] = run[lane].event;
+    good &= update(b, time, l, to_project & good, now & good);
+    if (!any(now)) return good;
+    for (lane = 0; lane < LANES; lane++) run[lane].event += LANE(now, lane) != 0;
+    now = sampled(b, l, now & good, run);
+    to_project = none();
+  }
+}
+
+/* x and the weighted sum of rates; most weights of a high order are zero. */
+ON_DEVICE static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE],
+                            real *reached) {
+  int i, j;
+  for (i = 0; i < SIZE; i++) {
+    real sum = K(0.0);
+    for (j = 0; j < count; j++) {
+      const double weight = b[j];
+      if (weight != 0.0) sum += K(weight) * k[j][i];
+    }
+    reached[i] = x[i] + step * sum;
+  }
+}
+$fixed
+$controlled
+#ifdef __CUDACC__
+/* One run, or under error control one after the other, in each thread of a device. */
+#ifdef __cplusplus
+extern "C"
+#endif
+__global__ void run_on_device(const Batch *b) {
+  const long long first = (long long)blockIdx.x * blockDim.x + threadIdx.x;
+  if (!b->stages) {
+    run_apart(b);
+  } else if (first < b->num_runs) {
+    run_together(b, first);
+  }
+}
+#else
+/* What Python calls, from any number of threads at once. */
+__attribute__((visibility("default"))) void run_lanes(const Batch *b) {
+  long long first;
+  if (!b->stages) {
+    run_apart(b);
+    return;
+  }
+  while ((first = take(b, LANES)) < b->num_runs) run_together(b, first);
+}
+#endif

@@ -1,0 +1,117 @@
+"""Many runs of a diagram as one library of machine code, in which they go side by side."""
+
+import ctypes
+from collections.abc import Mapping
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.integrate import DOP853
+
+from drake_dae.running.rollout.lanes.emitter import can_be_emitted, emitted
+from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.stepping.machine import RUN, c_table
+from drake_dae.trace.compiled import Compiled, library
+
+FOLDER = Path(__file__).parent
+
+CONTRACTED = ("-ffp-contract=fast", "-O2")
+"""A product and a sum are one operation where the processor can; -O2 takes a tenth less time."""
+
+
+def can_run(program: Program) -> bool:
+    """Whether runs of a diagram can go side by side: no block changes, nor does Drake step one."""
+    compiled = program.compiled
+    if compiled.changes or compiled.has_stepped or not program.size:
+        return False
+    return all(can_be_emitted(each) for each in _functions(program).values())
+
+
+def load(program: Program, compiled: Compiled, make: bool) -> ctypes.CDLL | None:
+    """The library of a diagram; None if there is none.
+
+    Args:
+        program: The diagram.
+        compiled: The choice, True or "auto".
+        make: Whether to make it where the cache has none.
+
+    Warns:
+        MachineCodeWarning: It should be made and cannot be.
+    """
+    operations = program.num_operations
+    path = library(source(program), operations, compiled, make, CONTRACTED)
+    return None if path is None else ctypes.CDLL(str(path))
+
+
+def source(program: Program) -> str:
+    """The C source of a diagram."""
+    functions, compiled = _functions(program), program.compiled
+    texts = [emitted(function, f"dae_{name}") for name, function in functions.items()]
+    words: dict[str, Any] = {
+        "header": _text("lanes.h"),
+        "functions": "\n".join(texts),
+        "constants": _constants(program, functions),
+        "run": RUN.read_text(encoding="utf-8"),
+        "updates": "\n".join(
+            _updated(number, len(rate.places), rate.is_unrestricted)
+            for number, rate in enumerate(compiled.rates)
+        ),
+        "fixed": _text("fixed.c"),
+        "controlled": _text("controlled.c"),
+    }
+    return Template(_text("lanes.c")).substitute(words)
+
+
+def _functions(program: Program) -> Mapping[str, ca.Function]:
+    return program.functions
+
+
+def _text(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def _constants(program: Program, functions: Mapping[str, ca.Function]) -> str:
+    compiled = program.compiled
+    sizes = {
+        "SIZE": program.size,
+        "HELD": compiled.sizes["held"],
+        "PARAMETERS": compiled.sizes["parameters"],
+        "NOISE": compiled.sizes["noise"],
+        "WIDTH": program.width,
+        "GIVEN": functions["given"].numel_out(0),
+        "PROJECTS": int(compiled.projects),
+        "RATES": len(compiled.rates),
+    }
+    tables = {
+        "dop_a": DOP853.A,
+        "dop_b": DOP853.B,
+        "dop_c": DOP853.C,
+        "dop_e3": DOP853.E3,
+        "dop_e5": DOP853.E5,
+        "dop_d": DOP853.D,
+        "dop_a_more": DOP853.A_EXTRA,
+        "dop_c_more": DOP853.C_EXTRA,
+    }
+    lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
+    for number, rate in enumerate(compiled.rates):
+        listed = ", ".join(map(str, [*rate.places, 0]))
+        lines.append(f"CONSTANT int places_{number}[] = {{{listed}}};")
+    lines += [c_table(name, np.asarray(values), "CONSTANT") for name, values in tables.items()]
+    return "\n".join([*lines, ""])
+
+
+def _updated(number: int, count: int, is_unrestricted: bool) -> str:
+    """How lanes.c computes an update where it is due."""
+    return f"""  if (unrestricted == {int(is_unrestricted)}) {{
+    const mask own = due(b, l, now, {number});
+    if (any(own)) {{
+      real values[{count + 1}], valid;
+      dae_update_{number}(&time, l->x, l->held, l->parameters, l->given, noise, values, &valid);
+      good &= is_number(valid) | ~own;
+      for (i = 0; i < {count}; i++) {{
+        fresh[places_{number}[i]] = CHOOSE(own, values[i], fresh[places_{number}[i]]);
+      }}
+    }}
+  }}"""

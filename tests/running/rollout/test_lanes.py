@@ -1,0 +1,237 @@
+"""Runs side by side against the same runs one after the other, and their arithmetic alone."""
+
+import ctypes
+import re
+import shutil
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+from runs import scenario
+
+from drake_dae import build_scenario, rollout, start_values
+from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.errors import MachineCodeWarning, ModelError
+from drake_dae.running.rollout import rollout as module
+from drake_dae.running.rollout.lanes.emitter import emitted
+from drake_dae.running.rollout.lanes.library import CONTRACTED, FOLDER
+from drake_dae.trace.compiled import library
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+
+FIXED = [
+    "integrator.integration_scheme=runge_kutta3",
+    "integrator.use_error_control=false",
+    "integrator.max_step_size=1e-3",
+]
+ONE_AFTER_THE_OTHER = 10**9
+COUNT = 11
+"""More than a register has, and no multiple of it."""
+
+
+def problem(name, *settings):
+    """A closed loop, its integrator, and random starts and link masses for some runs."""
+    chosen = scenario(name, *settings)
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    random, size = np.random.default_rng(0), loop.plant.dae.num_states
+    manifold, mass = loop.plant.structure.manifold, loop.plant.dae.parameter_slice("link1.mass")
+    starts, rows = [], []
+    for _ in range(COUNT):
+        near = manifold.settle(start[:size] + 0.02 * random.normal(size=size))
+        starts.append(np.concatenate([near, start[size:]]))
+        rows.append(parameters.copy())
+        rows[-1][mass] *= random.uniform(0.9, 1.1)
+    return loop, chosen, np.array(starts), np.array(rows)
+
+
+def both_ways(monkeypatch, *arguments, **settings):
+    """The runs side by side, and one after the other."""
+    found = []
+    for several in (1, ONE_AFTER_THE_OTHER):
+        monkeypatch.setattr(module, "SEVERAL", several)
+        found.append(rollout(*arguments, compiled=True, **settings))
+    return found
+
+
+def assert_same(ours, theirs, tolerance, slack=0):
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.failure is None
+        assert abs(one.steps - other.steps) <= slack
+        for name, recorded in other.record.signals.items():
+            scale = max(1.0, np.abs(recorded.values).max(initial=0.0))
+            np.testing.assert_allclose(
+                one.record[name], recorded.values, rtol=0.0, atol=tolerance * scale
+            )
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "seeds"),
+    [
+        ("two_link_wall", [], ()),
+        pytest.param("seven_joint_wall", [], (), marks=pytest.mark.slow),
+        pytest.param(
+            "two_link_wall",
+            [
+                "sampling={period: 0.002, delay: 0.001}",
+                "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3}",
+            ],
+            ("encoder_noise",),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "two_link_measured_force",
+            ["force_feedback=!MeasuredForce {sample_period: 0.003, noise_deviation: 0.1}"],
+            ("force_noise",),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_fixed_steps_are_equal(monkeypatch, name, settings, seeds):
+    """To 1e-13 of the largest value, after 100 steps: products and sums are rounded once."""
+    loop, chosen, starts, rows = problem(name, *settings, *FIXED)
+    given = [dict.fromkeys(seeds, encoder_seed(number)) for number in range(COUNT)]
+    times = [0.0, 0.0125, 0.05, 0.1]
+    config = chosen.integrator
+    found = both_ways(monkeypatch, loop, starts, rows, times, config=config, seeds=given)
+    assert_same(*found, 1e-13)
+
+
+def test_error_control_with_equal_steps_is_equal(monkeypatch):
+    """To 1e-13 of the largest value: the longest step is what all take, rows lie between."""
+    settings = ["integrator.accuracy=1e-6", "integrator.max_step_size=0.01"]
+    loop, chosen, starts, rows = problem("two_link_wall", *settings)
+    times = np.linspace(0.0, 0.3, 71)
+    assert_same(*both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator), 1e-13)
+
+
+@pytest.mark.parametrize(
+    "settings", [[], pytest.param(["sampling={period: 0.05}"], marks=pytest.mark.slow)]
+)
+def test_each_run_has_steps_of_its_own(monkeypatch, settings):
+    """To 1e-9, as accurate as steps are: round-off in the estimate of an error shifts them."""
+    loop, chosen, starts, rows = problem("two_link_wall", "integrator.accuracy=1e-6", *settings)
+    # Steps differ where speeds do.
+    fast = loop.plant.structure.manifold
+    starts[:, :4] = [
+        fast.settle(each[:4] * np.r_[1.0, 1.0, 10.0 * k, 10.0 * k]) for k, each in enumerate(starts)
+    ]
+    times = np.linspace(0.0, 1.0, 31)
+    ours, theirs = both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator)
+    assert_same(ours, theirs, 1e-9, slack=1)
+    if not settings:
+        assert len({each.steps for each in ours}) > 2
+
+
+@pytest.mark.parametrize("config", [FIXED, ["integrator.accuracy=1e-6"]])
+def test_a_run_does_not_depend_on_those_beside_it(monkeypatch, config):
+    """To the last bit, in another order and among fewer."""
+    loop, chosen, starts, rows = problem("two_link_wall", *config)
+    monkeypatch.setattr(module, "SEVERAL", 1)
+    settings = {"config": chosen.integrator, "compiled": True}
+    times = np.linspace(0.0, 0.2, 5)
+    whole = rollout(loop, starts, rows, times, **settings)
+    backward = rollout(loop, starts[::-1], rows[::-1], times, **settings)[::-1]
+    (alone,) = rollout(loop, starts[3], rows[3], times, **settings)
+    for one, other in zip(whole, backward, strict=True):
+        np.testing.assert_array_equal(one.record["state"], other.record["state"])
+    np.testing.assert_array_equal(whole[3].record["state"], alone.record["state"])
+
+
+def assert_same_failures(ours, theirs):
+    for one, other in zip(ours, theirs, strict=True):
+        assert type(one.failure) is type(other.failure)
+        assert one.record.time.size == other.record.time.size
+        if one.failure is not None:
+            assert one.failure.time == pytest.approx(other.failure.time, abs=1e-9)
+            assert str(one.failure)[:20] == str(other.failure)[:20]
+
+
+@pytest.mark.parametrize(
+    "config", [["integrator.accuracy=1e-6"], [*FIXED[:2], "integrator.max_step_size=0.01"]]
+)
+def test_a_run_fails_in_the_words_that_it_has_alone(monkeypatch, config):
+    """At its own time, to round-off: the tool leaves what the arm can reach."""
+    settings = ["references.tool.z.amplitudes=[3.0]", *config]
+    loop, chosen, starts, rows = problem("two_link_wall", *settings)
+    times = np.linspace(0.0, 0.6, 61)
+    found = both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator)
+    assert all(each.failure is not None for each in found[0])
+    assert_same_failures(*found)
+
+
+def test_a_run_that_fails_ends_no_other(monkeypatch):
+    """Every third run has gains that no step of this length follows; the others reach the end."""
+    euler = ["integrator.integration_scheme=explicit_euler", FIXED[1]]
+    settings = [*euler, "integrator.max_step_size=0.01"]
+    loop, chosen, starts, rows = problem("two_link_wall", *settings)
+    rows[::3] = start_values(*build_scenario(scenario("two_link_wall", "gains.all=[-4000]")))[1]
+    times = np.linspace(0.0, 2.0, 21)
+    ours, theirs = both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator)
+    assert [each.failure is None for each in ours] == [k % 3 > 0 for k in range(COUNT)]
+    assert_same_failures(ours, theirs)
+    going = [k for k in range(COUNT) if k % 3]
+    assert_same([ours[k] for k in going], [theirs[k] for k in going], 1e-12)
+
+
+X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+a, b, c = ca.vertsplit(X)
+OPERATIONS = ca.vertcat(
+    *(-a, ca.exp(a), ca.log(b), ca.sqrt(b), a**2, a + a, a**3, ca.fabs(a), ca.sin(a), ca.cos(a)),
+    *(ca.tan(a), ca.asin(c), ca.acos(c), ca.atan(a), ca.sinh(c), ca.cosh(c), ca.tanh(c)),
+    *(ca.sign(a), ca.sign(0.0 * a), 1 / b, a / b, c / b, ca.floor(a), ca.ceil(a), b**a, P[0]),
+    *(a - b, a * b, ca.fmin(a, b), ca.fmax(a, b), ca.fmin(ca.log(a), b), ca.fmax(b, ca.log(a))),
+    *(a < b, a <= b, ca.eq(a, b), ca.ne(a, b), ca.atan2(a, b), ca.copysign(b, a)),
+    ca.if_else(ca.logic_and(a > 0, ca.logic_or(b > 1, ca.logic_not(c > 0))), P[0] * b, P[1]),
+    ca.if_else(a > 0, ca.sqrt(a), 0),
+    *(ca.sin(1e4 * a), ca.cos(1e4 * a), ca.sin(1e7 * a), ca.cos(1e7 * a), 3.0),
+)
+ENTRY = """
+__attribute__((visibility("default"))) int evaluate(const double *x, const double *p, double *r) {
+  real own[3], shared[2], found[ROWS];
+  int i, lane;
+  for (lane = 0; lane < LANES; lane++) {
+    for (i = 0; i < 3; i++) LANE(own[i], lane) = x[3 * lane + i];
+    for (i = 0; i < 2; i++) LANE(shared[i], lane) = p[i];
+  }
+  operations(own, shared, found);
+  for (lane = 0; lane < LANES; lane++) {
+    for (i = 0; i < ROWS; i++) r[ROWS * lane + i] = LANE(found[i], lane);
+  }
+  return LANES;
+}
+"""
+
+
+@pytest.mark.parametrize("options", ["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"])
+def test_operations_are_those_of_casadi(options):
+    """To two units in the last place; sine and cosine have a series of their own."""
+    function = ca.Function("operations", [X, P], [OPERATIONS], {"cse": False})
+    rows = function.numel_out(0)
+    header = (FOLDER / "lanes.h").read_text()
+    text = [header, emitted(function, "operations"), f"enum {{ ROWS = {rows} }};", ENTRY]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MachineCodeWarning)
+        path = library("\n".join(text), 100, True, True, (*CONTRACTED, options))
+    if path is None:
+        pytest.skip(f"the C compiler does not know {options}")
+    code = ctypes.CDLL(str(path))
+    random = np.random.default_rng(0)
+    shared = np.array([1.5, -0.5])
+    for _ in range(20):
+        points = random.uniform([-2.0, 0.1, -0.9], [2.0, 2.0, 0.9], (8, 3))
+        points[0, 0] = 0.0
+        found = np.zeros((8, rows))
+        given = (each.ctypes.data_as(ctypes.c_void_p) for each in (points, shared, found))
+        lanes = code.evaluate(*given)
+        assert lanes == (1 if options == "-DONE_LANE" else lanes)
+        for point, values in zip(points[:lanes], found, strict=False):
+            wanted = function(point, shared).full()[:, 0]
+            np.testing.assert_allclose(values, wanted, rtol=5e-16, atol=2e-16)
+
+
+def test_what_lanes_do_not_know_is_refused():
+    function = ca.Function("odd", [X], [ca.erf(X)])
+    with pytest.raises(ModelError, match=re.escape("odd has an operation that lanes do not know")):
+        emitted(function, "odd")
