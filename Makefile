@@ -11,7 +11,7 @@ PYTHON := $(PYTHON)
 
 SCENARIO ?= seven_joint_wall
 SEED ?= 0
-RUNS ?= 200
+RUNS ?= 1000
 VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
@@ -83,7 +83,7 @@ robots: $(VENV)/installed-dev
 # Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
 # all the same ends its run, with the reason.
 unknowns: $(VENV)/installed
-	$(BIN)/drake-dae sweep wall_point_contact --random $(RUNS) --seed $(SEED) --out runs/unknowns \
+	$(BIN)/drake-dae sweep wall_point_contact --rollout --random $(RUNS) --seed $(SEED) --out runs/unknowns \
 		--set duration=1.6 --set 'constraints.0.rpy=[0, 0, 0]' \
 		--set 'force_feedback=!MeasuredForce {sample_period: 0.001}' \
 		--set 'tolerances={outputs: {tool.y: 0.005, tool.z: 0.005, wall.force: 10}, after: 0.5}' \

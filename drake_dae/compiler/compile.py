@@ -24,7 +24,6 @@ from drake_dae.systems.blocks.traced import (
     STATE,
     Block,
     Computation,
-    not_traced,
 )
 
 
@@ -79,7 +78,6 @@ def _compiled(
     is_short: bool = False,
 ) -> CompiledDiagram:
     wires = Wires.of(diagram)
-    _refuse(wires)
     if outputs is None:
         outputs = [name for name, port in wires.outputs.items() if _is_vector(port)]
     for name in outputs:
@@ -88,6 +86,9 @@ def _compiled(
     context = context or diagram.CreateDefaultContext()
     expressions = Expressions(wires, context, twins, is_short)
     chosen = [wires.outputs[name] for name in outputs]
+    for system in wires.systems:
+        if getattr(system, "ends_runs", False):  # It counts, though it leads to no output.
+            expressions.block(system)
     _needed_systems(expressions, chosen)
     blocks = {each: expressions.used[each] for each in wires.systems if each in expressions.used}
     columns, places = {"time": expressions.time}, {}
@@ -186,14 +187,6 @@ def _check_stepped(blocks: Mapping[System, Block], states: Sequence[Place]) -> N
             "sample the law, with a force sensor without a time constant, or run the loop by "
             "simulate"
         )
-
-
-def _refuse(wires: Wires) -> None:
-    """Refuses what ends a run by its own will, which no function of the time does."""
-    for system in wires.systems:
-        what = getattr(system, "ends_runs", None)
-        if what is not None:
-            raise not_traced(what)
 
 
 def _is_vector(port: tuple[System, int]) -> bool:

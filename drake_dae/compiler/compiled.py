@@ -183,13 +183,21 @@ class CompiledDiagram:
     ) -> FloatArray:
         """What is held when a run begins: what is not a number yet, as its block says."""
         found = held.copy()
+        for part, initial in self._initial:
+            if np.isnan(found[part]).any():
+                found[part] = initial(time, state, held, parameters).full()[:, 0]
+        return found
+
+    @cached_property
+    def _initial(self) -> list[tuple[slice, ca.Function]]:
+        """What blocks hold when a run begins, where that is not a number."""
+        found = []
         for system, part in self.held:
             initial = self.blocks[system].initial
-            if initial is not None and np.isnan(found[part]).any():
+            if initial is not None:
                 call = self._expressions.call(self.blocks[system], initial)
                 value = call.results[initial.outputs.index(HELD)]
-                function = self._function("initial", [value])
-                found[part] = function(time, state, held, parameters).full()[:, 0]
+                found.append((part, self._function("initial", [value])))
         return found
 
     def values(self, context: Context) -> FloatArray:

@@ -41,3 +41,29 @@ class KnownForce:
         """The reaction on the robot."""
         velocity = kinematics.velocity(self.frame, self.point)
         return kinematics.reaction(ca.dot(self.parameters[0].symbol, velocity))
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class ScaledForce(KnownForce):
+    """A force s(t) F on a point of a frame, whose course s is an exogenous signal.
+
+    The parameter "<name>.force" is F in N, in the world, and "<name>.course" is s, zero by default:
+    a study changes F without another signal.
+
+    Attributes:
+        force: The default of F.
+    """
+
+    name: str = "scaled_force"
+    force: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        force = Parameter(f"{self.name}.force", np.array(self.force), "N")
+        course = Parameter(f"{self.name}.course", np.zeros(1))
+        object.__setattr__(self, "parameters", (force, course))
+
+    def reaction(self, kinematics: Kinematics) -> Reaction:
+        force, course = (parameter.symbol for parameter in self.parameters)
+        velocity = kinematics.velocity(self.frame, self.point)
+        return kinematics.reaction(course * ca.dot(force, velocity))

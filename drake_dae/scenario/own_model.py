@@ -4,17 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context
 
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import ScaledForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.forms.keys import each
+from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
+from drake_dae.systems.plants.contract import Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +40,8 @@ class OwnModel:
 def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     """The model of a scenario's ideal plant; None if it is that of its law.
 
-    A payload is a further body, and a disturbance is a force like those of `known_forces` as an
-    exogenous signal.
+    A payload is a further body, and the course of a disturbance is an exogenous signal. Masses and
+    forces are parameters, which `begin_own_model` sets in a context.
 
     Args:
         scenario: The scenario, completed.
@@ -50,15 +54,13 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     if scenario.plant.carries or not (payloads or disturbances):
         return None
     check_disturbances(disturbances, links)
-    named = {
-        f"plant_disturbance_{index}": disturbance for index, disturbance in enumerate(disturbances)
-    }
+    named = {_name(index): disturbance for index, disturbance in enumerate(disturbances)}
     known_forces = [
-        KnownForce(disturbance.frame, disturbance.point, name)
+        ScaledForce(disturbance.frame, disturbance.point, name, disturbance.force)
         for name, disturbance in named.items()
     ]
     moving: dict[str, Any] = {
-        f"{name}.force": [disturbance.reference] for name, disturbance in named.items()
+        f"{name}.course": [disturbance.course] for name, disturbance in named.items()
     }
     own = replace(
         scenario,
@@ -68,6 +70,34 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     scene_graph = SceneGraph()
     model = completed_model(own, scene_graph, payloads)[1]
     return OwnModel(own, model, scenario_structure(model), scene_graph)
+
+
+def _name(index: int) -> str:
+    return f"plant_disturbance_{index}"
+
+
+def begin_own_model(scenario: Scenario, plant: Plant, context: Context) -> None:
+    """Sets the masses of payloads and the forces of disturbances in the context of a plant.
+
+    Raises:
+        ScenarioError: A number makes no sense; the message names its key.
+    """
+    if scenario.plant.carries:
+        return
+    given: dict[str, list[tuple[str, ArrayLike]]] = {
+        "plant_payloads": [(f"{one.name}.mass", one.mass) for one in scenario.plant_payloads],
+        "plant_disturbances": [
+            (f"{_name(index)}.force", one.force)
+            for index, one in enumerate(scenario.plant_disturbances)
+        ],
+    }
+    values = plant.parameters(context)
+    for key, numbers in given.items():
+        with at(key):
+            for name, wanted in numbers:
+                # A plant of one's own may have fixed numbers, made with these.
+                if not np.array_equal(values[plant.dae.parameter_slice(name)], np.ravel(wanted)):
+                    plant.set_parameter(context, name, wanted)
 
 
 def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:

@@ -59,11 +59,12 @@ class ScenarioPlant(ABC):
        the context.
     3. `material` is the material of compliant contacts; None for ideal ones.
     4. `rolled` is the member that a rollout runs in its place: itself, or one with a traced plant.
-    5. `in_context` are the keys of numbers that `begin` sets in the context of a plant that was
-       made with others.
+    5. With `adjusts` the parameters of the plant can be set in a context. `in_context` are the keys
+       of numbers that `begin` sets in the context of a plant that was made with others.
     """
 
     carries: ClassVar[bool] = False
+    adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
@@ -228,6 +229,7 @@ class OwnPlant(ScenarioPlant):
     """
 
     maker: str
+    adjusts: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         module, _, name = self.maker.partition(":")

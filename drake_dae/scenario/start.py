@@ -14,6 +14,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
+from drake_dae.scenario.own_model import begin_own_model
 from drake_dae.scenario.parts.families import Gains
 from drake_dae.scenario.scenario import Scenario
 
@@ -47,8 +48,13 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
                 plant.set_parameter(own, name, numbers)
+    begin_own_model(scenario, plant, own)
     with at("plant"):
         scenario.plant.begin(plant, own)
+    if loop.sensor is not None:
+        with at("force_feedback"):
+            sensed = loop.sensor.GetMyMutableContextFromRoot(context)
+            scenario.force_feedback.begin(loop.sensor, sensed)
     if controller.takes_over:
         with at("start"):
             plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))

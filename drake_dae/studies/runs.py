@@ -10,6 +10,7 @@ from functools import lru_cache
 from threading import Lock
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
@@ -73,6 +74,10 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
         own["plant"] = {**own["plant"], **same}
     if kind.carries:  # It is built with its own parameters.
         own["plant_parameters"] = data["plant_parameters"]
+    elif kind.adjusts:
+        own["plant_payloads"] = [{**each, "mass": 1.0} for each in own["plant_payloads"]]
+        still = {"force": [0.0, 0.0, 0.0]}
+        own["plant_disturbances"] = [{**each, **still} for each in own["plant_disturbances"]]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
@@ -82,8 +87,10 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
         tag = own["gains"].get(TAG, "!Poles")
         if tag == base["gains"][TAG] != "!Matrices":
             own["gains"] = base["gains"]
-    if "seed" in own["force_feedback"]:
-        own["force_feedback"] = {**own["force_feedback"], "seed": 0}
+    if "seed" in (force := own["force_feedback"]):
+        deviation = float(np.any(np.array(force["noise_deviation"]) != 0.0))
+        errors = {"seed": 0, "bias": 0.0, "noise_deviation": deviation}
+        own["force_feedback"] = {**force, **errors}
     if own["encoders"]:
         own["encoders"] = {**own["encoders"], "seed": 0}
     return own

@@ -101,6 +101,7 @@ class Asked:
         calls = STAGES_PER_SECOND * seconds
         if self.settings.tableau is not None:
             calls = len(self.settings.tableau.b) / self.settings.longest * seconds
+        calls += seconds * sum(1.0 / rate.period for rate in program.compiled.rates)
         pays = attempts("auto", program.num_operations)
         return any(each.make and saved * calls >= each.calls for each in pays)
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from pydrake.systems.framework import Context
+
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.scenario.forms.values import Numbers
@@ -21,6 +23,9 @@ class ModelForce:
     def sensor(self, size: int) -> ForceSensor | None:
         """None: the force is not measured, so there is no sensor."""
         return None
+
+    def begin(self, sensor: ForceSensor, context: Context) -> None:
+        """Does nothing: there is no sensor."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,10 @@ class MeasuredForce:
         return ForceSensor(
             size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
         )
+
+    def begin(self, sensor: ForceSensor, context: Context) -> None:
+        """Sets the sensor's errors in its context."""
+        sensor.set_errors(context, self.bias, self.noise_deviation)
 
 
 @dataclass(frozen=True)

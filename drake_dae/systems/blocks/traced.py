@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, EventStatus, State, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.trace.functions import TracedFunction
 
 TIME, STATE, HELD, PARAMETERS, NOISE = "$time", "$state", "$held", "$parameters", "$noise"
@@ -165,6 +165,8 @@ class Block:
             law have the same model and numbers and nothing stands between; None if there is none.
         signals: Name of an argument -> names and units of its entries, for messages.
         ports: Name of an output port -> names and units of its entries, as far as they are known.
+        failure: (time, arguments) -> why its update ends a run, where its values are not valid;
+            None for what any function says.
     """
 
     system: System
@@ -183,6 +185,7 @@ class Block:
     under: Callable[[], Computation | None] | None = None
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
+    failure: Callable[[float, Sequence[FloatArray]], SimulationError] | None = None
 
 
 def not_traced(what: str) -> ModelError:

@@ -14,6 +14,7 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
     HELD,
+    PARAMETERS,
     STATE,
     Block,
     Computation,
@@ -40,6 +41,8 @@ class ForceSensor(DifferentiableSystem):
 
     Output port:
         measured_force: The measured force, shape (m,); no direct feedthrough from `force`.
+
+    The context holds bias and noise_deviation as numeric parameters; see `set_errors`.
 
     Args:
         size: The number of forces, m.
@@ -91,6 +94,7 @@ class ForceSensor(DifferentiableSystem):
                 "a ForceSensor needs a time_constant or a sample_period: without state it would "
                 "close an algebraic loop"
             )
+        self.DeclareNumericParameter(BasicVector(np.concatenate([self.bias, self.noise_deviation])))
         self._force_port = self.DeclareVectorInputPort("force", size)
         self._noise_port = None
         if self.noise_deviation.any():
@@ -103,10 +107,24 @@ class ForceSensor(DifferentiableSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
             sources = {self.xd_ticket()}
         else:
-            sources = state_tickets(self)
+            sources = state_tickets(self) | {self.all_parameters_ticket()}
             if self._noise_port is not None:
                 sources.add(self.input_port_ticket(self._noise_port.get_index()))
         self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
+
+    def set_errors(self, context: Context, bias: ArrayLike, noise_deviation: ArrayLike) -> None:
+        """Sets bias and noise_deviation in a context, numbers or shape (m,).
+
+        Raises:
+            ModelError: They do not fit, or there is noise and the sensor was made without.
+        """
+        self.check_context(context)
+        size = self._force_port.size()
+        other = ForceSensor(size, self.time_constant, self.sample_period, bias, noise_deviation)
+        if other.noise_deviation.any() and self._noise_port is None:
+            raise ModelError("a ForceSensor that was made without noise has no port for it")
+        errors = np.concatenate([other.bias, other.noise_deviation])
+        context.get_mutable_numeric_parameter(0).SetFromVector(errors)
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
         """Sets the steady state of the sensor for a constant force, shape (m,), without noise."""
@@ -115,7 +133,8 @@ class ForceSensor(DifferentiableSystem):
         if self.time_constant:
             context.SetContinuousState(value)
         if self.sample_period:
-            context.SetDiscreteState(self._held, value + self.bias)
+            bias = context.get_numeric_parameter(0).value()[: value.size]
+            context.SetDiscreteState(self._held, value + bias)
 
     def largest_stable_gain(self) -> float:
         """The largest gain Gbar of (59) for which a rigid robot's force error decays.
@@ -150,9 +169,10 @@ class ForceSensor(DifferentiableSystem):
             value = context.get_continuous_state_vector().CopyToVector()
         else:
             value = self._force_port.Eval(context)
+        bias, deviation = np.split(context.get_numeric_parameter(0).value(), 2)
         if self._noise_port is not None:
-            value = value + self.noise_deviation * self._noise_port.Eval(context)
-        return value + self.bias
+            value = value + deviation * self._noise_port.Eval(context)
+        return value + bias
 
     def _sample(self, context: Context, state: object) -> None:
         state.set_value(self._held, self._felt(context))  # type: ignore[attr-defined]
@@ -166,11 +186,13 @@ class ForceSensor(DifferentiableSystem):
     def traced(self) -> Block:
         size = self._force_port.size()
         force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "felt", "noise"))
-        sources, inputs = [("force", STATE)[bool(self.time_constant)]], [force]
-        measured = force + self.bias
+        errors = ca.SX.sym("errors", 2 * size)
+        sources = [("force", STATE)[bool(self.time_constant)], PARAMETERS]
+        inputs, measured = [force, errors], force
         if self._noise_port is not None:
-            sources, inputs = [*sources, "noise"], [force, noise]
-            measured = measured + self.noise_deviation * noise
+            sources, inputs = [*sources, "noise"], [*inputs, noise]
+            measured = measured + errors[size:] * noise
+        measured = measured + errors[:size]
         feel = ca.Function("measured_force", inputs, [measured])
         computations, updates = [], []
         if self.time_constant:
@@ -193,6 +215,7 @@ class ForceSensor(DifferentiableSystem):
             )
         size = self._force_port.size()
         force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
+        errors = ca.SX.sym("errors", 2 * size)
         rate = TracedFunction(
             "force sensor",
             {"force": force, "state": felt},
@@ -201,8 +224,9 @@ class ForceSensor(DifferentiableSystem):
         inputs, measured = {"state": felt}, felt
         if self._noise_port is not None:
             inputs["noise"] = noise
-            measured = measured + self.noise_deviation * noise
-        output = TracedFunction("measured force", inputs, {"value": measured + self.bias})
+            measured = measured + errors[size:] * noise
+        inputs["parameters"] = errors
+        output = TracedFunction("measured force", inputs, {"value": measured + errors[:size]})
         return {
             "derivative": TracedFormula(rate),
             "measured_force": TracedFormula(output),

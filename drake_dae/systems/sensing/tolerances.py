@@ -4,15 +4,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
+import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import brief, number, positive, unknown_name
+from drake_dae.arrays import FloatArray, brief, number, positive, unknown_name
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
+from drake_dae.trace.functions import Fault, TracedFunction
 
 
 @checked(ModelError)
@@ -85,8 +89,8 @@ class ToleranceWatch(LeafSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
-    #: What a function of the time does not do: see `compile_diagram`.
-    ends_runs = "tolerances"
+    ends_runs = True
+    """It counts in a compiled diagram, though it leads to no output."""
 
     def __init__(
         self,
@@ -102,7 +106,7 @@ class ToleranceWatch(LeafSystem):
         self._tolerances, self._outputs, self._forces = tolerances, outputs, forces
         self._places, self._lowest = tolerances.places(outputs), lowest
         self._largest = np.array(list(tolerances.outputs.values()), dtype=float)
-        self._share = -np.expm1(-period / tolerances.window)
+        self._period = period
         declared = {
             "controlled_output": len(outputs),
             "reference": sizes[0],
@@ -111,24 +115,51 @@ class ToleranceWatch(LeafSystem):
         }
         self._ports = [self.DeclareVectorInputPort(*item) for item in declared.items()]
         self._recent = self.DeclareDiscreteState(self._places.size)
+        self._function = self._traced(declared)
         # Unrestricted, as the step of a discrete MultibodyPlant, so that all are from the same
         # instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._look))
 
+    def _traced(self, sizes: Mapping[str, int]) -> TracedFunction:
+        """s after a sample; not valid where an error is too large."""
+        time, recent = ca.SX.sym("time"), ca.SX.sym("recent", self._places.size)
+        given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+        wanted = given["reference"][self._lowest.tolist()]
+        error = (given["controlled_output"] - wanted)[self._places.tolist()]
+        share = -np.expm1(-self._period / self._tolerances.window)
+        after = recent + share * (error**2 - recent)
+        beyond = ca.mmax(ca.sqrt(after) / self._largest)
+        # Forces and state stand in messages alone.
+        return TracedFunction(
+            "the watch of tolerances",
+            {**given, "recent": recent, "time": time},
+            {"recent": after},
+            doubt=ca.if_else(time >= self._tolerances.after, 1.0 - beyond, 1.0),
+            outside="an error is too large",
+        )
+
     def _look(self, context: Context, state: State) -> EventStatus:
-        z, reference = (port.Eval(context) for port in self._ports[:2])
-        error = (z - reference[self._lowest])[self._places]
-        recent = context.get_discrete_state(self._recent).CopyToVector()
-        recent += self._share * (error**2 - recent)
-        state.get_mutable_discrete_state().set_value(self._recent, recent)
-        beyond = np.sqrt(recent) / self._largest
-        if context.get_time() >= self._tolerances.after and np.max(beyond) > 1.0:
-            raise self._failure(context, int(np.argmax(beyond)), np.sqrt(recent))
+        given = [port.Eval(context) for port in self._ports]
+        recent, time = context.get_discrete_state(self._recent).value(), context.get_time()
+        after = self._function.evaluate(*given, recent, np.array([time]))[0]
+        if not self._function.is_valid:
+            raise self._failure(time, [*given, recent])
+        state.get_mutable_discrete_state().set_value(self._recent, after)
         return EventStatus.Succeeded()
 
-    def _failure(self, context: Context, worst: int, recent: np.ndarray) -> SimulationError:
-        force, state = (port.Eval(context) for port in self._ports[2:])
-        signal, time = self._outputs[self._places[worst]], context.get_time()
+    def traced(self) -> Block:
+        sources = (*(port.get_name() for port in self._ports), HELD, TIME)
+        update = Update(Computation.of(self._function, sources, (HELD,)), self._period, 0.0, True)
+        return Block(self, (), (update,), failure=self._failure)
+
+    def _failure(self, time: float, given: Sequence[FloatArray]) -> SimulationError:
+        force, state = (each.copy() for each in given[2:4])
+        function = self._function
+        recent = np.sqrt(function.evaluate(*given[:5], np.array([time]))[0])
+        if function.failure().fault is not Fault.OUTSIDE:
+            return simulation_error(function.failure(), time, state, {})
+        worst = int(np.argmax(recent / self._largest))
+        signal = self._outputs[self._places[worst]]
         unit = f" {signal.unit}".rstrip()
         text = (
             f"the recent error of {signal.name} is {recent[worst]:.3g}{unit} at t = {time:.6g} s, "

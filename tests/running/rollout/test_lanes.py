@@ -16,6 +16,7 @@ from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running.rollout import rollout as module
 from drake_dae.running.rollout.lanes.emitter import emitted
 from drake_dae.running.rollout.lanes.library import CONTRACTED, FOLDER
+from drake_dae.scenario.rolled import for_rollout
 from drake_dae.trace.compiled import library
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -202,6 +203,35 @@ __attribute__((visibility("default"))) int evaluate(const double *x, const doubl
   return LANES;
 }
 """
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
+    """Compliant contact at 1 kHz, where one run, also the first, exceeds its tolerances.
+
+    Round-off of sums of other order, 1e-15 of what is summed, in 300 steps.
+    """
+    chosen = scenario(
+        "wall_point_contact", "duration=0.3", "tolerances={outputs: {wall.force: 50}, after: 0.1}"
+    )
+    chosen = for_rollout(chosen)[0]
+    loop, context = build_scenario(chosen)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    rows = []
+    for index, mass in enumerate(np.linspace(6.0, 6.2, COUNT)):
+        loop.plant.set_parameter(own, "link3.mass", mass)
+        loop.plant.set_parameter(own, "wall.position", [0.7 - 0.01 * (index == first), 0.0, 0.0])
+        start, parameters = start_values(loop, context)
+        rows.append(parameters)
+    times = 1e-3 * np.arange(301)
+    arguments = loop, np.tile(start, (COUNT, 1)), np.array(rows), times
+    ours, theirs = both_ways(monkeypatch, *arguments, config=chosen.integrator)
+    for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+        assert (one.failure is None) == (index != first)
+        assert str(one.failure) == str(other.failure)
+        np.testing.assert_allclose(one.record["state"], other.record["state"], atol=1e-10)
+    slow = rollout(loop, start, rows[first], times, compiled=False)[0]
+    assert str(slow.failure) == str(ours[first].failure)
 
 
 @pytest.mark.parametrize("options", ["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"])

@@ -1,7 +1,14 @@
+/* The first of some runs. */
+ON_DEVICE static int first_of(mask some) {
+  int lane = 0;
+  while (lane < LANES - 1 && !LANE(some, lane)) lane++;
+  return lane;
+}
+
 /* Fixed steps of LANES runs, all at the same times. */
 ON_DEVICE static void run_together(const Batch *b, long long first) {
   Lanes l;
-  Run run[LANES], before; /* all alike: the first one stands for all */
+  Run run[LANES], before; /* those that go on are alike: the first one stands for all */
   real k[16][SIZE], reached[SIZE], x[SIZE], held[HELD + 1];
   long long rows[LANES];
   mask alive = none(), changed;
@@ -24,13 +31,17 @@ ON_DEVICE static void run_together(const Batch *b, long long first) {
     memcpy(x, l.x, sizeof(x));
     memcpy(held, l.held, sizeof(held));
     if (is_row) {
-      if (is_last) good &= updates(b, time, &l, good, good, run, &changed);
+      if (is_last) {
+        good &= updates(b, time, &l, good, good, run, &changed);
+        run[0].event = run[first_of(good)].event;
+      }
       for (lane = 0; lane < LANES; lane++) rows[lane] = before.row;
       good &= write(b, &l, good, time, l.x, rows);
       run[0].row++;
     }
     if (!is_last) {
       good &= updates(b, time, &l, good, good, run, &changed);
+      run[0].event = run[first_of(good)].event;
       end = b->times[run[0].row];
       if (run[0].event < b->num_events && b->events[run[0].event] < end) end = b->events[run[0].event];
       if (run[0].index == run[0].number) {

@@ -24,7 +24,7 @@ CONTRACTED = ("-ffp-contract=fast", "-O2")
 def can_run(program: Program) -> bool:
     """Whether runs of a diagram can go side by side: no block changes, nor does Drake step one."""
     compiled = program.compiled
-    if compiled.changes or compiled.has_stepped or not program.size:
+    if compiled.changes or compiled.has_stepped:
         return False
     return all(can_be_emitted(each) for each in _functions(program).values())
 

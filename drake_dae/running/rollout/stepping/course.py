@@ -200,7 +200,7 @@ class Course:
                     raise Ended(Ending.CHANGE)
             # Unrestricted updates see what was before the projection, which is one of them.
             for seen, is_unrestricted in ((state, True), (self.state, False)):
-                self.held = self.fused.update(
+                held = self.fused.update(
                     self.time,
                     seen,
                     self.held,
@@ -209,8 +209,9 @@ class Course:
                     int(problem.due[self.event]),
                     is_unrestricted,
                 )
-            if not np.isfinite(self.held).all():
-                raise Ended(Ending.INVALID)
+                if not np.isfinite(held).all():
+                    raise Ended(Ending.INVALID)
+                self.held = held
             self.event += 1
         return self.event > before
 

@@ -134,7 +134,7 @@ static int apply(double time, const double *x, double *held, Given *g, const dou
   set_time(time, g);
   memcpy(fresh, held, HELD * sizeof(double));
 $updates
-  memcpy(held, fresh, HELD * sizeof(double));
+  if (good) memcpy(held, fresh, HELD * sizeof(double)); /* Else it says what was wrong. */
   return good;
 }
 

@@ -116,18 +116,20 @@ class CompliantPlant(ParameterizedSystem, Plant):
         if model.stages and material.time_step:
             check_step(model, material.time_step, values)
         own = np.concatenate([values, material.values, ball_normals(model, structure, values)])
-        signals = {"state": dae.state_signals, "control": dae.control_signals}
+        forces = tuple(
+            Signal(f"{constraint.name}.contact_f{axis}", "N")
+            for constraint in model.constraints
+            for axis in "xyz"
+        )
+        state = dae.state_signals + forces if material.time_step else dae.state_signals
+        signals = {"state": state, "control": dae.control_signals}
         super().__init__(dae, own, signals, sees_steps=not material.time_step)
         self.model: RobotModel = model
         self.structure, self.material = structure, material
         self.time_step = material.time_step
         self.set_name(dae.name)
         equations = CompliantEquations(model, structure, material)
-        self.contact_force_signals = tuple(
-            Signal(f"{constraint.name}.contact_f{axis}", "N")
-            for constraint in model.constraints
-            for axis in "xyz"
-        )
+        self.contact_force_signals = forces
         self._shown, self._advanced = equations.shown, equations.advanced
         degrees = dae.exogenous.degrees(*equations.expressions)
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)

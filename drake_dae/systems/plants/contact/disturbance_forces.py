@@ -58,14 +58,20 @@ class DisturbanceForce:
     @property
     def reference(self) -> ExpressionReference:
         """F(t) as three rows."""
+        return ExpressionReference(
+            lambda time: [component * self._share(time) for component in self.force]
+        )
 
-        def force(time: ca.SX) -> list[ca.SX]:
-            share = self._grown(time - self.start_time)
-            if self.end_time is not None:
-                share -= self._grown(time - self.end_time)
-            return [component * share for component in self.force]
+    @property
+    def course(self) -> ExpressionReference:
+        """The factor of F."""
+        return ExpressionReference(lambda time: [self._share(time)])
 
-        return ExpressionReference(force)
+    def _share(self, time: ca.SX) -> ca.SX:
+        share = self._grown(time - self.start_time)
+        if self.end_time is not None:
+            share -= self._grown(time - self.end_time)
+        return share
 
     def _grown(self, since: ca.SX) -> ca.SX:
         x = ca.fmin(ca.fmax(since / self.rise, 0.0), 1.0)
