@@ -15,7 +15,7 @@ from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running.rollout import rollout as module
 from drake_dae.running.rollout.lanes.emitter import emitted
-from drake_dae.running.rollout.lanes.library import OPTIONS, FOLDER
+from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS
 from drake_dae.trace.compiled import library
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
