@@ -91,6 +91,9 @@ from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
 from .running.export.export import export_code as export_code
+from .running.rollout.gradient.gradient import RolloutGradient as RolloutGradient
+from .running.rollout.gradient.gradient import rollout_gradient as rollout_gradient
+from .running.rollout.gradient.gradient import rollout_tangent as rollout_tangent
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
 from .scenario.build import build_scenario as build_scenario

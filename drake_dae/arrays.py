@@ -192,3 +192,8 @@ def show_state(state: ArrayLike) -> str:
     values = np.asarray(state, dtype=float)
     largest = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
     return f"grown to {largest:.0e}" if largest > MEANINGFUL else show(values)
+
+
+def by_columns(values: FloatArray) -> FloatArray:
+    """The columns of a table as rows that lie together: NumPy adds these up many times as fast."""
+    return np.ascontiguousarray(values.T)

@@ -276,8 +276,10 @@ class RobotModel:
         values = self.dae.parameter_vector(parameters)
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
+        if not self.stages:  # Forces enter no state.
+            return np.concatenate([q, np.zeros(self.links.v.numel())])
         state, _, left = self._balance.rest(q, load, values)
-        if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
+        if left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
                 f"{self.name}: no control holds the robot at rest at q = {show(q)} with forces "
                 f"{load}; {left:.2g} N m is left. It has fewer actuators than joints"

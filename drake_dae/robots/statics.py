@@ -6,7 +6,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
 
 
 class Placing:
@@ -36,14 +36,14 @@ class Placing:
             guess: Where to start, shape (nq,).
             parameters: Values of all parameters.
         """
-        count = outputs.size
+        count, evaluated = outputs.size, once(lambda q: self._function(q, parameters))
 
         def residual(q: FloatArray) -> FloatArray:
-            phi, h_1, _, _ = self._function(q, parameters)
+            phi, h_1, _, _ = evaluated(q)
             return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
         def linearize(q: FloatArray) -> NewtonModel | None:
-            _, _, J, P = self._function(q, parameters)
+            _, _, J, P = evaluated(q)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
 
@@ -104,12 +104,13 @@ class Balance:
             forces: The force outputs z_2, shape (k,).
             parameters: Values of all parameters.
         """
+        evaluated = once(lambda unknown: self._function(q, forces, unknown, parameters))
 
         def residual(unknown: FloatArray) -> FloatArray:
-            return self._function(q, forces, unknown, parameters)[0]
+            return evaluated(unknown)[0]
 
         def linearize(unknown: FloatArray) -> NewtonModel | None:
-            balance, gradient, _ = self._function(q, forces, unknown, parameters)
+            balance, gradient, _ = evaluated(unknown)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
             scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)

@@ -227,15 +227,19 @@ def scenario_data(scenario: Scenario) -> dict[str, Any]:
     return dict(scenario_reader().write(scenario))
 
 
-def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
+def read_scenario(
+    data: Mapping[str, Any], folder: Path | None = None, known: dict[Any, Any] | None = None
+) -> Scenario:
     """The scenario of plain data, with the paths of its robot unchanged.
 
     Args:
         data: Plain data.
         folder: The folder of relative file names; None for the working directory.
+        known: What parts of scenarios were read into before, for many that have most of them in
+            common; the parts of this one are put into it.
 
     Raises:
         ScenarioError: Keys are unknown or missing, or values are not valid; all problems are
             listed.
     """
-    return scenario_reader().read(data, folder)
+    return scenario_reader().read(data, folder, known)

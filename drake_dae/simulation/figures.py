@@ -1,8 +1,11 @@
 """The figures of a run as numbers, under names for tables of many runs."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import SLACK, Limits
@@ -24,15 +27,19 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     if not record.time.size:
         return {}
     found = {}
-    for signal, values in _columns(record, "tracking_error"):
-        found[_label("largest error of", signal)] = float(np.max(np.abs(values)))
-        found[_label("final error of", signal)] = float(values[-1])
-        found[_label("late error of", signal)] = _late_size(record.time, values)
-    for signal, values in _columns(record, "constraint_force"):
-        found[_label("least", signal)] = float(np.min(values))
-        found[_label("largest", signal)] = float(np.max(values))
-    for signal, values in _columns(record, "control"):
-        found[_label("largest", signal)] = float(np.max(np.abs(values)))
+    errors = record["tracking_error"]
+    figures = _each(record, "tracking_error", _largest(errors), errors[-1], _late_sizes(record))
+    for signal, largest, final, late in figures:
+        found[_label("largest error of", signal)] = largest
+        found[_label("final error of", signal)] = final
+        found[_label("late error of", signal)] = late
+    for signal, least, largest in _each(
+        record, "constraint_force", *_extremes(record["constraint_force"])
+    ):
+        found[_label("least", signal)] = least
+        found[_label("largest", signal)] = largest
+    for signal, largest in _each(record, "control", _largest(record["control"])):
+        found[_label("largest", signal)] = largest
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     return {
         **found,
@@ -46,16 +53,20 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     }
 
 
-def _late_size(times: FloatArray, values: FloatArray) -> float:
-    """The root mean square over the second half of a piecewise linear signal."""
+def _late_sizes(record: Record) -> FloatArray:
+    """Root mean squares over the second half of tracking errors, piecewise linear, shape (p,)."""
+    times, values = record.time, by_columns(record["tracking_error"])
     middle = 0.5 * (times[0] + times[-1])
-    late = times > middle
-    if not late.any():
-        return float(abs(values[-1]))
-    found = np.concatenate([[np.interp(middle, times, values)], values[late]])
-    steps = np.diff(np.concatenate([[middle], times[late]]))
-    squares = (found[:-1] ** 2 + found[:-1] * found[1:] + found[1:] ** 2) / 3.0
-    return float(np.sqrt(squares @ steps / steps.sum()))
+    first = int(np.searchsorted(times, middle, side="right"))
+    if first == times.size:
+        return np.abs(values[:, -1])
+    before, after = values[:, first - 1], values[:, first]
+    begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
+    found = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
+    steps = np.diff(np.concatenate([[middle], times[first:]]))
+    squares = (found[:, :-1] ** 2 + found[:, :-1] * found[:, 1:] + found[:, 1:] ** 2) / 3.0
+    sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
+    return sizes
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
@@ -65,16 +76,20 @@ def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
     velocities have a lower and an upper limit. A start may be on a limit, up to round-off.
     """
     found = []
-    for index, (signal, values) in enumerate(_columns(record, "control")):
+    for index, (signal, largest) in enumerate(
+        _each(record, "control", _largest(record["control"]))
+    ):
         limit = np.inf if limits.control is None else limits.control[index]
-        found.append((signal, float(limit - np.max(np.abs(values)))))
-    for signal, values in _columns(record, "constraint_force"):
+        found.append((signal, float(limit - largest)))
+    forces = record["constraint_force"]
+    for signal, least, _ in _each(record, "constraint_force", *_extremes(forces)):
         if not limits.can_pull(signal):
-            found.append((signal, float(np.min(values))))
+            found.append((signal, least))
     for name, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and name in record.signals:
-            for (signal, values), low, high in zip(_columns(record, name), *bounds, strict=False):
-                room = float(min(np.min(values) - low, high - np.max(values)))
+            extremes = _each(record, name, *_extremes(record[name]))
+            for (signal, least, largest), low, high in zip(extremes, *bounds, strict=False):
+                room = float(min(least - low, high - largest))
                 found.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
     return [(signal, room) for signal, room in found if np.isfinite(room)]
 
@@ -86,9 +101,22 @@ def exceeded(record: Record, limits: Limits) -> list[str]:
     return [signal.name for signal, room in margins(record, limits) if room < 0.0]
 
 
-def _columns(record: Record, name: str) -> list[tuple[Signal, FloatArray]]:
-    recorded = record.signals[name]
-    return list(zip(recorded.signals, recorded.values.T, strict=True))
+def _each(record: Record, name: str, *numbers: FloatArray) -> Iterator[tuple[Any, ...]]:
+    """Each entry of a signal: its name and unit, and its numbers."""
+    signals = record.signals[name].signals
+    return zip(signals, *(each.tolist() for each in numbers), strict=True)
+
+
+def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest number in each column."""
+    columns = by_columns(values)
+    return columns.min(axis=1), columns.max(axis=1)
+
+
+def _largest(values: FloatArray) -> FloatArray:
+    """The largest size in each column."""
+    least, largest = _extremes(values)
+    return np.maximum(-least, largest)
 
 
 def _label(what: str, signal: Signal) -> str:

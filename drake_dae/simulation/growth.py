@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import SimulationError
 from drake_dae.systems.plants.contract import Plant
@@ -62,7 +62,7 @@ class Amounts:
         self, times: FloatArray, values: FloatArray, states: FloatArray
     ) -> SimulationError | None:
         """What diverges first in rows of a run; None if nothing does."""
-        if (np.maximum(values.max(0), -values.min(0)) <= 10.0 * self._size).all():
+        if (np.abs(by_columns(values)).max(axis=1) <= 10.0 * self._size).all():
             self._since = times[-1]
             return None
         shares = np.abs(values) / self._size
@@ -139,9 +139,10 @@ class Errors:
         """Whether no error is larger than its size was before these rows; then sizes grow."""
         units = [signal.unit for signal in self._signals]
         sizes = np.array([self._sizes.get(unit, 0.0) for unit in units])
-        if not (errors.max(0) <= sizes).all():
+        if not (by_columns(errors).max(axis=1) <= sizes).all():
             return False
-        for unit, largest in zip(units, np.abs(desired).max(0).tolist(), strict=True):
+        largest_now = np.abs(by_columns(desired)).max(axis=1)
+        for unit, largest in zip(units, largest_now.tolist(), strict=True):
             self._sizes[unit] = max(self._sizes.get(unit, 0.0), largest)
         return True
 

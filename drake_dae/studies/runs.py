@@ -111,7 +111,7 @@ class Runner:
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
         self._base = base
         self._lasting = lasting
-        self._key = ""
+        self._key, self._known = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
@@ -180,7 +180,7 @@ class Runner:
     def _begin(self, number: int, variation: Variation) -> "_Begun | RunResult":
         try:
             data = varied_data(self._base, variation)
-            scenario = read_scenario(data)
+            scenario = read_scenario(data, known=self._known)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.
                 loop = self.loop(data)

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from math import sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg
 from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
+
+T = TypeVar("T")
 
 ROUND_OFF = 1e-12
 """A Newton step below this, relative to the state, is within the round-off of the residual."""
@@ -101,6 +103,25 @@ def newton(
         x = trial
     # Steps within round-off do not decrease either.
     return x, regular and bool(size <= CONVERGED)
+
+
+def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
+    """A function that is evaluated once where `newton` asks for it several times in turn.
+
+    Args:
+        function: The function; its iterates are never written over.
+    """
+    at: FloatArray | None = None
+    value: Any = None
+
+    def evaluated(x: FloatArray) -> T:
+        nonlocal at, value
+        if x is not at:
+            at, value = x, function(x)
+        found: T = value
+        return found
+
+    return evaluated
 
 
 def _polished(

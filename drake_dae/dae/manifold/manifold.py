@@ -164,6 +164,8 @@ class Manifold:
         and exceptions are those of `project`.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
+        if not self.residual_function.evaluate(start, p)[0].any():
+            return start
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
             return near.copy()  # It was there but for round-off, which no level would move.

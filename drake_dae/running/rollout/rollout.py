@@ -205,9 +205,12 @@ def run_together(
 def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarray]]:
     """The runs in which plant and law have the same numbers, and the others; each its program."""
     has_twins = problems.with_twins()
-    kinds = (program.twins if kind else program for kind in (True, False))
-    places = (np.flatnonzero(has_twins == kind) for kind in (True, False))
-    return [each for each in zip(kinds, places, strict=True) if each[1].size]
+    found = []
+    if has_twins.any():
+        found.append((program.twins, np.flatnonzero(has_twins)))
+    if not has_twins.all():
+        found.append((program, np.flatnonzero(~has_twins)))
+    return found
 
 
 def _interpreted(program: Program, settings: Settings) -> Callable[..., Run]:

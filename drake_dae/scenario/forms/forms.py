@@ -6,8 +6,9 @@ plain data is `written` as another one; a member of a family is chosen by a tag.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import pydantic
 from pydantic_core import CoreSchema, core_schema
@@ -21,6 +22,23 @@ PLAIN = {str: "text", float: "a number"}
 """The name of plain values among choices by tag."""
 
 
+MOST_KNOWN = 1000
+"""So many parts are kept while scenarios are read that have parts in common."""
+
+
+class Reading(NamedTuple):
+    """What reading depends on besides the data.
+
+    Attributes:
+        folder: The folder of relative file names; None for the working directory.
+        known: What parts of data have been read into, for scenarios that have most of them in
+            common; None to read all anew.
+    """
+
+    folder: Path | None = None
+    known: dict[Any, Any] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Form:
     """Annotates a dataclass, or a Drake class with `__fields__`: data have the keys of its fields.
@@ -31,6 +49,7 @@ class Form:
         tag: The tag that chooses the class, "!Sphere"; empty if there is no choice.
         needs_tag: Whether data without a tag mean another class.
         texts: Name of a field -> its text, if the docstring of the class has none.
+        is_part: Whether it is a part of another one, so that it may be known from before.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
@@ -38,6 +57,7 @@ class Form:
     tag: str = ""
     needs_tag: bool = False
     texts: Mapping[str, str] = field(default_factory=dict)
+    is_part: bool = True
 
     def __get_pydantic_json_schema__(
         self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
@@ -76,11 +96,26 @@ class Form:
             extra_behavior="forbid",
             config=core_schema.CoreConfig(strict=True, allow_inf_nan=False),
         )
-        return core_schema.no_info_after_validator_function(
+        made = core_schema.no_info_after_validator_function(
             make,
             data,
             serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=data),
         )
+        if not self.is_part:
+            return made
+
+        def known(given: Any, read: Callable[[Any], Any], info: Any) -> Any:
+            parts = info.context.known if info.context is not None else None
+            if parts is None:
+                return read(given)
+            key = id(self), source, repr(given)
+            if key not in parts:
+                if len(parts) >= MOST_KNOWN:
+                    parts.clear()
+                parts[key] = read(given)
+            return parts[key]
+
+        return core_schema.with_info_wrap_validator_function(known, made)
 
     def _fields(self, source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
         for name, hint, default in _fields_of(source):

@@ -8,7 +8,7 @@ import pydantic
 
 from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.forms import Form
+from drake_dae.scenario.forms.forms import Form, Reading
 from drake_dae.scenario.forms.problems import problem, with_parts
 
 T = TypeVar("T")
@@ -18,17 +18,19 @@ class Reader(Generic[T]):
     """Reads a dataclass from plain data, and writes it."""
 
     def __init__(self, form: type[T]) -> None:
-        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
+        whole = Annotated[form, Form(is_part=False)]  # type: ignore[valid-type]
+        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(whole)
         self.schema: dict[str, Any] = self._adapter.json_schema()
         #: Dotted keys of the dictionaries with any names; "*" is any entry of a list.
         self.free_names = set(_free_names(self.schema, ""))
 
-    def read(self, data: Any, folder: Path | None = None) -> T:
+    def read(self, data: Any, folder: Path | None = None, known: dict[Any, Any] | None = None) -> T:
         """The dataclass that plain data describe.
 
         Args:
             data: The plain data.
             folder: The folder of relative file names; None for the working directory.
+            known: As of `Reading`.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
@@ -41,7 +43,7 @@ class Reader(Generic[T]):
             text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
             raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
-            return self._adapter.validate_python(data, context=folder)
+            return self._adapter.validate_python(data, context=Reading(folder, known))
         except pydantic.ValidationError as error:
             # Each member of a Union reports the same.
             problems = dict.fromkeys(

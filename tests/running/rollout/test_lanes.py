@@ -15,7 +15,7 @@ from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running.rollout import rollout as module
 from drake_dae.running.rollout.lanes.emitter import emitted
-from drake_dae.running.rollout.lanes.library import CONTRACTED, FOLDER
+from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.trace.compiled import library
 
@@ -243,7 +243,7 @@ def test_operations_are_those_of_casadi(options):
     text = [header, emitted(function, "operations"), f"enum {{ ROWS = {rows} }};", ENTRY]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MachineCodeWarning)
-        path = library("\n".join(text), 100, True, True, (*CONTRACTED, options))
+        path = library("\n".join(text), 100, True, True, (*OPTIONS, options))
     if path is None:
         pytest.skip(f"the C compiler does not know {options}")
     code = ctypes.CDLL(str(path))

@@ -56,14 +56,14 @@ def run_many(
 def run_briefly(
     lanes: Library, program: Program, problems: Problems, settings: Settings, most: int
 ) -> list[Run | None]:
-    """The same of runs that come to their end side by side; None for the others.
+    """The same on one core, of runs that come to their end side by side; None for the others.
 
     Args:
         lanes, program, problems, settings: As of `run_many`.
         most: A run that takes more steps is none of them.
     """
     many = Many(program, problems, settings, most)
-    _run(lanes, many)
+    lanes.run_lanes(ctypes.byref(many.here()))
     endings = many.arrays["endings"].tolist()
     return [None if ending else many.done(index) for index, ending in enumerate(endings)]
 
@@ -125,6 +125,10 @@ class Many:
             **places,
         )
 
+    def here(self) -> ctypes.Structure:
+        """The same with the arrays of this processor."""
+        return self.batch({name: array.ctypes.data for name, array in self.arrays.items()})
+
     def done(self, index: int) -> Run:
         """A run that has come to its end."""
         own = RunState.from_buffer(self.arrays["runs"][index])
@@ -159,8 +163,7 @@ _NOWHERE = np.zeros(0)
 
 def _run(lanes: Library, many: Many) -> None:
     """Runs all in threads, which need no lock of Python's; Ctrl-C ends them."""
-    arrays = many.arrays
-    batch = many.batch({name: array.ctypes.data for name, array in arrays.items()})
+    arrays, batch = many.arrays, many.here()
     threads = max(1, min(num_cores(), len(arrays["endings"]) // 8))
     with ThreadPoolExecutor(threads) as pool:
         try:

@@ -207,16 +207,21 @@ ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, 
 /* x and the weighted sum of rates; most weights of a high order are zero. */
 ON_DEVICE static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE],
                             real *reached) {
-  int i, j;
+  real weights[16];
+  const real *used[16];
+  int i, j, number = 0;
+  for (j = 0; j < count; j++) {
+    if (b[j] == 0.0) continue;
+    weights[number] = step * K(b[j]);
+    used[number++] = k[j];
+  }
   for (i = 0; i < SIZE; i++) {
-    real sum = K(0.0);
-    for (j = 0; j < count; j++) {
-      const double weight = b[j];
-      if (weight != 0.0) sum += K(weight) * k[j][i];
-    }
-    reached[i] = x[i] + step * sum;
+    real sum = x[i];
+    for (j = 0; j < number; j++) sum += weights[j] * used[j][i];
+    reached[i] = sum;
   }
 }
+
 $fixed
 $controlled
 #ifdef __CUDACC__

@@ -141,6 +141,26 @@ def _first_step(course: Course, rate: FloatArray, settings: Settings) -> float:
     return min(100.0 * h0, h1, longest)
 
 
+def fixed_steps(problem: Problem, longest: float) -> Iterator[FloatArray]:
+    """Times of steps between samples: where each begins, where it ends, and what is a row."""
+    times = problem.times
+    inside = problem.events[(problem.events > times[0]) & (problem.events < times[-1])]
+    ends = np.union1d(times, inside)
+    lengths = np.diff(ends)
+    numbers = np.maximum(1, np.ceil(lengths / longest - 0.01)).astype(int)
+    # The last steps of all intervals, then the place of each step in its own one.
+    last = np.cumsum(numbers)
+    own = np.repeat(np.arange(len(numbers)), numbers)
+    place = np.arange(last[-1]) - (last - numbers)[own]
+    shares = np.array([place, place + 1]) / numbers[own]
+    first, after = ends[own] + lengths[own] * shares
+    after[last - 1] = ends[1:]
+    is_row = np.zeros(last[-1])
+    is_row[last - 1] = np.isin(ends[1:], times)
+    block = np.column_stack([first, after, is_row])
+    yield from np.split(block, last[np.flatnonzero(np.isin(ends[1:-1], inside))])
+
+
 class _Steps:
     """Fixed steps, many in one call of CasADi."""
 
@@ -152,7 +172,7 @@ class _Steps:
         """Runs to the end of the record."""
         times = course.problem.times
         course.write(course.time, course.state)
-        for block in self._blocks(course.problem):
+        for block in fixed_steps(course.problem, self._longest):
             course.update()
             done = 0
             while done < len(block):
@@ -162,25 +182,6 @@ class _Steps:
         course.rows[-1] = course.rows[-1].without_last()
         course.update()
         course.write(times[-1], course.state)
-
-    def _blocks(self, problem: Problem) -> Iterator[FloatArray]:
-        """Times of steps between samples: where each begins, where it ends, and what is a row."""
-        times = problem.times
-        inside = problem.events[(problem.events > times[0]) & (problem.events < times[-1])]
-        ends = np.union1d(times, inside)
-        lengths = np.diff(ends)
-        numbers = np.maximum(1, np.ceil(lengths / self._longest - 0.01)).astype(int)
-        # The last steps of all intervals, then the place of each step in its own one.
-        last = np.cumsum(numbers)
-        own = np.repeat(np.arange(len(numbers)), numbers)
-        place = np.arange(last[-1]) - (last - numbers)[own]
-        shares = np.array([place, place + 1]) / numbers[own]
-        first, after = ends[own] + lengths[own] * shares
-        after[last - 1] = ends[1:]
-        is_row = np.zeros(last[-1])
-        is_row[last - 1] = np.isin(ends[1:], times)
-        block = np.column_stack([first, after, is_row])
-        yield from np.split(block, last[np.flatnonzero(np.isin(ends[1:-1], inside))])
 
     def _advance(self, course: Course, block: FloatArray) -> int:
         """Takes some steps, and says how many."""

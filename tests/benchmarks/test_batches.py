@@ -1,0 +1,122 @@
+"""Many rollouts: side by side against one after the other, their fixed cost, and gradients.
+
+By what they take of all cores together, in turn, since how fast a core is changes.
+"""
+
+import time
+
+import numpy as np
+import pytest
+from runs import scenario
+from timing import has_compiler
+
+from drake_dae import (
+    build_scenario,
+    grid_variations,
+    rollout,
+    rollout_gradient,
+    start_values,
+)
+from drake_dae.running.rollout import rollout as module
+from drake_dae.scenario.scenario import scenario_data
+from drake_dae.studies.runs import Runner
+
+FIXED = [
+    "integrator.integration_scheme=runge_kutta3",
+    "integrator.use_error_control=false",
+    "integrator.max_step_size=1e-3",
+]
+ONE_AFTER_THE_OTHER = 10**9
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="there is no C compiler")
+
+
+def in_turn(calls, rounds=15):
+    """The least time of each on the processor, in s."""
+    best = dict.fromkeys(calls, np.inf)
+    for _ in range(rounds):
+        for name, call in calls.items():
+            began = time.process_time()
+            call()
+            best[name] = min(best[name], time.process_time() - began)
+    return best
+
+
+def problem(name, *settings):
+    chosen = scenario(name, *settings)
+    loop, context = build_scenario(chosen)
+    return (loop, *start_values(loop, context)), chosen.integrator
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"), [("-march=native", 5e6), ("-march=native -mno-avx512f", 2.5e6)]
+)
+@pytest.mark.parametrize("robot", ["two_link_wall", "seven_joint_wall"])
+def test_steps_side_by_side(robot, options, wanted, monkeypatch, report):
+    """Of 1 ms and third order, without rows in between."""
+    monkeypatch.setenv("CC", f"cc {options}")
+    (loop, start, parameters), config = problem(robot, *FIXED)
+    starts, times = np.tile(start, (16, 1)), [0.0, 5.0]
+
+    def run(several, count):
+        monkeypatch.setattr(module, "SEVERAL", several)
+        rollout(loop, starts[:count], parameters, times, config=config, compiled=True)
+
+    calls = {"lanes": lambda: run(8, 16), "scalar": lambda: run(ONE_AFTER_THE_OTHER, 4)}
+    for call in calls.values():
+        call()
+    seconds = in_turn(calls)
+    lanes, scalar = 16 * 5000 / seconds["lanes"], 4 * 5000 / seconds["scalar"]
+    what = "without AVX-512" if "no-" in options else "as the processor can"
+    goal = f" (>{wanted / 1e6:g})" if robot == "seven_joint_wall" else ""
+    ratio = f"{lanes / 1e6:.2f}, x {lanes / scalar:.1f}{goal}"
+    report(f"{robot}: million 1 ms steps a second of a core, {what}", {"side by side": ratio})
+
+
+def test_ten_thousand_short_runs(report):
+    """1 s each at 1e-6, with other starts and parameters."""
+    (loop, start, parameters), config = problem("two_link_wall", "integrator.accuracy=1e-6")
+    manifold, random = loop.plant.structure.manifold, np.random.default_rng(0)
+    starts = [manifold.settle(start + 0.05 * random.normal(size=4)) for _ in range(500)] * 20
+    rows = np.tile(parameters, (10_000, 1))
+
+    def run():
+        found = rollout(loop, starts, rows, [0.0, 1.0], config=config, compiled=True)
+        assert all(each.failure is None for each in found)
+
+    run()
+    took = in_turn({"lanes": run}, 4)["lanes"]
+    report("two_link_wall: 10,000 rollouts of 1 s", {"processor time [s]": f"{took:.2f} (<0.5)"})
+
+
+def test_a_run_of_a_sweep(report):
+    """10 s of the 2-link wall at 1e-8 with 1,001 rows, from its keys to its figures."""
+    runner = Runner(scenario_data(scenario("two_link_wall", "compiled=true")), 1e6)
+    variations = grid_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, 64)})
+    batch = list(enumerate(variations))
+
+    def run():
+        assert all(each.reason == "" for each in runner.run_all(batch))
+
+    run()
+    took = in_turn({"sweep": run}, 10)["sweep"] / len(batch)
+    report(
+        "two_link_wall: a run of a sweep by rollouts", {"processor [ms]": f"{1e3 * took:.2f} (<1)"}
+    )
+
+
+def test_gradient(report):
+    """By the start and all parameters, of 1 s in steps of 1 ms, beside the interpreted run."""
+    (loop, start, parameters), config = problem("seven_joint_wall", *FIXED, "compiled=false")
+    times = np.array([0.0, 1.0])
+    weights = {"state": np.ones((2, 14))}
+    given = loop, start, parameters, times
+    calls = {
+        "gradient": lambda: rollout_gradient(*given, weights, config=config),
+        "run": lambda: rollout(*given, config=config, compiled=False),
+    }
+    for call in calls.values():
+        call()
+    seconds = in_turn(calls, 4)
+    ratio = f"{1e3 * seconds['gradient']:.0f} ms, x {seconds['run'] / seconds['gradient']:.2f}"
+    report("seven_joint_wall: gradient of 1,000 steps by 50 numbers", {"interpreted": ratio})
