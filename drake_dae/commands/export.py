@@ -1,13 +1,14 @@
-"""`drake-dae export`: writes law, plant and projection of a scenario as C99."""
+"""`drake-dae export`: writes the controller, law, plant and projection of a scenario as C99."""
 
 import argparse
 import json
 from pathlib import Path
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.export.export import export_code
 from drake_dae.running.export.parts import parts_of
+from drake_dae.running.export.steps.controller import export_controller
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
@@ -24,7 +25,13 @@ def run_command(options: argparse.Namespace) -> int:
         raise ScenarioError(("task", text))
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
-    names, missing = [file.name for file in files], _left_out(scenario, loop)
+    missing = _left_out(scenario, loop)
+    try:
+        run = scenario.integrator, scenario.duration
+        files += export_controller(loop, context, path.stem, folder, *run)
+    except ModelError as error:
+        missing.append(f"the whole controller as one step: {error}")
+    names = list(dict.fromkeys(file.name for file in files))
     if options.json:
         print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
         return 0
@@ -35,15 +42,12 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
-    """The parts of the scenario that are not in the exported code; none if the whole loop is."""
+    """The parts of the scenario that are not in the exported functions; none if the loop is."""
     if parts_of(loop).compiled is not None:
         return []
-    closed = "the code has the plant with all contacts closed"
+    closed = "the functions have the plant with all contacts closed"
     parts = {
-        "the observer, which estimates the disturbance and the friction among law_parameters": (
-            loop.observer is not None
-        ),
-        "the limits of the drives": scenario.saturation,
+        "the limits of the drives, except in the controller": scenario.saturation,
         f"Drake's own contact: {closed}, and ideal": not loop.plant.is_ideal,
         f"how contacts open: {closed}": bool(loop.plant.contacts),
     }

@@ -110,10 +110,11 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     written = commands.add_parser(
         "export",
         parents=[named],
-        help="write law, plant and projection as C99",
+        help="write controller, law, plant and projection as C99",
         description="Writes the law, the plant and the projection of a scenario as plain C99 "
-        "without dependencies, with sizes, names and units, and a test program: `make` in the "
-        "folder compiles it and compares it with Python.",
+        "without dependencies, with sizes, names and units; and of a sampled law the whole "
+        "controller as one step, with a class of C++ over it. `make` in the folder compiles "
+        "programs that compare them with Python and with a run of Drake's Simulator.",
     )
     written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
     _add_json(written, "print the names of the files as JSON")

@@ -1,8 +1,10 @@
 """What Python writes in C: vectors, calls, lists, strings and comments."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from string import Template
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
@@ -68,3 +70,25 @@ def string(text: str) -> str:
         for byte in text.encode()
     )
     return f'"{"".join(plain)}"'
+
+
+def written(
+    templates: Path, folder: str | Path, names: Mapping[str, str], words: Mapping[str, str]
+) -> list[Path]:
+    """Writes files from templates; returns them.
+
+    Args:
+        templates: The folder of the templates.
+        folder: Where to write; made if there is none.
+        names: Name of a template -> that of the file.
+        words: What stands for its names in the templates.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for template, target in names.items():
+        text = Template((templates / template).read_text(encoding="utf-8")).substitute(words)
+        (folder / target).write_text(text, encoding="utf-8")
+    return [folder / target for target in names.values()]
