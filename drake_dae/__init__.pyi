@@ -92,6 +92,7 @@ from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
 from .running.export.export import export_code as export_code
 from .running.export.steps.controller import export_controller as export_controller
+from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
 from .scenario.build import build_scenario as build_scenario

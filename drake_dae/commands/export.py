@@ -1,14 +1,18 @@
-"""`drake-dae export`: writes the controller, law, plant and projection of a scenario as C99."""
+"""`drake-dae export`: writes controller, plant and loop of a scenario as C99 or WebAssembly."""
 
 import argparse
 import json
 from pathlib import Path
+
+from pydrake.systems.framework import Context
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.export.export import export_code
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.steps.controller import export_controller
+from drake_dae.running.export.steps.parts import Export
+from drake_dae.running.export.wasm.wasm import export_wasm
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
@@ -23,22 +27,38 @@ def run_command(options: argparse.Namespace) -> int:
     if loop.generator is None:
         text = "exports support only `references`; `drake-dae simulate` runs a task"
         raise ScenarioError(("task", text))
-    folder = options.out or Path(f"{path.stem}_c99")
-    files = export_code(loop, context, path.stem, folder)
-    missing = _left_out(scenario, loop)
-    try:
-        run = scenario.integrator, scenario.duration
-        files += export_controller(loop, context, path.stem, folder, *run)
-    except ModelError as error:
-        missing.append(f"the whole controller as one step: {error}")
+    folder = options.out or Path(
+        f"{path.stem}_{'c99' if options.format == 'c' else options.format}"
+    )
+    files, missing = WRITERS[options.format](scenario, loop, context, path.stem, folder)
     names = list(dict.fromkeys(file.name for file in files))
     if options.json:
         print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
         return 0
     print(f"written to {folder}/: {', '.join(names)}")
+    if options.format != "c":
+        print(f"{names[0]} has {files[0].stat().st_size / 1000:.0f} kB")
     if missing:
         print(f"not among them: {'; '.join(missing)}")
     return 0
+
+
+def _write_c(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    files, missing = export_code(loop, context, name, folder), _left_out(scenario, loop)
+    try:
+        run = scenario.integrator, scenario.duration
+        files += export_controller(loop, context, name, folder, *run)
+    except ModelError as error:
+        missing.append(f"the whole controller as one step: {error}")
+    return Export(files, missing)
+
+
+def _write_wasm(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    return export_wasm(loop, context, name, folder, scenario.integrator)
 
 
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
@@ -52,3 +72,7 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
         f"how contacts open: {closed}": bool(loop.plant.contacts),
     }
     return [text for text, is_run in parts.items() if is_run]
+
+
+WRITERS = {"c": _write_c, "wasm": _write_wasm}
+"""Format -> what writes it."""

@@ -16,9 +16,8 @@ from drake_dae.errors import ModelError
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.samples import samples, tests
 from drake_dae.running.export.steps.words import file_of, parameter_names, prefix_of
-from drake_dae.running.export.text import Call, Vector, braced, comment, string, written
+from drake_dae.running.export.text import Call, Vector, braced, comment, generated, string, written
 from drake_dae.running.export.whole import whole_calls, whole_vectors
-from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 TEMPLATES = Path(__file__).parent / "c99"
@@ -62,9 +61,6 @@ def export_code(
     if whole is not None:
         vectors |= whole_vectors(whole, whole.values(context))
         calls |= whole_calls(whole)
-    generated = generate(
-        *(renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
-    )
     words = {
         "title": comment(f"{structure.system.name} ({name})"),
         "name": file,
@@ -76,7 +72,9 @@ def export_code(
         "names": "".join(_defined(prefix, *item) for item in vectors.items()),
         "law": calls["law"].signature,
         "plant": calls["plant"].signature,
-        "generated": generated,
+        "generated": generated(
+            {f"{prefix}_traced_{key}": call.function.function for key, call in calls.items()}
+        ),
         "calls": "".join(_called(prefix, *item) for item in calls.items()),
         "residual": calls["residual"].signature,
         "residuals": str(max(1, len(structure.manifold.residual_signals))),

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
+import casadi as ca
+
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -44,6 +47,27 @@ class Call:
         """The arguments as C declares them."""
         inputs = [f"const double *{name}" for name in self.inputs]
         return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
+
+
+def generated(functions: Mapping[str, ca.Function]) -> str:
+    """The C of functions as static ones, of which several files may be linked together.
+
+    Args:
+        functions: What each is called -> the function.
+    """
+    source = generate(*(renamed(each, symbol) for symbol, each in functions.items()))
+    kept, is_left_out = list[str](), False
+    for line in source.splitlines():
+        is_helper = (
+            line.startswith("CASADI_SYMBOL_EXPORT") and "(const casadi_real** arg" not in line
+        )
+        if not (is_helper or is_left_out or line.startswith("static const casadi_int casadi_s")):
+            kept.append(line)
+        # A helper ends in its line, or at the first brace that begins one.
+        is_left_out = (is_helper and not line.endswith("}")) or (is_left_out and line != "}")
+    text = "\n".join([*kept, ""]).replace("CASADI_SYMBOL_EXPORT int", "static int")
+    text = re.sub(r"^casadi_real casadi_", "static casadi_real casadi_", text, flags=re.MULTILINE)
+    return re.sub(r"\n{3,}", "\n\n", text)
 
 
 def braced(items: Sequence[str]) -> str:

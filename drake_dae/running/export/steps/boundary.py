@@ -1,29 +1,32 @@
-"""Where a loop is cut, so that its controller, or its plant, stands alone."""
+"""The parts of a loop that are exported by themselves: controller, plant, and all of it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    InputPortIndex,
-    OutputPort,
-    OutputPortIndex,
-    System,
-)
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.compiler.compile import compile_part
 from drake_dae.compiler.compiled import CompiledDiagram
-from drake_dae.compiler.wires import Port, Wires, leaf_port
+from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.running.export.steps.cuts import (
+    CONTROL,
+    control_port,
+    measured_ports,
+    plant_of,
+    port_of,
+    reaches,
+    upstream,
+)
 from drake_dae.running.export.steps.ticks import Ticks
+from drake_dae.running.rollout.program import program_of
 from drake_dae.systems.plants.contract import Plant
 
-CONTROL = "control"
-"""What a controller gives, and a plant takes."""
+NEVER = Ticks(0.0)
+"""Of a part that steps whenever it is asked to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class Part:
     Attributes:
         compiled: Its functions; its inputs are the last of the parameters.
         inputs, outputs: Names and units of what it reads and shows.
-        ticks: When it steps.
+        ticks: When a controller steps.
         acts_at_once: Whether its control depends on what is measured in the same instant; else it
             is held, and changes by the updates of an instant.
     """
@@ -41,8 +44,8 @@ class Part:
     compiled: CompiledDiagram
     inputs: Mapping[str, tuple[Signal, ...]]
     outputs: Mapping[str, tuple[Signal, ...]]
-    ticks: Ticks
-    acts_at_once: bool
+    ticks: Ticks = NEVER
+    acts_at_once: bool = False
 
 
 def controller_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
@@ -58,20 +61,21 @@ def controller_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
     Raises:
         ModelError: There is not one plant, or the controller has no steps: why.
     """
-    diagram, plant = (
-        (loop, _plant(loop)) if isinstance(loop, Diagram) else (loop.diagram, loop.plant)
-    )
-    wires, measured = Wires.of(diagram), _measured(diagram, plant)
-    control = _control(wires, plant)
-    systems, inputs = _upstream(wires, control, measured)
-    acts_at_once = _reaches(wires, control, measured)
+    diagram, plant = _diagram_and_plant(loop)
+    wires, measured = Wires.of(diagram), measured_ports(diagram, plant)
+    control = control_port(wires, plant)
+    systems, inputs = upstream(wires, control, measured)
+    acts_at_once = reaches(wires, control, measured)
     outputs = {CONTROL: control}
     for name, port in wires.outputs.items():
         is_own = port != control and port not in measured and port[0] in systems
-        if is_own and name != CONTROL and not _reaches(wires, port, measured):
+        if is_own and name != CONTROL and not reaches(wires, port, measured):
             outputs[name] = port
     compiled = compile_part(
-        diagram, {name: _port(p) for p, name in inputs.items()}, _ports(outputs), context
+        diagram,
+        {name: port_of(port) for port, name in inputs.items()},
+        {name: port_of(port) for name, port in outputs.items()},
+        context,
     )
     _check_steps(compiled)
     if acts_at_once and not plant.time_step:
@@ -79,154 +83,99 @@ def controller_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
             "the controller acts continuously, and as one step it needs samples: give the loop a "
             "sampling, in a scenario `sampling: {period: 0.001}`"
         )
-    known = _known_signals(loop, plant)
-    return Part(
-        compiled,
-        {name: _signals(known, name, part.stop - part.start) for name, part in compiled.inputs},
-        {
-            name: _signals({**compiled.signals, **known}, name, _port(port).size())
-            for name, port in outputs.items()
-        },
-        Ticks.of(compiled.rates, plant.time_step),
-        acts_at_once,
-    )
+    ticks = Ticks.of(compiled.rates, plant.time_step)
+    known = {**compiled.signals, **_known_signals(loop, plant)}
+    return _part(compiled, known, ticks, acts_at_once)
 
 
 def plant_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
-    """The plant of a loop alone, whose input is its control.
+    """The plant of a loop with its sensors, whose input is the control.
+
+    Its outputs have the names of the controller's inputs, among others.
 
     Args:
         loop, context: As of `controller_part`.
 
     Raises:
-        ModelError: There is not one plant, or it cannot be traced: why.
+        ModelError: There is not one plant, or it changes as no function of the time does: why.
     """
-    diagram, plant = (
-        (loop, _plant(loop)) if isinstance(loop, Diagram) else (loop.diagram, loop.plant)
-    )
-    wires, inputs = Wires.of(diagram), dict[str, OutputPort]()
-    if plant.dae.num_controls:
-        inputs[CONTROL] = _port(_control(wires, plant))
-    known = _known_signals(loop, plant)
+    diagram, plant = _diagram_and_plant(loop)
+    wires, inputs = Wires.of(diagram), {}
     names = ["state", "constraint_force", "constraint_residual", "controlled_output"]
-    outputs = {
-        name: plant.GetOutputPort(name) for name in names if plant.GetOutputPort(name).size()
-    }
-    compiled = compile_part(diagram, inputs, outputs, context)
+    outputs = {name: plant.GetOutputPort(name) for name in names}
+    if plant.dae.num_controls:
+        inputs[CONTROL] = control = control_port(wires, plant)
+        _, read = upstream(wires, control, measured_ports(diagram, plant))
+        outputs |= {name: port_of(port) for port, name in read.items()}
+    compiled = compile_part(
+        diagram,
+        {name: port_of(port) for name, port in inputs.items()},
+        {name: port for name, port in outputs.items() if port.size()},
+        context,
+    )
+    _check_time(compiled, "the plant")
+    return _part(compiled, _known_signals(loop, plant))
+
+
+def loop_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
+    """A loop as a whole, which has no inputs. Its outputs are those of the record.
+
+    Args:
+        loop, context: As of `controller_part`; a diagram may have any number of plants.
+
+    Raises:
+        ModelError: It changes as no function of the time does: why.
+    """
+    program = program_of(loop)
+    _check_time(program.compiled, "the loop")
+    return _part(program.compiled, {name: tuple(each) for name, each in program.signals.items()})
+
+
+def _part(
+    compiled: CompiledDiagram,
+    known: Mapping[str, tuple[Signal, ...]],
+    ticks: Ticks = NEVER,
+    acts_at_once: bool = False,
+) -> Part:
+    inputs = {name: part.stop - part.start for name, part in compiled.inputs}
+    ports = {name: port_of(compiled.wires.outputs[name]) for name in compiled.outputs}
     return Part(
         compiled,
-        {name: _signals(known, name, port.size()) for name, port in inputs.items()},
-        {name: _signals(known, name, port.size()) for name, port in outputs.items()},
-        Ticks.of(compiled.rates),
-        False,
+        {name: _signals(known, name, size) for name, size in inputs.items()},
+        {name: _signals(known, name, port.size()) for name, port in ports.items()},
+        ticks,
+        acts_at_once,
     )
 
 
-def _plant(diagram: Diagram) -> Plant:
-    found = list[Plant]()
+def _diagram_and_plant(loop: ClosedLoop | Diagram) -> tuple[Diagram, Plant]:
+    if isinstance(loop, Diagram):
+        return loop, plant_of(loop)
+    return loop.diagram, loop.plant
 
-    def look(system: System) -> None:
-        if isinstance(system, Plant):
-            found.append(system)
-        elif isinstance(system, Diagram):
-            for each in system.GetSystems():
-                look(each)
 
-    look(diagram)
-    if len(found) != 1:
+def _check_time(compiled: CompiledDiagram, what: str) -> None:
+    """Refuses what is no function of the time, the state and the inputs.
+
+    Raises:
+        ModelError: Contacts open, phases end, Drake steps something, or random numbers are drawn.
+    """
+    changing = [*compiled.guards, *compiled.watched]
+    if changing:
         raise ModelError(
-            f"an export cuts a diagram at its plant, and this one has {len(found)}: a Plant, as "
-            "RobotPlant, DaePlant or ContactPlant"
+            f"{what} changes at moments that a run has to find, as where a contact opens or a "
+            f"phase ends ('{changing[0].system.get_name()}'): no export knows it; a rollout does"
         )
-    return found[0]
-
-
-def _measured(diagram: Diagram, plant: Plant) -> dict[Port, str]:
-    """What the plant and the sensors show: port of a leaf -> name."""
-    names = dict[Port, str]()
-
-    def add(system: System) -> None:
-        for index in range(system.num_output_ports()):
-            port = system.get_output_port(index)
-            name = port.get_name()
-            taken = name in names.values()
-            names[leaf_port(port)] = f"{system.get_name()}_{name}" if taken else name
-
-    def look(system: System) -> None:
-        if system is plant or getattr(system, "measures", False):
-            add(system)
-        elif isinstance(system, Diagram):
-            for each in system.GetSystems():
-                look(each)
-
-    look(diagram)
-    return names
-
-
-def _control(wires: Wires, plant: Plant) -> Port:
-    """What feeds the plant's control, also where the plant takes the law itself."""
-    system: Any = plant
-    for name in (CONTROL, "feedback"):
-        if not plant.HasInputPort(name):
-            continue
-        index = int(plant.GetInputPort(name).get_index())
-        while isinstance(system, Diagram) and (system, index) not in wires.sources:
-            locators = system.GetInputPortLocators(InputPortIndex(index))
-            if not locators:
-                break
-            system, index = locators[0][0], int(locators[0][1])
-        source = wires.sources.get((system, index))
-        if source is not None and name == CONTROL:
-            return source
-        if source is not None:
-            return leaf_port(source[0].GetOutputPort(CONTROL))
-        system = plant
-    raise ModelError(
-        f"nothing leads to the control of '{plant.get_name()}', so that there is no law"
-    )
-
-
-def _upstream(
-    wires: Wires, port: Port, measured: Mapping[Port, str]
-) -> tuple[set[System], dict[Port, str]]:
-    """The systems that lead to a port, and what they read that is measured."""
-    systems, inputs = set[System](), dict[Port, str]()
-
-    def walk(system: System) -> None:
-        if system in systems:
-            return
-        systems.add(system)
-        for index in range(system.num_input_ports()):
-            source = wires.sources.get((system, index))
-            if source is not None and source in measured:
-                inputs[source] = measured[source]
-            elif source is not None:
-                walk(source[0])
-
-    walk(port[0])
-    return systems, inputs
-
-
-def _reaches(wires: Wires, port: Port, measured: Mapping[Port, str]) -> bool:
-    """Whether a port depends on what is measured in the same instant."""
-    done = set[Port]()
-
-    def walk(found: Port) -> bool:
-        if found in measured:
-            return True
-        if found in done:
-            return False
-        done.add(found)
-        system, index = found
-        for i in range(system.num_input_ports()):
-            source = wires.sources.get((system, i))
-            if source is None or not system.HasDirectFeedthrough(i, index):
-                continue
-            if walk(source):
-                return True
-        return False
-
-    return walk(port)
+    if compiled.has_stepped:
+        raise ModelError(
+            f"{what} has Drake's own contact ('{compiled.stepped[1].system.get_name()}'), which no "
+            "export knows; a rollout does. Export one with an ideal plant"
+        )
+    if compiled.noise:
+        raise ModelError(
+            f"{what} draws random numbers ('{compiled.noise[0].system.get_name()}'), which no "
+            "export does: leave the noise out, in a scenario noise_deviation"
+        )
 
 
 def _check_steps(compiled: CompiledDiagram) -> None:
@@ -281,11 +230,3 @@ def _signals(known: Mapping[str, tuple[Signal, ...]], name: str, size: int) -> t
     if len(found) == size:
         return found
     return tuple(Signal(f"{name}[{i}]") for i in range(size))
-
-
-def _port(port: Port) -> OutputPort:
-    return port[0].get_output_port(OutputPortIndex(port[1]))
-
-
-def _ports(ports: Mapping[str, Port]) -> dict[str, OutputPort]:
-    return {name: _port(port) for name, port in ports.items()}

@@ -1,5 +1,6 @@
 """The whole controller of a loop as one step in C99, and as a class of C++."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -10,10 +11,11 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
-from drake_dae.compiler.rates import Rate
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.export.steps.boundary import CONTROL, Part, controller_part
+from drake_dae.running.export.steps.boundary import Part, controller_part
+from drake_dae.running.export.steps.cuts import CONTROL
+from drake_dae.running.export.steps.parts import CONTROLLER, Written
 from drake_dae.running.export.steps.played import played_run
 from drake_dae.running.export.steps.words import (
     called,
@@ -24,9 +26,10 @@ from drake_dae.running.export.steps.words import (
     numbers,
     parameter_signals,
     prefix_of,
+    updates,
 )
-from drake_dae.running.export.text import braced, comment, string, written
-from drake_dae.trace.compiled import generate, renamed, without_branches
+from drake_dae.running.export.text import braced, comment, generated, string, written
+from drake_dae.trace.compiled import without_branches
 
 TEMPLATES = Path(__file__).parent / "c99"
 COMMON = TEMPLATES.parents[1] / "c99"
@@ -66,28 +69,53 @@ def export_controller(
         ModelError: The controller acts continuously, or has a block that no C has: why.
         OSError: A file cannot be written.
     """
-    part = controller_part(loop, context)
-    prefix, file = prefix_of(name), file_of(name)
-    words = _Words(part, context, prefix).found | {
+    part, file = controller_part(loop, context), file_of(name)
+    words = _words(part, context, name)
+    diagram = loop if isinstance(loop, Diagram) else loop.diagram
+    run = played_run(diagram, part, context, config, duration, STEPS)
+    found = [
+        *_written(folder, file, words),
+        *written(TEMPLATES, folder, {"play.c": f"play_{file}.c"}, words),
+        *written(COMMON, folder, {each: each for each in ("Makefile", "LICENSE.txt")}, words),
+    ]
+    (found[0].parent / f"{file}_run.csv").write_text(run, encoding="utf-8")
+    return [*found, found[0].parent / f"{file}_run.csv"]
+
+
+def write_controller(part: Part, context: Context, name: str, folder: str | Path) -> Written:
+    """Writes a controller as name_controller.h, .c and .hpp.
+
+    Args:
+        part: As `controller_part` made it.
+        context: The context of the diagram at the start.
+        name: What the files are called.
+        folder: Where to write; made if there is none.
+
+    Raises:
+        ModelError: It reads nothing.
+        OSError: A file cannot be written.
+    """
+    files = _written(folder, file_of(name), _words(part, context, name))
+    signals = parameter_signals(part.compiled)
+    values = part.compiled.values(context)[: len(signals)]
+    return Written(part, CONTROLLER, signals, values, tuple(files), context.get_time())
+
+
+def _words(part: Part, context: Context, name: str) -> dict[str, Any]:
+    prefix = prefix_of(name)
+    return _Words(part, context, prefix).found | {
         "title": comment(name),
-        "name": file,
+        "name": file_of(name),
         "prefix": prefix,
         "guard": prefix.upper(),
         "version": version("drake_dae"),
         "casadi": ca.__version__,
     }
-    files = {
-        "controller.h": f"{file}_controller.h",
-        "controller.c": f"{file}_controller.c",
-        "controller.hpp": f"{file}_controller.hpp",
-        "play.c": f"play_{file}.c",
-    }
-    diagram = loop if isinstance(loop, Diagram) else loop.diagram
-    run = played_run(diagram, part, context, config, duration, STEPS)
-    found = written(TEMPLATES, folder, files, words)
-    found += written(COMMON, folder, {each: each for each in ("Makefile", "LICENSE.txt")}, words)
-    (found[0].parent / f"{file}_run.csv").write_text(run, encoding="utf-8")
-    return [*found, found[0].parent / f"{file}_run.csv"]
+
+
+def _written(folder: str | Path, file: str, words: Mapping[str, Any]) -> list[Path]:
+    names = {f"controller.{each}": f"{file}_controller.{each}" for each in ("h", "c", "hpp")}
+    return written(TEMPLATES, folder, names, words)
 
 
 @dataclass
@@ -113,12 +141,11 @@ class _Words:
             chosen["begin"] = begin
         self._functions = chosen
         self._symbols = {key: f"{prefix}_traced_controller_{key}" for key in chosen}
-        generated = generate(*(renamed(f, self._symbols[key]) for key, f in chosen.items()))
         inputs, outputs = identifiers(part.inputs), identifiers(part.outputs)
         signals = parameter_signals(compiled)
         values = compiled.values(self.context)[: len(signals)]
         first = part.ticks.at(start)
-        count = compiled.sizes["held"]
+        count, updated = compiled.sizes["held"], self._updates()
         self.found: dict[str, Any] = {
             "period": repr(part.ticks.period),
             "start": repr(part.ticks.time(first)),
@@ -132,16 +159,18 @@ class _Words:
             "num_held": str(count + 1),
             "count_held": str(count),
             "num_given": str(functions["given"].numel_out(0) + 1),
-            "generated": without_branches(generated),
+            "generated": without_branches(
+                generated({self._symbols[key]: each for key, each in chosen.items()})
+            ),
             "names": named(f"{prefix}_controller", "parameter", signals),
             "parameters": numbers(values),
             "held": numbers(held),
             "given": self._call("given", ["&time", "c->parameters"], ["c->given"]),
             "row": self._call("row", self._arguments("held"), ["row", "&valid"]),
             "begin": self._begin(),
-            "updates": "".join(_update(*each, self) for each in enumerate(compiled.rates)),
+            "updates": updated["updates"],
             "time": self._time(),
-            "steps": self._steps(),
+            "steps": self._steps(updated),
             "gathered": _copied(inputs, "in->{0}", "fresh + {1}", to_member=False),
             "written": _copied(
                 {key: one for key, one in outputs.items() if key != CONTROL},
@@ -178,38 +207,20 @@ class _Words:
             lines.append(f"  if (is_due(tick, {every}, {first})) time = {moment};\n")
         return "".join(lines)
 
-    def _steps(self) -> str:
+    def _steps(self, updated: Mapping[str, str]) -> str:
         """The outputs and the updates, in Drake's order."""
-        rates, ticks = self.part.compiled.rates, self.part.ticks
-        show = "  good &= show(c, time, held, row);\n"
-        lines = [show] if self.part.acts_at_once else []
-        for is_unrestricted in (True, False):
-            chosen = [i for i, each in enumerate(rates) if each.is_unrestricted is is_unrestricted]
-            if not chosen:
-                continue
-            lines.append("  {\n    double before[HELD + 1];\n")
-            lines.append("    memcpy(before, held, sizeof(before));\n")
-            for i in chosen:
-                due = f"is_due(tick, {ticks.every[i]}, {ticks.first[i]})"
-                lines.append(f"    if ({due}) good &= update_{i}(c, time, before, held);\n")
-            lines.append("  }\n")
-        return "".join([*lines, *([] if self.part.acts_at_once else [show])])
+        show, acts_at_once = "  good &= show(c, time, held, row);\n", self.part.acts_at_once
+        lines = updated["unrestricted"] + updated["discrete"]
+        return show + lines if acts_at_once else lines + show
 
-
-def _update(number: int, rate: Rate, words: _Words) -> str:
-    """The function of one rate, from what is held before an instant to what is held after it."""
-    count = len(rate.places)
-    listed = ", ".join(map(str, [*rate.places, 0]))
-    call = words._call(f"update_{number}", words._arguments("before"), ["values", "&valid"])
-    return f"""/* From t = {rate.offset:g} s on each {rate.period:g} s. */
-static int update_{number}(Controller *c, double time, const double *before, double *held) {{
-  static const int places[] = {{{listed}}};
-  double values[{count + 1}], valid = 0.0;
-  int i;
-{call}  for (i = 0; i < {count}; i++) held[places[i]] = values[i];
-  return isfinite(valid) != 0;
-}}
-"""
+    def _updates(self) -> dict[str, str]:
+        ticks = self.part.ticks
+        return updates(
+            self.part.compiled.rates,
+            "Controller *c",
+            lambda i: self._call(f"update_{i}", self._arguments("before"), ["values", "&valid"]),
+            lambda i: f"is_due(tick, {ticks.every[i]}, {ticks.first[i]})",
+        )
 
 
 def _copied(

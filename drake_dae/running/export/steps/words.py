@@ -1,13 +1,14 @@
 """What Python writes in C for a part of a loop: its functions, vectors and names."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
+from drake_dae.compiler.rates import Rate
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -77,10 +78,55 @@ def called(symbol: str, function: ca.Function, given: Sequence[str], results: Se
 """
 
 
-def numbers(values: FloatArray) -> str:
-    """A list of C, with one entry more, since no list is empty; what is no number is NAN."""
+def numbers(values: FloatArray, spare: bool = True) -> str:
+    """A list of C; what is no number is NAN.
+
+    Args:
+        values: Its entries.
+        spare: Whether it has one entry more, as where there may be none, which C has not.
+    """
     texts = [repr(x) if np.isfinite(x) else "NAN" for x in values.tolist()]
-    return braced([*texts, "0.0"])
+    return braced([*texts, "0.0"] if spare else texts)
+
+
+def updates(
+    rates: Sequence[Rate], own: str, call: Callable[[int], str], due: Callable[[int], str]
+) -> dict[str, str]:
+    """The functions of all rates, and for each kind a block that calls those that are due at once.
+
+    Args:
+        rates: The rates.
+        own: The first parameter of the functions, a pointer: its type and its name.
+        call: Number of a rate -> what computes its values and whether they are of use, from time,
+            own and before.
+        due: Number of a rate -> whether it is due.
+    """
+    pointer = own.split("*")[1]
+    found = {"updates": "", "unrestricted": "", "discrete": ""}
+    for number, rate in enumerate(rates):
+        count = len(rate.places)
+        listed = ", ".join(map(str, [*rate.places, 0]))
+        found["updates"] += f"""/* From t = {rate.offset:g} s on each {rate.period:g} s. */
+static int update_{number}({own}, double time, const double *before, double *held) {{
+  static const int places[] = {{{listed}}};
+  double values[{count + 1}], valid = 0.0;
+  int i;
+{call(number)}  for (i = 0; i < {count}; i++) held[places[i]] = values[i];
+  return isfinite(valid) != 0;
+}}
+"""
+    for kind in ("unrestricted", "discrete"):
+        chosen = [i for i, each in enumerate(rates) if each.is_unrestricted is (kind[0] == "u")]
+        if chosen:
+            lines = [
+                "  {\n    double before[HELD + 1];\n    memcpy(before, held, sizeof(before));\n"
+            ]
+            lines += [
+                f"    if ({due(i)}) good &= update_{i}({pointer}, time, before, held);\n"
+                for i in chosen
+            ]
+            found[kind] = "".join([*lines, "  }\n"])
+    return found
 
 
 def named(prefix: str, what: str, signals: Sequence[Signal]) -> str:
@@ -88,12 +134,12 @@ def named(prefix: str, what: str, signals: Sequence[Signal]) -> str:
     lines = []
     for kind in ("name", "unit"):
         texts = [string(getattr(signal, kind)) for signal in signals]
-        lines.append(f"const char *const {prefix}_{what}_{kind}s[] = {braced([*texts, '0'])};")
+        lines.append(f"const char *const {prefix}_{kind}s_of_{what}s[] = {braced([*texts, '0'])};")
     return "\n".join([*lines, ""])
 
 
 def parameter_signals(compiled: CompiledDiagram) -> list[Signal]:
-    """Names and units of the parameters of all blocks, without those that are inputs."""
+    """Names and units of the parameters of all blocks, without inputs; no name comes twice."""
     first = compiled.inputs[0][1].start if compiled.inputs else compiled.sizes["parameters"]
     found = [Signal("")] * first
     for system, part in compiled.parameters:
@@ -105,6 +151,18 @@ def parameter_signals(compiled: CompiledDiagram) -> list[Signal]:
     for system, name, part in compiled.fixed:
         count = part.stop - part.start
         found[part] = [Signal(f"{system.get_name()}.{name}[{i}]") for i in range(count)]
+    return distinct(found)
+
+
+def distinct(signals: Sequence[Signal]) -> list[Signal]:
+    """The same signals; where a name was there before, a number follows it."""
+    names, found = set[str](), list[Signal]()
+    for signal in signals:
+        name, number = signal.name, 2
+        while name in names:
+            name, number = f"{signal.name}_{number}", number + 1
+        names.add(name)
+        found.append(Signal(name, signal.unit))
     return found
 
 

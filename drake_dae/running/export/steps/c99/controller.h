@@ -89,8 +89,8 @@ typedef struct {
 } ${prefix}_controller;
 
 /* Names and units of the parameters, and of all outputs below each other; their ends are null. */
-extern const char *const ${prefix}_controller_parameter_names[];
-extern const char *const ${prefix}_controller_parameter_units[];
+extern const char *const ${prefix}_controller_names_of_parameters[];
+extern const char *const ${prefix}_controller_units_of_parameters[];
 
 /* Default parameters, no memory, and: stop_control 0, stop_time 0.1 s, max_age 1.5 periods,
    patience 10 steps. */
