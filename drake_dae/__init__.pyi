@@ -91,6 +91,7 @@ from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
 from .running.export.export import export_code as export_code
+from .running.export.fmu.fmu import export_fmu as export_fmu
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.problems import start_values as start_values

@@ -1,4 +1,4 @@
-"""`drake-dae export`: writes controller, plant and loop of a scenario as C99 or WebAssembly."""
+"""`drake-dae export`: writes controller, plant and loop as C99, FMUs or WebAssembly."""
 
 import argparse
 import json
@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.export.export import export_code
+from drake_dae.running.export.fmu.fmu import export_fmu
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.steps.controller import export_controller
 from drake_dae.running.export.steps.parts import Export
@@ -36,7 +37,7 @@ def run_command(options: argparse.Namespace) -> int:
         print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
         return 0
     print(f"written to {folder}/: {', '.join(names)}")
-    if options.format != "c":
+    if options.format == "wasm":
         print(f"{names[0]} has {files[0].stat().st_size / 1000:.0f} kB")
     if missing:
         print(f"not among them: {'; '.join(missing)}")
@@ -61,6 +62,12 @@ def _write_wasm(
     return export_wasm(loop, context, name, folder, scenario.integrator)
 
 
+def _write_fmu(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    return export_fmu(loop, context, name, folder, scenario.integrator)
+
+
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
     """The parts of the scenario that are not in the exported functions; none if the loop is."""
     if parts_of(loop).compiled is not None:
@@ -74,5 +81,5 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
     return [text for text, is_run in parts.items() if is_run]
 
 
-WRITERS = {"c": _write_c, "wasm": _write_wasm}
+WRITERS = {"c": _write_c, "wasm": _write_wasm, "fmu": _write_fmu}
 """Format -> what writes it."""

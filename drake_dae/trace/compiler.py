@@ -81,13 +81,27 @@ class Compiler(NamedTuple):
             MachineCodeError: The compiler fails, or takes longer than some seconds.
             OSError: A file cannot be written.
         """
-        code, library = file.with_suffix(".c"), file.with_suffix(".so")
+        code = file.with_suffix(".c")
         code.write_text(source)
-        options = [*FLAGS, *self.target, level, str(code), "-o", str(library), "-lm"]
+        self.link([code], file.with_suffix(".so"), level, seconds, self.target)
+
+    def link(
+        self,
+        sources: Sequence[Path],
+        library: Path,
+        level: str,
+        seconds: float,
+        target: Sequence[str] = (),
+    ) -> None:
+        """Compiles sources to one shared library; by default for any processor of this kind.
+
+        Raises:
+            MachineCodeError: The compiler fails, or takes longer than some seconds.
+        """
+        options = [*FLAGS, *target, level, *map(str, sources), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
-        if done.returncode == 0 and library.exists():
-            return
-        raise MachineCodeError(_failure(self.command, done, code.parent))
+        if done.returncode or not library.exists():
+            raise MachineCodeError(_failure(self.command, done, sources[0].parent))
 
 
 def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:

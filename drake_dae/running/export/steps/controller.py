@@ -15,7 +15,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import Part, controller_part
 from drake_dae.running.export.steps.cuts import CONTROL
-from drake_dae.running.export.steps.parts import CONTROLLER, Written
+from drake_dae.running.export.steps.parts import CONTROLLER, Written, defaults
 from drake_dae.running.export.steps.played import played_run
 from drake_dae.running.export.steps.words import (
     called,
@@ -97,8 +97,8 @@ def write_controller(part: Part, context: Context, name: str, folder: str | Path
     """
     files = _written(folder, file_of(name), _words(part, context, name))
     signals = parameter_signals(part.compiled)
-    values = part.compiled.values(context)[: len(signals)]
-    return Written(part, CONTROLLER, signals, values, tuple(files), context.get_time())
+    values, inputs = defaults(part, context)
+    return Written(part, CONTROLLER, signals, values, inputs, tuple(files), context.get_time())
 
 
 def _words(part: Part, context: Context, name: str) -> dict[str, Any]:

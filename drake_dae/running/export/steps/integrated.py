@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import Part
-from drake_dae.running.export.steps.parts import PLANT, Written
+from drake_dae.running.export.steps.parts import PLANT, Written, defaults
 from drake_dae.running.export.steps.words import (
     called,
     file_of,
@@ -80,7 +80,7 @@ def write_integrated(
         "input": [signal for signals in part.inputs.values() for signal in signals],
         "output": [signal for signals in part.outputs.values() for signal in signals],
     }
-    values = compiled.values(_begun(compiled, context) if part.inputs else context)
+    values, inputs = defaults(part, context)
     tableau, rates = FIXED[scheme], compiled.rates
     time = context.get_time()
     words = {
@@ -117,7 +117,7 @@ def write_integrated(
             generated({symbols[key]: each for key, each in chosen.items()})
         ),
         "names": "".join(named(f"{prefix}_{kind}", *item) for item in signals.items()),
-        "parameters": numbers(values),
+        "parameters": numbers(np.concatenate([values, inputs])),
         "state": numbers(start),
         "held": numbers(held),
         "given": called(
@@ -139,16 +139,7 @@ def write_integrated(
     }
     names = {f"integrated.{suffix}": f"{file}_{kind}.{suffix}" for suffix in ("h", "c")}
     files = tuple(written(TEMPLATES, folder, names, words))
-    own = parameters, values[: len(parameters)]
-    return Written(part, kind, *own, files, time, states, start, longest)
-
-
-def _begun(compiled: CompiledDiagram, context: Context) -> Context:
-    """The context of a run that has begun: what a law holds, and the plant reads, is a number."""
-    own = context.Clone()
-    own.SetAccuracy(1e-9)
-    compiled.diagram.ExecuteInitializationEvents(own)
-    return own
+    return Written(part, kind, parameters, values, inputs, files, time, states, start, longest)
 
 
 def fixed_steps(config: SimulatorConfig | None) -> tuple[str, float]:

@@ -38,6 +38,7 @@ class Written:
         kind: "controller", "plant" or "loop".
         parameters, states: Names and units; a controller has no continuous state.
         values, start: Their defaults.
+        inputs: Those of the inputs.
         longest: The longest step of a plant or a loop at first, in s.
         time: Of the start, in s.
         files: The header and the source, and what else there is.
@@ -47,6 +48,7 @@ class Written:
     kind: str
     parameters: Sequence[Signal]
     values: FloatArray
+    inputs: FloatArray
     files: tuple[Path, ...]
     time: float
     states: Sequence[Signal] = ()
@@ -88,3 +90,21 @@ def parts_of_loop(
     if not found:
         raise ModelError(f"nothing of it can be exported: {'; '.join(left_out)}")
     return found, left_out
+
+
+def defaults(part: Part, context: Context) -> tuple[FloatArray, FloatArray]:
+    """The parameters of a part, and its inputs when a run begins.
+
+    Args:
+        part: The part.
+        context: The context of the diagram at the start; not changed.
+    """
+    values = part.compiled.values(context)
+    if not part.inputs:
+        return values, np.zeros(0)
+    # What a law holds, and the plant reads, is no number before a run begins.
+    own = context.Clone()
+    own.SetAccuracy(1e-9)
+    part.compiled.diagram.ExecuteInitializationEvents(own)
+    count = part.compiled.inputs[0][1].start
+    return values[:count], part.compiled.values(own)[count:]
