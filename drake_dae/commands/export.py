@@ -9,11 +9,9 @@ from pydrake.systems.framework import Context
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.export.export import export_code
-from drake_dae.running.export.fmu.fmu import export_fmu
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.steps.controller import export_controller
 from drake_dae.running.export.steps.parts import Export
-from drake_dae.running.export.wasm.wasm import export_wasm
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
@@ -59,12 +57,16 @@ def _write_c(
 def _write_wasm(
     scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
 ) -> Export:
+    from drake_dae.running.export.wasm.wasm import export_wasm
+
     return export_wasm(loop, context, name, folder, scenario.integrator)
 
 
 def _write_fmu(
     scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
 ) -> Export:
+    from drake_dae.running.export.fmu.fmu import export_fmu
+
     return export_fmu(loop, context, name, folder, scenario.integrator)
 
 
