@@ -91,6 +91,9 @@ from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
 from .running.export.export import export_code as export_code
+from .running.export.fmu.fmu import export_fmu as export_fmu
+from .running.export.steps.controller import export_controller as export_controller
+from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.gradient.gradient import RolloutGradient as RolloutGradient
 from .running.rollout.gradient.gradient import rollout_gradient as rollout_gradient
 from .running.rollout.gradient.gradient import rollout_tangent as rollout_tangent
@@ -132,6 +135,7 @@ from .systems.plants.contact_events import ContactChange as ContactChange
 from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
+from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant

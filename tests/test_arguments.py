@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
@@ -219,6 +220,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulatorConfig: fixed_step,
     Stage: lambda: dd.DcMotors(0.1, 1e-3, 0.5),
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
+    DrakeLcmInterface: lambda: DrakeLcm("memq://"),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
@@ -241,6 +243,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "add_robot": lambda: add_arm,
     "parameters of ContactPlant": lambda: {"wall.position": [1.2, 0.0, 0.0]},
     "limits of ControlLimits": lambda: [1.0],
+    "driver": lambda: "iiwa",
     "axes": lambda: "xz",
     "axis": lambda: (0.0, 0.0, 1.0),
     "axis of AxisCoordinates": lambda: "z",

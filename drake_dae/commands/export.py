@@ -1,13 +1,17 @@
-"""`drake-dae export`: writes law, plant and projection of a scenario as C99."""
+"""`drake-dae export`: writes controller, plant and loop as C99, FMUs or WebAssembly."""
 
 import argparse
 import json
 from pathlib import Path
 
+from pydrake.systems.framework import Context
+
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.export.export import export_code
 from drake_dae.running.export.parts import parts_of
+from drake_dae.running.export.steps.controller import export_controller
+from drake_dae.running.export.steps.parts import Export
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
@@ -22,29 +26,62 @@ def run_command(options: argparse.Namespace) -> int:
     if loop.generator is None:
         text = "exports support only `references`; `drake-dae simulate` runs a task"
         raise ScenarioError(("task", text))
-    folder = options.out or Path(f"{path.stem}_c99")
-    files = export_code(loop, context, path.stem, folder)
-    names, missing = [file.name for file in files], _left_out(scenario, loop)
+    folder = options.out or Path(
+        f"{path.stem}_{'c99' if options.format == 'c' else options.format}"
+    )
+    files, missing = WRITERS[options.format](scenario, loop, context, path.stem, folder)
+    names = list(dict.fromkeys(file.name for file in files))
     if options.json:
         print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
         return 0
     print(f"written to {folder}/: {', '.join(names)}")
+    if options.format == "wasm":
+        print(f"{names[0]} has {files[0].stat().st_size / 1000:.0f} kB")
     if missing:
         print(f"not among them: {'; '.join(missing)}")
     return 0
 
 
+def _write_c(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    files, missing = export_code(loop, context, name, folder), _left_out(scenario, loop)
+    try:
+        run = scenario.integrator, scenario.duration
+        files += export_controller(loop, context, name, folder, *run)
+    except ModelError as error:
+        missing.append(f"the whole controller as one step: {error}")
+    return Export(files, missing)
+
+
+def _write_wasm(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    from drake_dae.running.export.wasm.wasm import export_wasm
+
+    return export_wasm(loop, context, name, folder, scenario.integrator)
+
+
+def _write_fmu(
+    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
+) -> Export:
+    from drake_dae.running.export.fmu.fmu import export_fmu
+
+    return export_fmu(loop, context, name, folder, scenario.integrator)
+
+
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
-    """The parts of the scenario that are not in the exported code; none if the whole loop is."""
+    """The parts of the scenario that are not in the exported functions; none if the loop is."""
     if parts_of(loop).compiled is not None:
         return []
-    closed = "the code has the plant with all contacts closed"
+    closed = "the functions have the plant with all contacts closed"
     parts = {
-        "the observer, which estimates the disturbance and the friction among law_parameters": (
-            loop.observer is not None
-        ),
-        "the limits of the drives": scenario.saturation,
+        "the limits of the drives, except in the controller": scenario.saturation,
         f"Drake's own contact: {closed}, and ideal": not loop.plant.is_ideal,
         f"how contacts open: {closed}": bool(loop.plant.contacts),
     }
     return [text for text, is_run in parts.items() if is_run]
+
+
+WRITERS = {"c": _write_c, "wasm": _write_wasm, "fmu": _write_fmu}
+"""Format -> what writes it."""

@@ -110,12 +110,19 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     written = commands.add_parser(
         "export",
         parents=[named],
-        help="write law, plant and projection as C99",
-        description="Writes the law, the plant and the projection of a scenario as plain C99 "
-        "without dependencies, with sizes, names and units, and a test program: `make` in the "
-        "folder compiles it and compares it with Python.",
+        help="write controller, plant and loop as C99, FMUs or WebAssembly",
+        description="c: writes the law, the plant and the projection of a scenario as plain C99 "
+        "without dependencies, with sizes, names and units; and of a sampled law the whole "
+        "controller as one step, with a class of C++ over it. `make` in the folder compiles "
+        "programs that compare them with Python and with a run of Drake's Simulator. fmu: writes "
+        "controller and plant as FMUs (FMI 3.0, co-simulation), with sources and a binary for this "
+        "machine. wasm: writes controller, plant and loop in fixed steps as one WebAssembly "
+        "module, and a module of JavaScript that loads it in a page; it needs drake_dae[compiler].",
     )
-    written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
+    written.add_argument("--format", choices=("c", "fmu", "wasm"), default="c", help="(default: c)")
+    written.add_argument(
+        "--out", type=_path, help="folder for the files (default: <scenario>_<format>, _c99 for c)"
+    )
     _add_json(written, "print the names of the files as JSON")
     film = commands.add_parser(
         "render",

@@ -4,14 +4,14 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import casadi as ca
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
 from drake_dae.compiler.rates import Place, Rate, dense_function
 from drake_dae.compiler.trace import Expressions
-from drake_dae.compiler.wires import Port, Wires
+from drake_dae.compiler.wires import Port, Wires, leaf_port
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
@@ -51,7 +51,35 @@ def compile_diagram(
         ModelError: There is no such output, an input has neither a wire nor a value, blocks close
             an algebraic loop, or a block cannot be traced: its name and why.
     """
-    return _compiled(diagram, outputs, context, {})
+    return _compiled(Wires.of(diagram), outputs, context, {})
+
+
+def compile_part(
+    diagram: Diagram,
+    inputs: Mapping[str, OutputPort],
+    outputs: Mapping[str, OutputPort],
+    context: Context | None = None,
+) -> CompiledDiagram:
+    """A part of a diagram as functions: what leads from some output ports to others.
+
+    What stands behind the inputs is not looked at, and may be what no function knows, such as
+    Drake's own contact. Inputs are the last entries of the parameters, see
+    `CompiledDiagram.inputs`.
+
+    Args:
+        diagram: The diagram.
+        inputs: Name -> the output port of a system in it whose value is an input of the part.
+        outputs: Name -> the output port of a system in it that is computed.
+        context: As of `compile_diagram`.
+
+    Raises:
+        ModelError: As of `compile_diagram`.
+    """
+    wires = Wires.of(diagram).part(
+        {name: leaf_port(port) for name, port in inputs.items()},
+        {name: leaf_port(port) for name, port in outputs.items()},
+    )
+    return _compiled(wires, None, context, {})
 
 
 def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
@@ -64,30 +92,30 @@ def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
     twins = compiled.twins
     if not twins:
         return compiled
-    given = compiled.diagram, compiled.outputs, compiled.context, twins
+    given = compiled.wires, compiled.outputs, compiled.context, twins
     plain, short = (_compiled(*given, is_short=is_short) for is_short in (False, True))
     is_shorter = short.rate.n_instructions() < 0.9 * plain.rate.n_instructions()
     return short if is_shorter else plain
 
 
 def _compiled(
-    diagram: Diagram,
+    wires: Wires,
     outputs: Sequence[str] | None,
     context: Context | None,
     twins: Mapping[System, System],
     is_short: bool = False,
 ) -> CompiledDiagram:
-    wires = Wires.of(diagram)
     if outputs is None:
         outputs = [name for name, port in wires.outputs.items() if _is_vector(port)]
     for name in outputs:
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
-    context = context or diagram.CreateDefaultContext()
+    context = context or wires.diagram.CreateDefaultContext()
     expressions = Expressions(wires, context, twins, is_short)
     chosen = [wires.outputs[name] for name in outputs]
     for system in wires.systems:
-        if getattr(system, "ends_runs", False):  # It counts, though it leads to no output.
+        # It counts, though it leads to no output; a part of a diagram does not end its run.
+        if getattr(system, "ends_runs", False) and not wires.inputs:
             expressions.block(system)
     _needed_systems(expressions, chosen)
     blocks = {each: expressions.used[each] for each in wires.systems if each in expressions.used}
@@ -101,6 +129,11 @@ def _compiled(
             first = columns["parameters"].numel()
             fixed.append((system, name, slice(first, first + symbol.numel())))
             columns["parameters"] = ca.vertcat(columns["parameters"], symbol)
+    inputs = []
+    for name, symbol in expressions.inputs.items():
+        first = columns["parameters"].numel()
+        inputs.append((name, slice(first, first + symbol.numel())))
+        columns["parameters"] = ca.vertcat(columns["parameters"], symbol)
     given = [columns[name] for name in (*ARGUMENTS, "noise")]
     asked: dict[str, Sequence[ca.SX]] = {
         "rate": expressions.checked(
@@ -129,6 +162,7 @@ def _compiled(
         tuple(places["held"]),
         tuple(places["parameters"]),
         tuple(fixed),
+        tuple(inputs),
         tuple(places["noise"]),
         tuple(rate for rate, _ in rates),
         blocks,

@@ -33,6 +33,7 @@ class CompiledDiagram:
         outputs: The names of the output ports of the diagram that are computed.
         states, held, parameters, noise: Where the columns of each block stand.
         fixed: The input ports without a wire whose values are parameters: (system, name, part).
+        inputs: The inputs of a part of a diagram, among the parameters: (name, part).
         rates: The updates, one function for each period and offset.
         blocks: The blocks by their systems, in the order of Drake's states.
         guards: Where the margins of each block stand that changes at moments which a run finds.
@@ -46,6 +47,7 @@ class CompiledDiagram:
     held: tuple[Place, ...]
     parameters: tuple[Place, ...]
     fixed: tuple[tuple[System, str, slice], ...]
+    inputs: tuple[tuple[str, slice], ...]
     noise: tuple[Place, ...]
     rates: tuple[Rate, ...]
     blocks: Mapping[System, Block]
@@ -200,6 +202,22 @@ class CompiledDiagram:
                 found.append((part, self._function("initial", [value])))
         return found
 
+    def begin(self, held: FloatArray) -> ca.Function | None:
+        """(time, state, held, parameters) -> what is held when a run begins; None if `held` is.
+
+        Args:
+            held: What is held before, not a number where a block says what it is.
+        """
+        columns = [self._columns["held"][part] for _, part in self.held]
+        for number, (system, part) in enumerate(self.held):
+            initial = self.blocks[system].initial
+            if initial is not None and np.isnan(held[part]).any():
+                call = self._expressions.call(self.blocks[system], initial)
+                columns[number] = call.results[initial.outputs.index(HELD)]
+        if all(np.isfinite(held)):
+            return None
+        return self._function("begin", [ca.vertcat(*columns)])
+
     def values(self, context: Context) -> FloatArray:
         """The parameters in a context of the diagram, shape (m,).
 
@@ -218,6 +236,9 @@ class CompiledDiagram:
                     f"the input port '{name}' of '{system.get_name()}' has no value in this context"
                 )
             found[part] = port.Eval(own)
+        for name, part in self.inputs:
+            system, index = self.wires.inputs[name]
+            found[part] = system.get_output_port(index).Eval(system.GetMyContextFromRoot(context))
         return found
 
     @cached_property

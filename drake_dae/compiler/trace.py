@@ -75,6 +75,7 @@ class Expressions:
         given: Each symbol of what the time and parameters alone determine, with its expression.
         symbols: (system, STATE, HELD, PARAMETERS, NOISE, or the name of an input port with a fixed
             value) -> its symbols.
+        inputs: Name of an input, where wires are cut -> its symbols.
 
     Raises:
         ModelError: A block cannot be traced; its name and why.
@@ -98,6 +99,9 @@ class Expressions:
         self._needed: list[dict[int, Call]] = []
         self._owners: dict[System, dict[str, Computation]] = {}
         self._under: dict[System, tuple[Block, Computation]] = {}
+        cut = {name: each.get_output_port(i) for name, (each, i) in wires.inputs.items()}
+        self.inputs = {name: ca.SX.sym(name, port.size()) for name, port in cut.items()}
+        self._cut = {(p.get_system(), p.get_name()): self.inputs[n] for n, p in cut.items()}
         for plant, controller in self._twins.items() if is_short else ():
             self._shorten(plant, self.block(controller))
 
@@ -122,6 +126,8 @@ class Expressions:
 
     def output(self, system: System, name: str) -> ca.SX:
         """An output of a block, or its derivative; errors as of `port`."""
+        if (system, name) in self._cut:
+            return self._cut[system, name]
         block = self.block(system)
         computation = self._owners[system].get(name)
         if computation is None:

@@ -1,8 +1,15 @@
 """The wires of a diagram, those of the diagrams inside it included."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
-from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
+from pydrake.systems.framework import (
+    Diagram,
+    InputPortIndex,
+    OutputPort,
+    OutputPortIndex,
+    System,
+)
 
 from drake_dae.systems.blocks.traced import Traced
 
@@ -19,12 +26,18 @@ class Wires:
         systems: The leaf systems, in the order of Drake's states and parameters.
         sources: Input port -> the output port that feeds it; an input without a wire is not there.
         outputs: Name of an output port of the diagram -> the leaf's port.
+        inputs: Name -> an output port of a leaf at which wires are cut: what it shows is an input.
     """
 
     diagram: Diagram
     systems: tuple[System, ...]
     sources: dict[Port, Port]
     outputs: dict[str, Port]
+    inputs: Mapping[str, Port] = field(default_factory=dict)
+
+    def part(self, inputs: Mapping[str, Port], outputs: Mapping[str, Port]) -> "Wires":
+        """The part of the diagram from some output ports of leaves to others."""
+        return replace(self, inputs=dict(inputs), outputs=dict(outputs))
 
     @classmethod
     def of(cls, diagram: Diagram) -> "Wires":
@@ -49,6 +62,11 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
         source = _output(giver, int(given))
         for port in _inputs(taker, int(taken)):
             sources[port] = source
+
+
+def leaf_port(port: OutputPort) -> Port:
+    """The leaf's port that an output port of any system shows."""
+    return _output(port.get_system(), int(port.get_index()))
 
 
 def _output(system: System, index: int) -> Port:

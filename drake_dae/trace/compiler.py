@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
@@ -37,6 +38,15 @@ libm and memcpy. The results are the same to the bit."""
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
 """Options that make Python a C compiler, if ziglang is installed: code for any processor, since
 machines may share a home, and without Zig's checks for undefined behavior."""
+
+WEB = (
+    *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c99", "-O2"),
+    *("-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=undefined", "-Wl,--strip-all"),
+)
+"""Options that make Python a compiler of WebAssembly."""
+
+WEB_PATIENCE = 600.0
+"""That compiler hangs if it takes longer than this, in s."""
 
 ANSWERS = 10.0
 """A compiler that takes longer than this to report its version counts as hanging, in s."""
@@ -78,18 +88,36 @@ class Compiler(NamedTuple):
             MachineCodeError: The compiler fails, or takes longer than some seconds.
             OSError: A file cannot be written.
         """
-        code, library = file.with_suffix(".c"), file.with_suffix(".so")
+        code = file.with_suffix(".c")
         code.write_text(source)
-        options = [*FLAGS, *self.target, level, *more, str(code), "-o", str(library), "-lm"]
+        target = (*self.target, *more)
+        self.link([code], file.with_suffix(".so"), level, seconds, target)
+
+    def link(
+        self,
+        sources: Sequence[Path],
+        library: Path,
+        level: str,
+        seconds: float,
+        target: Sequence[str] = (),
+    ) -> None:
+        """Compiles sources to one shared library; by default for any processor of this kind.
+
+        Raises:
+            MachineCodeError: The compiler fails, or takes longer than some seconds.
+        """
+        options = [*FLAGS, *target, level, *map(str, sources), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
-        if done.returncode == 0 and library.exists():
-            return
-        lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-        wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
-        said = wrong[0].replace(f"{code.parent}/", "").strip()
-        raise MachineCodeError(
-            f"the C compiler '{shlex.join(self.command)}' fails (exit {done.returncode}): {said}"
-        )
+        if done.returncode or not library.exists():
+            raise MachineCodeError(_failure(self.command, done, sources[0].parent))
+
+
+def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:
+    """What a compiler says that fails."""
+    lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+    wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
+    said = wrong[0].replace(f"{folder}/", "").strip()
+    return f"the C compiler '{shlex.join(command)}' fails (exit {done.returncode}): {said}"
 
 
 def find_compiler() -> Compiler:
@@ -181,3 +209,22 @@ def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str
         ) from None
     except (OSError, ValueError) as error:
         raise MachineCodeError(f"the C compiler '{command[0]}' does not run: {error}") from None
+
+
+def compile_webassembly(sources: Sequence[Path], file: Path) -> None:
+    """Compiles C sources to a WebAssembly module that imports nothing, by the zig of ziglang.
+
+    The first call on a machine compiles zig's C library as well, which takes half a minute.
+
+    Raises:
+        MachineCodeError: There is no ziglang, or it fails.
+    """
+    if find_spec("ziglang") is None:
+        raise MachineCodeError(
+            "WebAssembly is compiled by zig, which is not installed: pip install "
+            "'drake_dae[compiler]'"
+        )
+    command = [sys.executable, *WEB, *map(str, sources), "-o", str(file)]
+    done = _run(command, WEB_PATIENCE)
+    if done.returncode or not file.exists():
+        raise MachineCodeError(_failure(command, done, sources[0].parent))

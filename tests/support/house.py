@@ -81,7 +81,9 @@ def declared_modules() -> set[str]:
     used = [needed for extra, names in extras.items() if extra != "dev" for needed in names]
     requirements = [*project["dependencies"], *used]
     names = [re.split(r"[^\w.-]", requirement)[0] for requirement in requirements]
-    return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
+    found = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
+    # Drake's wheel has the LCM messages beside pydrake.
+    return found | ({"drake"} & set(names))
 
 
 def modules() -> dict[str, Path]:

@@ -1,27 +1,23 @@
 """A closed loop's law, plant and projection as plain C99, for somebody's real-time loop."""
 
-import re
 from importlib.metadata import version
 from pathlib import Path
-from string import Template
 
 import casadi as ca
-import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.samples import samples, tests
-from drake_dae.running.export.text import Call, Vector, braced, comment, string
+from drake_dae.running.export.steps.words import file_of, parameter_names, prefix_of
+from drake_dae.running.export.text import Call, Vector, braced, comment, generated, string, written
 from drake_dae.running.export.whole import whole_calls, whole_vectors
-from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 TEMPLATES = Path(__file__).parent / "c99"
@@ -59,20 +55,12 @@ def export_code(
     law, structure = controller.law, plant.structure
     plant_parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
     law_parameters = controller.all_parameters(controller.GetMyContextFromRoot(context))
-    if not re.search("[A-Za-z]", name):
-        raise ModelError(f"a name of C has letters of A to Z, got {name!r}")
-    prefix = re.sub("[^A-Za-z0-9]+", "_", name).strip("_").lower()
-    if prefix[0].isdigit():
-        prefix = f"dae_{prefix}"
-    file = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
+    prefix, file = prefix_of(name), file_of(name)
     vectors = _vectors(law, structure, plant_parameters, law_parameters)
     calls = _calls(law, structure)
     if whole is not None:
         vectors |= whole_vectors(whole, whole.values(context))
         calls |= whole_calls(whole)
-    generated = generate(
-        *(renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
-    )
     words = {
         "title": comment(f"{structure.system.name} ({name})"),
         "name": file,
@@ -84,7 +72,9 @@ def export_code(
         "names": "".join(_defined(prefix, *item) for item in vectors.items()),
         "law": calls["law"].signature,
         "plant": calls["plant"].signature,
-        "generated": generated,
+        "generated": generated(
+            {f"{prefix}_traced_{key}": call.function.function for key, call in calls.items()}
+        ),
         "calls": "".join(_called(prefix, *item) for item in calls.items()),
         "residual": calls["residual"].signature,
         "residuals": str(max(1, len(structure.manifold.residual_signals))),
@@ -102,12 +92,7 @@ def export_code(
         "Makefile": "Makefile",
         "LICENSE.txt": "LICENSE.txt",
     }
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for template, target in names.items():
-        text = Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(words)
-        (folder / target).write_text(text, encoding="utf-8")
-    return [folder / target for target in names.values()]
+    return written(TEMPLATES, folder, names, words)
 
 
 def _vectors(
@@ -119,11 +104,6 @@ def _vectors(
     """All vectors of the C code, by their names there."""
     system = structure.system
     moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
-    gains = [
-        Signal(f"K of {system.output_signals[i].name} for {chain.name}")
-        for j, chain in enumerate(law.coordinate_signals)
-        for i in np.flatnonzero(law.gains.matrix[:, j])
-    ]
     vectors = {
         "state": Vector("x, the state", system.state_signals),
         "control": Vector("u, the control", system.control_signals),
@@ -133,10 +113,10 @@ def _vectors(
         "constraint_force": Vector("v, the constraint inputs", system.constraint_input_signals),
         "constraint_residual": Vector("zero on N*", structure.manifold.residual_signals),
         "controlled_output": Vector("z, the controlled outputs", system.output_signals),
-        "parameters": Vector(f"of the plant{moves}", _parameters(system), plant_parameters),
+        "parameters": Vector(f"of the plant{moves}", parameter_names(system), plant_parameters),
         "law_parameters": Vector(
             "of the law's model, and then the gains",
-            [*_parameters(law.system), *gains],
+            parameter_names(law.system, law),
             law_parameters,
         ),
     }
@@ -147,17 +127,6 @@ def _vectors(
         rates = [Signal(f"d/dt {s.name}", s.unit.removesuffix(" s")) for s in law.integral.signals]
         vectors["integral_rate"] = Vector("their derivatives by the time", rates)
     return vectors
-
-
-def _parameters(system: DaeSystem) -> list[Signal]:
-    """Names and units of all parameters, and of the derivatives of those that move."""
-    rates = [
-        signal.derivative(order)
-        for p in system.exogenous.moving
-        for order in range(1, len(p.derivatives) + 1)
-        for signal in p.signals
-    ]
-    return [signal for p in system.parameters for signal in p.signals] + rates
 
 
 def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:

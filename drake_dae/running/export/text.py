@@ -1,11 +1,16 @@
 """What Python writes in C: vectors, calls, lists, strings and comments."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+
+import casadi as ca
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -44,6 +49,27 @@ class Call:
         return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
 
 
+def generated(functions: Mapping[str, ca.Function]) -> str:
+    """The C of functions as static ones, of which several files may be linked together.
+
+    Args:
+        functions: What each is called -> the function.
+    """
+    source = generate(*(renamed(each, symbol) for symbol, each in functions.items()))
+    kept, is_left_out = list[str](), False
+    for line in source.splitlines():
+        is_helper = (
+            line.startswith("CASADI_SYMBOL_EXPORT") and "(const casadi_real** arg" not in line
+        )
+        if not (is_helper or is_left_out or line.startswith("static const casadi_int casadi_s")):
+            kept.append(line)
+        # A helper ends in its line, or at the first brace that begins one.
+        is_left_out = (is_helper and not line.endswith("}")) or (is_left_out and line != "}")
+    text = "\n".join([*kept, ""]).replace("CASADI_SYMBOL_EXPORT int", "static int")
+    text = re.sub(r"^casadi_real casadi_", "static casadi_real casadi_", text, flags=re.MULTILINE)
+    return re.sub(r"\n{3,}", "\n\n", text)
+
+
 def braced(items: Sequence[str]) -> str:
     """A list of C, in lines that are not long."""
     lines, last = [], ""
@@ -68,3 +94,25 @@ def string(text: str) -> str:
         for byte in text.encode()
     )
     return f'"{"".join(plain)}"'
+
+
+def written(
+    templates: Path, folder: str | Path, names: Mapping[str, str], words: Mapping[str, str]
+) -> list[Path]:
+    """Writes files from templates; returns them.
+
+    Args:
+        templates: The folder of the templates.
+        folder: Where to write; made if there is none.
+        names: Name of a template -> that of the file.
+        words: What stands for its names in the templates.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for template, target in names.items():
+        text = Template((templates / template).read_text(encoding="utf-8")).substitute(words)
+        (folder / target).write_text(text, encoding="utf-8")
+    return [folder / target for target in names.values()]

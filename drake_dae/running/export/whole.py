@@ -24,21 +24,21 @@ def whole_vectors(compiled: CompiledDiagram, parameters: FloatArray) -> dict[str
         parameters: Their default, as `CompiledDiagram.values` has them.
     """
     sizes = compiled.sizes
-    state = _named(compiled, compiled.states, sizes["state"], "state")
-    held = _named(compiled, compiled.held, sizes["held"], "held")
+    state = signals_of(compiled, compiled.states, sizes["state"], "state")
+    held = signals_of(compiled, compiled.held, sizes["held"], "held")
     found = {
         "time": Vector("t", [Signal("time", "s")]),
         "loop_state": Vector("the states of all blocks, in the order of the diagram", state),
         "loop_held": Vector("what blocks hold between their samples", held),
         "loop_parameters": Vector(
             "of all blocks, in the order of the diagram",
-            _named(compiled, compiled.parameters, sizes["parameters"], "parameter"),
+            signals_of(compiled, compiled.parameters, sizes["parameters"], "parameter"),
             parameters,
         ),
         "loop_rate": Vector("the derivative of loop_state", [s.derivative(1) for s in state]),
     }
     if sizes["noise"]:
-        noise = _named(compiled, compiled.noise, sizes["noise"], "noise")
+        noise = signals_of(compiled, compiled.noise, sizes["noise"], "noise")
         found["loop_noise"] = Vector("new random numbers of deviation 1", noise)
     outputs = [signal for signals in compiled.signals.values() for signal in signals]
     found["loop_outputs"] = Vector(
@@ -96,10 +96,19 @@ def _call(name: str, function: ca.Function, inputs: Sequence[str]) -> Call:
     return Call(traced, list(inputs), [name])
 
 
-def _named(
+def signals_of(
     compiled: CompiledDiagram, places: Sequence[Place], size: int, what: str
 ) -> list[Signal]:
-    """Names of entries: what the block calls them, or its name and a number."""
+    """Names and units of the entries of a column of a diagram.
+
+    They are what a block calls them, or its name and a number.
+
+    Args:
+        compiled: The diagram.
+        places: Where those of each block stand in the column.
+        size: How many there are.
+        what: What messages call one, and the port of a block that has such signals.
+    """
     found = [Signal("")] * size
     for system, part in places:
         own = compiled.blocks[system].ports.get(what, ())

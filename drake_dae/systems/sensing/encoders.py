@@ -145,6 +145,8 @@ class StateSensor(LeafSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    measures = True
+    """It is a part of the machine, also where its controller is exported alone."""
 
     def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
         super().__init__()

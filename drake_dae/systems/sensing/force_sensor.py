@@ -60,6 +60,8 @@ class ForceSensor(DifferentiableSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    measures = True
+    """It is a part of the machine, also where its controller is exported alone."""
 
     def __init__(
         self,

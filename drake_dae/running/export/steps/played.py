@@ -1,0 +1,79 @@
+"""A run of Drake's Simulator, as what a controller reads and gives at each of its steps."""
+
+from math import floor
+
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import Context, Diagram, OutputPortIndex
+
+from drake_dae.compiler.wires import Port
+from drake_dae.errors import SimulationError
+from drake_dae.running.export.steps.boundary import Part
+
+
+def played_run(
+    diagram: Diagram,
+    part: Part,
+    context: Context,
+    config: SimulatorConfig | None,
+    duration: float,
+    most: int,
+) -> str:
+    """The run as a table: a line has the time in s, the inputs, and the outputs that follow.
+
+    Inputs are those that the updates of an instant read. What is held after these is read by
+    letting Drake make them without going on in time.
+
+    Args:
+        diagram: The whole diagram.
+        part: The controller in it.
+        context: The context at the start.
+        config: Drake's settings; its defaults if None.
+        duration: How long it is at most, in s.
+        most: How many steps it has at most.
+
+    Raises:
+        SimulationError: The run ends before its first step.
+    """
+    config, ticks = config or SimulatorConfig(), part.ticks
+    simulator = Simulator(diagram, context.Clone())
+    ApplySimulatorConfig(config, simulator)
+    own = simulator.get_mutable_context()
+    own.SetTime(context.get_time())
+    own.SetAccuracy(config.accuracy)
+    simulator.Initialize()
+    first = ticks.at(context.get_time())
+    count = max(1, min(most, floor(duration / ticks.period + 1e-9)))
+    wires = part.compiled.wires
+    inputs, outputs = list(wires.inputs.values()), list(wires.outputs.values())
+
+    def values(ports: list[Port]) -> list[float]:
+        found = [
+            system.get_output_port(OutputPortIndex(index)).Eval(system.GetMyContextFromRoot(own))
+            for system, index in ports
+        ]
+        return np.concatenate(found).tolist() if found else []
+
+    signals = [
+        signal.name
+        for group in (part.inputs, part.outputs)
+        for signals in group.values()
+        for signal in signals
+    ]
+    lines = [",".join(["time", *(name.replace(",", " ") for name in signals)])]
+    for tick in range(first, first + count):
+        try:
+            if tick > first:
+                simulator.AdvanceTo(ticks.time(tick))
+            row = [own.get_time(), *values(inputs)]
+            if part.acts_at_once:
+                row += values(outputs)
+            simulator.AdvancePendingEvents()
+            if not part.acts_at_once:
+                row += values(outputs)
+        except SimulationError:
+            if tick == first:
+                raise
+            break
+        lines.append(",".join(map(repr, row)))
+    return "\n".join([*lines, ""])
