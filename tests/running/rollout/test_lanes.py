@@ -3,6 +3,8 @@
 import ctypes
 import re
 import shutil
+import signal
+import threading
 import warnings
 
 import casadi as ca
@@ -265,3 +267,18 @@ def test_what_lanes_do_not_know_is_refused():
     function = ca.Function("odd", [X], [ca.erf(X)])
     with pytest.raises(ModelError, match=re.escape("odd has an operation that lanes do not know")):
         emitted(function, "odd")
+
+
+@pytest.mark.parametrize("config", [FIXED, ["integrator.max_step_size=1e-3"]])
+@pytest.mark.usefixtures("signals_of_a_shell")
+def test_an_interrupt_ends_all_runs(config):
+    """Within a step of each: they would take half a minute."""
+    loop, chosen, starts, rows = problem("two_link_wall", *config)
+    settings = {"config": chosen.integrator, "compiled": True}
+    rollout(loop, starts, rows, [0.0, 0.1], **settings)
+    main = threading.main_thread().ident
+    timer = threading.Timer(0.3, lambda: signal.pthread_kill(main, signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        rollout(loop, starts, rows, [0.0, 3e4], **settings)
+    timer.join()
