@@ -62,6 +62,11 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", (), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", ("sampling=null",), marks=pytest.mark.slow),
+        pytest.param(
+            "wall_point_contact",
+            ("sampling=null", "observer=null", "force_feedback=!ModelForce {}", "integral=[]"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param("wall_flexible_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
     ],
 )

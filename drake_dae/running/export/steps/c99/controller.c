@@ -67,6 +67,8 @@ static int run(Controller *c, long long tick) {
   int good = 1;
 $time  set_time(c, time);
   memcpy(held, c->held, sizeof(double) * HELD);
+  held[HELD] = 0.0;
+  (void)is_due; /* Where nothing is sampled. */
 $steps  if (!good || !are_numbers(held, HELD)) return 0;
   memcpy(c->held, held, sizeof(double) * HELD);
   memcpy(c->row, row, sizeof(row));
