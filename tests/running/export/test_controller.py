@@ -62,6 +62,11 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", (), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", ("sampling=null",), marks=pytest.mark.slow),
+        pytest.param(
+            "wall_point_contact",
+            ("sampling=null", "observer=null", "force_feedback=!ModelForce {}", "integral=[]"),
+            marks=pytest.mark.slow,
+        ),
         pytest.param("wall_flexible_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
     ],
 )
@@ -119,6 +124,15 @@ def test_the_program_finds_what_is_wrong(two_link, tmp_path):
     assert done.returncode == 1
     assert re.search(r"control\[\d\] in line \d+ is .*, and Drake has", done.stdout)
     assert done.stdout.endswith("FAILED\n")
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_long_controller_plays_with_the_instructions_of_this_processor(tmp_path):
+    """Where what is held begins with several equal numbers, of which gcc 12 made more."""
+    exported(tmp_path, "wall_point_contact", steps=50)
+    done = played(tmp_path, "wall_point_contact", "-O1", "-march=native")
+    assert done.returncode == 0, done.stdout
 
 
 def test_it_plays_with_other_roundings_too(two_link):

@@ -140,6 +140,15 @@ def test_what_has_no_value_is_told(plant):
     assert_same(code.output("state"), record, "state", 1)
 
 
+def test_numbers_are_those_of_the_model_with_all_optimizations(tmp_path):
+    """On processors with AVX-512 gcc 12 takes wrong what is equal and followed by zeros."""
+    loop, context = build_scenario(scenario("two_link_wall", *EVERYTHING))
+    written = write_integrated(loop_part(loop, context), "loop", context, "arm", tmp_path, CONFIG)
+    code = CIntegrated(written, "-O2", "-march=native")
+    np.testing.assert_array_equal(code.own.parameters, written.values)
+    np.testing.assert_array_equal(code.own.state[: written.start.size], written.start)
+
+
 def test_all_files_are_linked_together(tmp_path):
     """Names of one file are no names of another."""
     loop, context = build_scenario(scenario("two_link_wall", SAMPLED))
