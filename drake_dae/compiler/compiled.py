@@ -14,10 +14,7 @@ from drake_dae.compiler.trace import Call, Expressions
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import (
-    HELD,
-    Block,
-)
+from drake_dae.systems.blocks.traced import HELD, Block
 
 ARGUMENTS = ("time", "state", "held", "parameters")
 """What the functions of a diagram take; an update takes new random numbers, "noise", as well."""

@@ -1,12 +1,14 @@
 """Runs that end where their errors leave what is tolerated."""
 
+import warnings
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
 
 from drake_dae import Tolerances, build_scenario, rollout, simulate, start_values
-from drake_dae.errors import ModelError, ScenarioError, SimulationError
+from drake_dae.errors import MachineCodeWarning, ModelError, ScenarioError, SimulationError
 
 CONTACT = "plant=!MultibodyPlant {time_step: 1.0e-3}", "constraint_damping=!Poles {all: [-50.0]}"
 
@@ -45,10 +47,21 @@ def test_recent_error_is_that_of_its_equation():
         assert (np.sqrt(recent) > largest) == (time > raised.value.time - 1e-9)
 
 
-def test_rollouts_refuse_to_watch():
-    loop, context = build_scenario(scenario("two_link_wall", "tolerances={outputs: {tool.z: 1.0}}"))
-    with pytest.raises(ModelError, match="tolerances cannot be traced: a rollout does not know it"):
-        rollout(loop, *start_values(loop, context), [0.0, 0.1])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_rollout_ends_where_simulate_does(compiled):
+    """With fixed steps both see the same errors at the same samples, and say the same."""
+    steps = "integrator={use_error_control: false, max_step_size: 1.0e-3}"
+    chosen = scenario("two_link_wall", steps, "tolerances={outputs: {tool.z: 0.01}, window: 0.05}")
+    loop, context = build_scenario(chosen)
+    given = start_values(loop, context)
+    with pytest.raises(SimulationError, match=r"recent error of tool\.z") as wanted:
+        simulate(loop.diagram, context, 1.0, chosen.integrator)
+    times = np.linspace(0.0, 1.0, 1001)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MachineCodeWarning)  # Not everywhere there is a compiler.
+        (run,) = rollout(loop, *given, times, config=chosen.integrator, compiled=compiled)
+    assert str(run.failure) == str(wanted.value)
+    assert run.record.time[-1] == pytest.approx(wanted.value.time)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,10 @@ OPTIONS = ("-O2", "-ffp-contract=fast")
 """A product and a sum are one operation where the processor can; -O2 takes a tenth less time."""
 
 
+SLOWER = 4
+"""Operations of registers take so many times as long to compile."""
+
+
 def can_run(program: Program) -> bool:
     """Whether runs of a diagram can go side by side: no block changes, nor does Drake step one."""
     compiled = program.compiled
@@ -40,7 +44,7 @@ def load(program: Program, compiled: Compiled, make: bool) -> ctypes.CDLL | None
     Warns:
         MachineCodeWarning: It should be made and cannot be.
     """
-    operations = program.num_operations
+    operations = program.num_operations * (SLOWER if compiled is True else 1)
     path = library(source(program), operations, compiled, make, OPTIONS)
     return None if path is None else ctypes.CDLL(str(path))
 
