@@ -249,6 +249,12 @@ class TaskController(Diagram, Controller):
                 f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
                 f"controller with sample_period={plant.time_step:g} or a multiple of it"
             )
+        if not (plant.time_step or plant.is_ideal or self.sample_period):
+            raise WiringError(
+                "a contact that gives way may be lost and found at any time, and a task that "
+                "reacts at once may switch without end: make the controller with a sample_period "
+                "(in a scenario: sampling)"
+            )
         name = system.force_signals[self.force].name
         if plant.contacts and name.split(".")[0] not in plant.contacts:
             raise WiringError(

@@ -51,7 +51,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.errors import ModelError, ScenarioError, SimulationError
+from drake_dae.errors import ModelError, ScenarioError, SimulationError, WiringError
 from drake_dae.scenario.shipped import FOLDER
 
 MATERIAL = {"stiffness": 1e5, "dissipation": 2.0, "friction": 0.3, "radius": 0.01}
@@ -348,6 +348,12 @@ def test_gains_of_a_continuous_contact_need_a_period():
     )
     with pytest.raises(ScenarioError, match="or a sampling"):
         run_scenario(found)
+
+
+def test_a_task_on_a_continuous_contact_is_sampled():
+    found = scenario("wall_polish", "plant=!CompliantContact {time_step: 0}", "sampling=null")
+    with pytest.raises((ScenarioError, WiringError), match=r"in a scenario: sampling"):
+        build_scenario(found)
 
 
 @pytest.mark.slow
