@@ -155,6 +155,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Analysis: analysis,
     dd.ClosedLoop: loop,
     dd.ContactMaterial: dd.ContactMaterial,
+    dd.PointMaterial: dd.PointMaterial,
     dd.ContactPlant: contact_plant,
     dd.Controller: lambda: loop().controller,
     dd.LoopSettings: dd.LoopSettings,

@@ -120,7 +120,7 @@ def test_machine_code_agrees_with_the_interpreter(name, monkeypatch):
         monkeypatch.setattr(
             Compiler,
             "compile",
-            lambda own, code, file, _, limit: plain(own, code, file, "-O0", limit),
+            lambda own, code, file, _, limit, more: plain(own, code, file, "-O0", limit, more),
         )
     code, interpreted = (functions_of(name, compiled) for compiled in ("true", "false"))
     random, compiled = np.random.default_rng(0), 0
