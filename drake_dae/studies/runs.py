@@ -27,7 +27,7 @@ from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.plants import plant_kind
-from drake_dae.scenario.scenario import Scenario, read_scenario
+from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import exceeded, run_figures
 from drake_dae.simulation.records.record import Record
@@ -45,6 +45,33 @@ TOGETHER = 32
 
 Batch = Sequence[tuple[int, Variation]]
 """Runs of one structure, with their numbers."""
+
+
+def study_data(
+    base: Mapping[str, Any], variation: Variation, is_rollout: bool = False
+) -> dict[str, Any]:
+    """The complete data of a run, for a rollout with the plant that this runs.
+
+    Args:
+        base: The plain data of the study's scenario.
+        variation: What the run has different.
+        is_rollout: Whether it is a rollout.
+
+    Raises:
+        ScenarioError: A scenario cannot have this.
+    """
+    data = varied_data(base, variation)
+    if any(map(_has_keys, variation.values())):  # It may leave out keys that have defaults.
+        data = scenario_data(read_scenario(data))
+    if is_rollout:
+        from drake_dae.scenario.rolled import rolled_data
+
+        data = rolled_data(data)
+    return data
+
+
+def _has_keys(value: Any) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and any(map(_has_keys, value)))
 
 
 def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
@@ -109,19 +136,19 @@ class Runner:
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
-        self._base = base
+        self._base, self._own = base, study_data(base, {}, lasting is not None)
         self._lasting = lasting
         self._key, self._known = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
-        """The closed loop of a scenario's data.
+        """The closed loop of a run's data.
 
         Raises:
             ScenarioError: Something does not fit; the message names its key.
         """
-        built = _built(data, self._base)
+        built = _built(data, self._own)
         key = json.dumps(built, sort_keys=True)
         if key != self._key:
             self._key, self._built = "", None
@@ -141,7 +168,7 @@ class Runner:
         A start out of reach or a violated assumption is an outcome of a run.
         """
         try:
-            data = varied_data(self._base, variation)
+            data = study_data(self._base, variation, self._lasting is not None)
             loop = self.loop(data)
             start_scenario(read_scenario(data), loop)
         except ScenarioError as error:
@@ -179,7 +206,7 @@ class Runner:
 
     def _begin(self, number: int, variation: Variation) -> "_Begun | RunResult":
         try:
-            data = varied_data(self._base, variation)
+            data = study_data(self._base, variation, self._lasting is not None)
             scenario = read_scenario(data, known=self._known)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.
@@ -314,16 +341,20 @@ def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
         base: The plain data of the study's scenario.
         variations: All runs of the study.
     """
-    total, keys = 0.0, set()
+    total, keys, own = 0.0, set(), study_data(base, {}, True)
     for variation in variations:
-        data = varied_data(base, variation)
-        total += data["duration"]
-        keys.add(structure_key(data, base))
-    return total / len(keys)
+        with suppress(ScenarioError):  # That run says so itself.
+            data = study_data(base, variation, True)
+            total += data["duration"]
+            keys.add(structure_key(data, own))
+    return total / max(len(keys), 1)
 
 
 def batches(
-    base: Mapping[str, Any], runs: Iterable[tuple[int, Variation]], workers: int
+    base: Mapping[str, Any],
+    runs: Iterable[tuple[int, Variation]],
+    workers: int,
+    are_rollouts: bool = False,
 ) -> list[Batch]:
     """The runs by structure, in portions: a worker builds at most one loop per portion.
 
@@ -331,10 +362,14 @@ def batches(
         base: The plain data of the study's scenario.
         runs: The runs.
         workers: The number of workers.
+        are_rollouts: Whether they are rollouts.
     """
     groups: dict[str, list[tuple[int, Variation]]] = {}
+    own = study_data(base, {}, are_rollouts)
     for number, variation in runs:
-        key = structure_key(varied_data(base, variation), base)
+        key = ""
+        with suppress(ScenarioError):  # That run says so itself.
+            key = structure_key(study_data(base, variation, are_rollouts), own)
         groups.setdefault(key, []).append((number, variation))
     total = sum(map(len, groups.values()))
     size = max(1, min(TOGETHER, total // (32 * workers)))

@@ -112,8 +112,9 @@ class CompliantPlant(ParameterizedSystem, Plant):
         dae = model.dae
         structure = constraint_structure_of(type(self).__name__, dae, structure)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
-        if model.stages and material.time_step:
-            check_step(model, material.time_step, values)
+        self.model: RobotModel = model
+        self.time_step, self._stepped = material.time_step, np.zeros(0)
+        self._check_step(values)
         equations = CompliantEquations(model, structure, material)
         forces = tuple(
             Signal(f"{constraint.name}.contact_f{axis}", "N")
@@ -124,9 +125,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         signals = {"state": state, "control": dae.control_signals}
         own = equations.own_parameters(values, material)
         super().__init__(dae, own, signals, sees_steps=not material.time_step)
-        self.model: RobotModel = model
         self.structure, self.material = structure, material
-        self.time_step = material.time_step
         self.set_name(dae.name)
         self.contact_force_signals = forces
         self._place = equations.own_parameters
@@ -200,7 +199,8 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 friction if and only if that of the plant has one.
 
         Raises:
-            ModelError: The material does not fit the plant, or a ball its surface.
+            ModelError: The material does not fit the plant, a ball its surface, or the step the
+                stages with the parameters of the context.
         """
         own = self.material
         kept = material.time_step, material.stiction_tolerance, material.friction is None
@@ -210,8 +210,16 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 f"radius and a number of its friction may change, got {material}"
             )
         values = context.get_numeric_parameter(0).CopyToVector()
-        placed = self._place(values[: self.dae.parameter_symbol.numel()], material)
+        values = values[: self.dae.parameter_symbol.numel()]
+        self._check_step(values)
+        placed = self._place(values, material)
         context.get_mutable_numeric_parameter(0).SetFromVector(placed)
+
+    def _check_step(self, values: FloatArray) -> None:
+        """Refuses a step that is too long for the stages; see `check_step`."""
+        if self.model.stages and self.time_step and not np.array_equal(values, self._stepped):
+            check_step(self.model, self.time_step, values)
+            self._stepped = values.copy()
 
     def _held(self, context: Context) -> FloatArray:
         """What functions take as the state: x, and of a discrete plant the contact forces."""
