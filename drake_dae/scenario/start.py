@@ -44,8 +44,8 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
         with at("integrator.start_time"):
             raise ModelError(
-                "steps and samples begin at 0 s in Drake, and so does a run with them at the earliest, "
-                f"got {scenario.integrator.start_time:g} s"
+                "steps and samples begin at 0 s in Drake, and a run with them no earlier, got "
+                f"{scenario.integrator.start_time:g} s"
             )
     context.SetTime(scenario.integrator.start_time)
     plant, controller = loop.plant, loop.controller
