@@ -369,6 +369,7 @@ def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
     builder.AddSystem(plant)
     source = builder.AddSystem(ConstantVectorSource([6.0, -10.0]))
     builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
@@ -377,6 +378,11 @@ def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
         simulate(diagram, context, 1.0)
     assert 0.15 < found.value.state[0] < 0.2
     assert 0.0 < found.value.time < 1.0
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), [0.0, -1e-3, 0.5, 0.0])
+    (run,) = rollout(diagram, *start_values(diagram, context), [0.0, 1.0], compiled=False)
+    assert str(run.failure) == str(found.value)
+    assert_allclose(run.failure.state, found.value.state, atol=1e-12)
 
 
 def test_a_constraint_that_is_no_contact_is_refused():
