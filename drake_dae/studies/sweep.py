@@ -23,7 +23,8 @@ from drake_dae.studies.cluster import Cluster
 from drake_dae.studies.journal import Journal, open_journal, study_head
 from drake_dae.studies.processes import cores, run_in_processes
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner, batches, lasting
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.structures import batches, lasting
 from drake_dae.studies.study import Study
 from drake_dae.studies.variations import MOST_RUNS, Variation, plain
 

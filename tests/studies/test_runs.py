@@ -14,7 +14,8 @@ from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner, batches, lasting, structure_key, study_data
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.structures import batches, lasting, structure_key, study_data
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
 
