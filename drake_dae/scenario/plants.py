@@ -205,10 +205,8 @@ class CompliantContact(PointMaterial, ScenarioPlant):
         cast(CompliantPlant, plant).set_contact(context, self)
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        with at("plant or plant_parameters"):
-            return CompliantPlant(
-                robot.model, self, structure=robot.structure, parameters=robot.parameters
-            )
+        with at("plant or plant_parameters"):  # Whose numbers are set in a context.
+            return CompliantPlant(robot.model, self, structure=robot.structure)
 
 
 @checked(ModelError)

@@ -1,10 +1,11 @@
 """The run of a scenario by `rollout`, for the command and for studies."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import ceil
+from typing import Any, cast
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -15,6 +16,8 @@ from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
+from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.plants import plant_kind
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.divergence import RecordWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
@@ -38,12 +41,40 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     if plant is scenario.plant:
         return scenario, ""
     name, before = type(plant).__name__, type(scenario.plant).__name__
+    viscous = [one for one in scenario.constraints if getattr(one, "viscous_friction", None)]
+    parameters = {**scenario.plant_parameters, **_without_viscous(one.name for one in viscous)}
     # One of the scenario's own plants, as the contract says.
-    return replace(scenario, plant=plant), (  # type: ignore[arg-type]
+    return replace(scenario, plant=plant, plant_parameters=parameters), (  # type: ignore[arg-type]
         f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
         "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
         "Drake's plant alone"
     )
+
+
+def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
+    """The same of a scenario's complete plain data."""
+    kind = plant_kind(data["plant"])
+    try:
+        plant = kind(**{key: value for key, value in data["plant"].items() if key != TAG})
+    except (ModelError, TypeError):
+        return data  # Who reads it says so.
+    if (rolled := plant.rolled) is plant:
+        return data
+    numbers = {each.name: getattr(rolled, each.name) for each in fields(cast(Any, rolled))}
+    viscous = [one for one in data["constraints"] if one.get("viscous_friction")]
+    return {
+        **data,
+        "plant": {TAG: f"!{type(rolled).__name__}", **numbers},
+        "plant_parameters": {
+            **data["plant_parameters"],
+            **_without_viscous(one["name"] for one in viscous),
+        },
+    }
+
+
+def _without_viscous(names: Iterable[str]) -> dict[str, float]:
+    """Parameters of contacts without viscous friction, which Drake's do not have."""
+    return {f"{name}.viscous_friction": 0.0 for name in names}
 
 
 def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:

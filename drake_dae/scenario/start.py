@@ -41,6 +41,12 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         ScenarioError: Something does not fit; the message names its key.
     """
     context = loop.diagram.CreateDefaultContext()
+    if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
+        with at("integrator.start_time"):
+            raise ModelError(
+                "steps and samples begin at 0 s in Drake, and a run with them no earlier, got "
+                f"{scenario.integrator.start_time:g} s"
+            )
     context.SetTime(scenario.integrator.start_time)
     plant, controller = loop.plant, loop.controller
     own = plant.GetMyMutableContextFromRoot(context)

@@ -8,7 +8,8 @@ from typing import Any
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Batch, run_batch
+from drake_dae.studies.runs import run_batch
+from drake_dae.studies.structures import Batch
 
 WAIT = 30.0
 """The longest time to wait for a scheduler, in s."""

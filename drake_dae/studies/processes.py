@@ -22,7 +22,8 @@ from typing import IO, Any
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Batch, Runner
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.structures import Batch
 
 BUILDS = 200
 """The number of loops after which a process is replaced, since Drake does not free all memory."""

@@ -3,14 +3,13 @@
 import json
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
@@ -24,9 +23,6 @@ from drake_dae.errors import (
     SimulationError,
 )
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.plants import plant_kind
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import exceeded, run_figures
@@ -34,66 +30,11 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
+from drake_dae.studies.structures import TOGETHER, Batch, built_data, study_data
 from drake_dae.studies.variations import Variation
 
 if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
     from drake_dae.running.rollout.rollout import Rollout
-
-
-TOGETHER = 32
-"""At most so many rollouts are made at once."""
-
-Batch = Sequence[tuple[int, Variation]]
-"""Runs of one structure, with their numbers."""
-
-
-def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
-    """Text that is equal for scenarios that the same closed loop can simulate.
-
-    They may differ in the data of a context: start, parameters of the plant, uncoupled gains, seed;
-    or in the settings of the run.
-    """
-    return json.dumps(_built(data, base), sort_keys=True)
-
-
-def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's data with the data of a context taken from the base of the study.
-
-    So the loop does not depend on which run comes first.
-    """
-    own = dict(data)
-    for key in ("description", "plant_parameters", "duration", "integrator", "write"):
-        own[key] = base[key]
-    kind, plant = plant_kind(own["plant"]), base["plant"]
-    if kind is plant_kind(plant):
-        same = {
-            key: plant[key]
-            for key in kind.in_context
-            if (plant[key] is None) is (own["plant"][key] is None)
-        }
-        own["plant"] = {**own["plant"], **same}
-    if kind.carries:  # It is built with its own parameters.
-        own["plant_parameters"] = data["plant_parameters"]
-    elif kind.adjusts:
-        own["plant_payloads"] = [{**each, "mass": 1.0} for each in own["plant_payloads"]]
-        still = {"force": [0.0, 0.0, 0.0]}
-        own["plant_disturbances"] = [{**each, **still} for each in own["plant_disturbances"]]
-    first, positions = base["start"], own["start"].get("positions", {})
-    if positions.keys() == first["positions"].keys():
-        positions = first["positions"]
-    own["start"] = {**first, "positions": positions}
-    # Default gains depend on the built loop; and a task is built with its numbers.
-    if own["gains"] and base["gains"] and not own["task"]:
-        tag = own["gains"].get(TAG, "!Poles")
-        if tag == base["gains"][TAG] != "!Matrices":
-            own["gains"] = base["gains"]
-    if "seed" in (force := own["force_feedback"]):
-        deviation = float(np.any(np.array(force["noise_deviation"]) != 0.0))
-        errors = {"seed": 0, "bias": 0.0, "noise_deviation": deviation}
-        own["force_feedback"] = {**force, **errors}
-    if own["encoders"]:
-        own["encoders"] = {**own["encoders"], "seed": 0}
-    return own
 
 
 class Runner:
@@ -109,19 +50,19 @@ class Runner:
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
-        self._base = base
+        self._base, self._own = base, study_data(base, {}, lasting is not None)
         self._lasting = lasting
         self._key, self._known = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
-        """The closed loop of a scenario's data.
+        """The closed loop of a run's data.
 
         Raises:
             ScenarioError: Something does not fit; the message names its key.
         """
-        built = _built(data, self._base)
+        built = built_data(data, self._own)
         key = json.dumps(built, sort_keys=True)
         if key != self._key:
             self._key, self._built = "", None
@@ -141,7 +82,7 @@ class Runner:
         A start out of reach or a violated assumption is an outcome of a run.
         """
         try:
-            data = varied_data(self._base, variation)
+            data = study_data(self._base, variation, self._lasting is not None)
             loop = self.loop(data)
             start_scenario(read_scenario(data), loop)
         except ScenarioError as error:
@@ -179,7 +120,7 @@ class Runner:
 
     def _begin(self, number: int, variation: Variation) -> "_Begun | RunResult":
         try:
-            data = varied_data(self._base, variation)
+            data = study_data(self._base, variation, self._lasting is not None)
             scenario = read_scenario(data, known=self._known)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.
@@ -305,41 +246,3 @@ def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
 @lru_cache(maxsize=1)
 def _runner(base: str) -> Runner:
     return Runner(*json.loads(base))
-
-
-def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
-    """The mean total duration of the runs of one structure, in s of simulated time.
-
-    Args:
-        base: The plain data of the study's scenario.
-        variations: All runs of the study.
-    """
-    total, keys = 0.0, set()
-    for variation in variations:
-        data = varied_data(base, variation)
-        total += data["duration"]
-        keys.add(structure_key(data, base))
-    return total / len(keys)
-
-
-def batches(
-    base: Mapping[str, Any], runs: Iterable[tuple[int, Variation]], workers: int
-) -> list[Batch]:
-    """The runs by structure, in portions: a worker builds at most one loop per portion.
-
-    Args:
-        base: The plain data of the study's scenario.
-        runs: The runs.
-        workers: The number of workers.
-    """
-    groups: dict[str, list[tuple[int, Variation]]] = {}
-    for number, variation in runs:
-        key = structure_key(varied_data(base, variation), base)
-        groups.setdefault(key, []).append((number, variation))
-    total = sum(map(len, groups.values()))
-    size = max(1, min(TOGETHER, total // (32 * workers)))
-    return [
-        group[first : first + size]
-        for group in groups.values()
-        for first in range(0, len(group), size)
-    ]

@@ -23,7 +23,8 @@ from drake_dae.studies.cluster import Cluster
 from drake_dae.studies.journal import Journal, open_journal, study_head
 from drake_dae.studies.processes import cores, run_in_processes
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner, batches, lasting
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.structures import batches, lasting
 from drake_dae.studies.study import Study
 from drake_dae.studies.variations import MOST_RUNS, Variation, plain
 
@@ -75,10 +76,6 @@ def sweep(
         ModelError: The file belongs to another study, or cannot be written; processes or cluster
             cannot be used.
     """
-    if rollout:
-        from drake_dae.scenario.rolled import for_rollout
-
-        scenario, _ = for_rollout(scenario)
     with suppress(ScenarioError):  # It is reported by each run, which may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
@@ -115,11 +112,11 @@ def _run(
     with _bar(total, total - len(missing), progress) as show:
         if cluster is None:
             count = workers or cores()
-            portions = batches(base, missing, count)
+            portions = batches(base, missing, count, settings[1] is not None)
             _collect(run_in_processes(settings, portions, count, time_limit), journal, show)
             return
         with Cluster(cluster) as connected:
-            portions = batches(base, missing, connected.workers)
+            portions = batches(base, missing, connected.workers, settings[1] is not None)
             _collect(connected.run(settings, portions), journal, show)
 
 

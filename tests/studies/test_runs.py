@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from runs import run_scenario, scenario
 
+from drake_dae import build_scenario
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import varied_data
+from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import read_scenario, scenario_data
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner, batches, lasting, structure_key
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.structures import batches, lasting, structure_key, study_data
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
 
@@ -198,3 +204,37 @@ def test_batches_have_one_structure_and_all_runs():
     assert max(map(len, found)) > 1
     # With few runs no worker waits for another one.
     assert [len(batch) for batch in batches(base, runs[:5], workers=2)] == [1] * 5
+
+
+def test_the_data_of_a_run_are_complete_and_of_the_plant_that_a_rollout_runs():
+    """Also where a variation gives a part of a plant, or keys that only the plant itself has."""
+    base = scenario_data(scenario("wall_point_contact", "constraints.0.viscous_friction=3"))
+    given = {"plant": {TAG: "!CompliantContact", "stiffness": 1e4}}
+    assert study_data(base, given)["plant"]["radius"] == 0.01
+    kinds = {
+        model: study_data(base, {"plant.contact_model": model}, True)
+        for model in ("point", "hydroelastic")
+    }
+    assert kinds["hydroelastic"]["plant"][TAG] == "!MultibodyPlant"
+    rolled, _ = for_rollout(read_scenario(base))
+    assert read_scenario(kinds["point"]).plant == rolled.plant
+    # Drake's contact has no viscous friction.
+    wanted = {"wall.viscous_friction": 0.0}
+    assert kinds["point"]["plant_parameters"] == rolled.plant_parameters == wanted
+
+
+def test_a_run_of_compliant_contact_has_its_own_parameters_alone():
+    """Not those of the study's scenario, which are its default."""
+    text = "plant=!CompliantContact {}", "plant_parameters={wall.position: [0.702, 0, 0]}"
+    base = scenario_data(scenario("wall_point_contact", "compiled=false", *text))
+    runner, data = Runner(base), study_data(base, {"plant_parameters": {}})
+    loop = runner.loop(data)
+    own = loop.plant.GetMyContextFromRoot(start_scenario(read_scenario(data), loop))
+    np.testing.assert_array_equal(loop.plant.get_parameter(own, "wall.position"), [0.7, 0.0, 0.0])
+
+
+def test_steps_do_not_begin_before_zero():
+    """Drake's periodic events do not, so such a plant would stand still until then."""
+    found = scenario("wall_point_contact", "compiled=false", "integrator.start_time=-1")
+    with pytest.raises(ScenarioError, match=r"start_time: .* begin at 0 s"):
+        build_scenario(found)

@@ -60,6 +60,7 @@ class Touch:
         normal: The unit normal toward the free side there, in the world, shape (3, 1).
         clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
         velocity: A point in the world, shape (3, 1) -> the velocity of the object there, in m/s.
+        is_exact: Whether the distance is exact also off the object; else it is to first order.
     """
 
     frame: str
@@ -67,6 +68,7 @@ class Touch:
     normal: ca.SX
     clearance: Callable[[ca.SX], ca.SX]
     velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)
+    is_exact: bool = True
 
 
 @dataclass(frozen=True, eq=False)

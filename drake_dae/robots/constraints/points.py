@@ -172,6 +172,7 @@ class PointOnSurface(Constraint):
             self._normal(frames),
             lambda point: self.surface.distance(self._offset(point)),
             self._surface_velocity,
+            self.surface.has_exact_distance,
         )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:

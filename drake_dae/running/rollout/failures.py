@@ -1,5 +1,7 @@
 """Why a rollout ended early, in the words of the blocks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from drake_dae.arrays import FloatArray
@@ -14,8 +16,9 @@ from drake_dae.systems.blocks.failures import (
     simulation_error,
     spoilt_step,
 )
-from drake_dae.systems.blocks.traced import STATE, TIME
+from drake_dae.systems.blocks.traced import HELD, STATE, TIME, Block
 from drake_dae.systems.blocks.trials import STEPS
+from drake_dae.systems.plants.contract import Plant
 
 STATES = (STATE, "estimated_state")
 """Where the argument of a computation comes from that says where the system is."""
@@ -79,7 +82,18 @@ def _reason(
             return NonFiniteError(
                 f"the reference is not finite at t = {time:g} s", time, function.outputs[0].copy()
             )
-        places = [i for i, name in enumerate(call.computation.sources) if name in STATES]
-        x = arguments[places[0]] if places else state
+        x = _where(call.computation.sources, arguments, call.block, state)
         return simulation_error(function.failure(), time, x, call.block.signals)
     return None
+
+
+def _where(
+    sources: Sequence[str], arguments: Sequence[FloatArray], block: Block, state: FloatArray
+) -> FloatArray:
+    """The state that a computation was given, or that of all if it was given none."""
+    for name, given in zip(sources, arguments, strict=True):
+        if name in STATES:
+            return given
+        if name == HELD and isinstance(block.system, Plant):
+            return given[: block.system.dae.num_states]
+    return state

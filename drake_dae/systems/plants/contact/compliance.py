@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.plants.contact.contact_laws import (
     Compliance,
@@ -14,10 +15,17 @@ from drake_dae.systems.plants.contact.contact_laws import (
     contact_step,
 )
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
-from drake_dae.systems.plants.contact.point_contact import point_contacts, touching
+from drake_dae.systems.plants.contact.point_contact import (
+    ball_normals,
+    point_contacts,
+    touching,
+)
 from drake_dae.systems.plants.contact.stepped_stages import stages_after
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
+
+FITS = 1e-3
+"""The allowed gap or depth of a ball where it shall touch, relative to its radius."""
 
 OUTSIDE = (
     "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
@@ -30,7 +38,7 @@ class CompliantEquations:
     """The functions of a `CompliantPlant`, of (state, control, parameters).
 
     The state is x, or (x, F) for a discrete plant. Parameters are those of the system, followed by
-    `PointMaterial.values` and `ball_normals`.
+    `PointMaterial.values` and `ball_normals` of the nominal configuration: see `own_parameters`.
 
     Args:
         model: The robot.
@@ -50,6 +58,7 @@ class CompliantEquations:
         material: PointMaterial,
     ) -> None:
         dae, self._model, self._h = model.dae, model, material.time_step
+        self._structure = structure
         numbers = ca.SX.sym("material", 4)
         normals = ca.SX.sym("normals", 3 * len(model.constraints))
         self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
@@ -75,6 +84,35 @@ class CompliantEquations:
             name: TracedFunction(name, inputs, {"value": value}, compiled=dae.compiled)
             for name, value in outputs.items()
         }
+        self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
+        depths = ca.vertcat(*(one.depth for one in self._contacts))
+        self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
+
+    def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
+        """All parameters, with the balls placed where they touch in the nominal configuration.
+
+        Args:
+            values: The values of the system's parameters.
+            material: The contact material.
+
+        Raises:
+            ModelError: A ball has no place there.
+        """
+        dae, manifold = self._model.dae, self._structure.manifold
+        state = manifold.project(dae.nominal_state, values)
+        normals = self._normals(state, values)[0]
+        found = np.concatenate([values, material.values, normals])
+        held = np.zeros(self._depths.sizes[0])
+        held[: state.size] = state
+        depths = self._depths(held, found)[0]
+        for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
+            if not abs(depth) <= FITS * material.radius:
+                raise ModelError(
+                    f"a ball with a radius of {material.radius:g} m does not fit "
+                    f"'{constraint.name}' where it shall touch, since the surface bends toward it "
+                    "more than the ball does: take a smaller radius"
+                )
+        return found
 
     def _balance(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
         """M and tau - H without contact, with torques within the limits of the actuators."""

@@ -37,7 +37,6 @@ from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contact.compliance import CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
-from drake_dae.systems.plants.contact.point_contact import ball_normals
 from drake_dae.systems.plants.contact.stepped_stages import check_step
 from drake_dae.systems.plants.contract import Plant
 
@@ -93,8 +92,8 @@ class CompliantPlant(ParameterizedSystem, Plant):
         contact_force_signals: Names and units of `contact_force`.
 
     Raises:
-        ModelError: A constraint is no contact of a point with a surface, or the step is too long
-            for the stages.
+        ModelError: A constraint is no contact of a point with a surface, a ball does not fit its
+            surface, or the step is too long for the stages.
         SimulationError: A joint reaches its limit during a run, or a step has no solution; the
             exception has time and state.
     """
@@ -113,9 +112,10 @@ class CompliantPlant(ParameterizedSystem, Plant):
         dae = model.dae
         structure = constraint_structure_of(type(self).__name__, dae, structure)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
-        if model.stages and material.time_step:
-            check_step(model, material.time_step, values)
-        own = np.concatenate([values, material.values, ball_normals(model, structure, values)])
+        self.model: RobotModel = model
+        self.time_step, self._stepped = material.time_step, np.zeros(0)
+        self._check_step(values)
+        equations = CompliantEquations(model, structure, material)
         forces = tuple(
             Signal(f"{constraint.name}.contact_f{axis}", "N")
             for constraint in model.constraints
@@ -123,13 +123,12 @@ class CompliantPlant(ParameterizedSystem, Plant):
         )
         state = dae.state_signals + forces if material.time_step else dae.state_signals
         signals = {"state": state, "control": dae.control_signals}
+        own = equations.own_parameters(values, material)
         super().__init__(dae, own, signals, sees_steps=not material.time_step)
-        self.model: RobotModel = model
         self.structure, self.material = structure, material
-        self.time_step = material.time_step
         self.set_name(dae.name)
-        equations = CompliantEquations(model, structure, material)
         self.contact_force_signals = forces
+        self._place = equations.own_parameters
         self._shown, self._advanced = equations.shown, equations.advanced
         degrees = dae.exogenous.degrees(*equations.expressions)
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
@@ -200,7 +199,8 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 friction if and only if that of the plant has one.
 
         Raises:
-            ModelError: The material does not fit.
+            ModelError: The material does not fit the plant, a ball its surface, or the step the
+                stages with the parameters of the context.
         """
         own = self.material
         kept = material.time_step, material.stiction_tolerance, material.friction is None
@@ -210,10 +210,16 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 f"radius and a number of its friction may change, got {material}"
             )
         values = context.get_numeric_parameter(0).CopyToVector()
-        first = self.dae.parameter_symbol.numel()
-        normals = ball_normals(self.model, self.structure, values[:first])
-        values[first:] = np.concatenate([material.values, normals])
-        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+        values = values[: self.dae.parameter_symbol.numel()]
+        self._check_step(values)
+        placed = self._place(values, material)
+        context.get_mutable_numeric_parameter(0).SetFromVector(placed)
+
+    def _check_step(self, values: FloatArray) -> None:
+        """Refuses a step that is too long for the stages; see `check_step`."""
+        if self.model.stages and self.time_step and not np.array_equal(values, self._stepped):
+            check_step(self.model, self.time_step, values)
+            self._stepped = values.copy()
 
     def _held(self, context: Context) -> FloatArray:
         """What functions take as the state: x, and of a discrete plant the contact forces."""

@@ -4,11 +4,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint, Touch
 from drake_dae.robots.model import RobotModel
+from drake_dae.trace.smoothness import length_of
+
+TURNS = 4
+"""So often the deepest point of a ball is sought, where a distance is exact on the surface alone:
+its direction is then wrong by (radius / radius of curvature)^4 of what it was at first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +59,14 @@ def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
     return found
 
 
-def ball_normals(
-    model: RobotModel, structure: ConstraintStructure, values: FloatArray
-) -> FloatArray:
-    """The normals of the surfaces in the frames of their constraints, below each other, (3 k,).
+def ball_normals(model: RobotModel) -> ca.SX:
+    """The normals of the surfaces in the frames of their constraints, below each other, (3 k, 1).
 
-    They are those of the nominal configuration, where a ball touches at the point of its
-    constraint: its center is that point plus the radius times the normal.
-
-    Args:
-        model: The robot.
-        structure: The structure of its system.
-        values: The values of all parameters.
+    Those of the nominal configuration say where the balls are: there a ball touches at the point of
+    its constraint, so that its center is that point plus the radius times the normal.
     """
     both = touching(model)
-    normals = [ca.mtimes(model.links.rotation(t.frame).T, t.normal) for _, t in both]
-    function = model.dae.trace("normals", {"normals": ca.vertcat(*normals)}, often=False)
-    state = structure.manifold.project(model.dae.nominal_state, values)
-    return function(state, values)[0]
+    return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for _, t in both))
 
 
 def point_contacts(
@@ -83,19 +76,17 @@ def point_contacts(
 
     Args:
         model: The robot.
-        normals: What `ball_normals` returns, as symbols.
+        normals: Symbols for the values of `ball_normals` in the nominal configuration.
         radius: The radius of the balls, in m.
         friction: The coefficient of all contacts; None for those of the constraints.
     """
     kinematics, links = model.links.kinematics(), model.links
     found = []
     for i, (constraint, touch) in enumerate(touching(model)):
-        place, point = ca.SX.sym("place", 3), ca.SX.sym("point", 3)
+        point = ca.SX.sym("point", 3)
         arm = radius * ca.mtimes(links.rotation(touch.frame), normals[3 * i : 3 * i + 3])
         ball = links.position(touch.frame, touch.point) + arm
-        clearance = touch.clearance(place)
-        normal, gap = ca.substitute([ca.gradient(clearance, place), clearance], [place], [ball])
-        depth = radius - gap
+        normal, depth = _overlap(touch, ball, radius)
         contact = ball - normal * (radius - depth / 2)
         lever = point - kinematics.position(touch.frame, touch.point)
         moving = kinematics.velocity(touch.frame, touch.point)
@@ -108,3 +99,22 @@ def point_contacts(
         viscous = own.get("viscous_friction", ca.SX(0))
         found.append(PointContact(depth, normal, jacobian, velocity, coefficient, viscous))
     return found
+
+
+def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The unit normal of the surface and the depth of the overlap of a ball there.
+
+    The distance of a surface may be exact on it alone. Then it is that of the deepest point of the
+    ball, p = ball - radius n(p), which is found by repetition.
+    """
+    place = ca.SX.sym("place", 3)
+    clearance = touch.clearance(place)
+    slope = ca.gradient(clearance, place)
+    if touch.is_exact:
+        normal, gap = ca.substitute([slope, clearance], [place], [ball])
+        return normal, radius - gap
+    slope = slope / length_of(slope)
+    normal = ca.substitute(slope, place, ball)
+    for _ in range(TURNS):
+        normal = ca.substitute(slope, place, ball - radius * normal)
+    return normal, -ca.substitute(clearance, place, ball - radius * normal)

@@ -40,6 +40,7 @@ from runs import run_scenario, scenario
 from drake_dae import (
     CoincidentPoints,
     CompliantPlant,
+    Ellipsoid,
     Plane,
     PointCoordinates,
     PointMaterial,
@@ -194,6 +195,50 @@ def stepped(plant, state, control):
     return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
 
 
+def on_arm(surface, radius: float) -> CompliantPlant:
+    """The seven-joint arm on a surface."""
+    links = arm("seven_joint").model
+    wall = PointOnSurface("tool", surface, name="wall", friction=0.3)
+    model = RobotModel(
+        links.links, [wall], links.outputs, links.nominal_positions, forces=["wall.force"]
+    )
+    return CompliantPlant(model, PointMaterial(0.0, **{**MATERIAL, "radius": radius}))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
+    """An ellipsoid with equal axes is a sphere of 0.1 m, of ten times the radius of the ball.
+
+    The distance of the ellipsoid is exact to first order in the depth d of up to 0.3 mm, which
+    leaves k d^2 / (2 R) = 0.05 N; at the center of the ball it would be 0.4 mm off, or 40 N.
+    """
+    center = (0.7 - 0.1, 0.0, 0.6) if inside else (0.7 + 0.1, 0.0, 0.6)
+    sphere = on_arm(Sphere(center, 0.1, inside=inside), 0.01)
+    ellipsoid = on_arm(Ellipsoid(center, (0.1, 0.1, 0.1), inside=inside), 0.01)
+    found = []
+    for state, _ in near_contact(sphere, 50, 3):
+        for plant in (sphere, ellipsoid):
+            context = plant.CreateDefaultContext()
+            plant.set_state(context, state)
+            found.append(plant.GetOutputPort("contact_force").Eval(context))
+    assert np.abs(found[::2]).max() > 10.0
+    assert_allclose(found[1::2], found[::2], rtol=0.0, atol=0.1)
+
+
+@pytest.mark.parametrize("surface", ["sphere", "ellipsoid"])
+def test_a_ball_that_its_surface_has_no_room_for_is_refused(surface):
+    center, radius = (0.7 - 0.05, 0.0, 0.6), 0.05
+    hollow = Sphere(center, radius, inside=True)
+    if surface == "ellipsoid":
+        hollow = Ellipsoid(center, (radius, radius, radius), inside=True)
+    plant = on_arm(hollow, 0.04)
+    with pytest.raises(ModelError, match=r"radius of 0.06 m does not fit 'wall'"):
+        on_arm(hollow, 0.06)
+    context = plant.CreateDefaultContext()
+    with pytest.raises(ModelError, match="does not fit 'wall'"):
+        plant.set_contact(context, replace(plant.material, radius=0.06))
+
+
 def sled(stop: float = np.inf) -> RobotModel:
     """A block that slides along x and z, on a floor at z = 0, pulled along x and pressed by u."""
     plant = MultibodyPlant(0.0)
@@ -324,6 +369,7 @@ def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
     builder.AddSystem(plant)
     source = builder.AddSystem(ConstantVectorSource([6.0, -10.0]))
     builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
@@ -332,6 +378,11 @@ def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
         simulate(diagram, context, 1.0)
     assert 0.15 < found.value.state[0] < 0.2
     assert 0.0 < found.value.time < 1.0
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), [0.0, -1e-3, 0.5, 0.0])
+    (run,) = rollout(diagram, *start_values(diagram, context), [0.0, 1.0], compiled=False)
+    assert str(run.failure) == str(found.value)
+    assert_allclose(run.failure.state, found.value.state, atol=1e-12)
 
 
 def test_a_constraint_that_is_no_contact_is_refused():
