@@ -153,7 +153,7 @@ class ToleranceWatch(LeafSystem):
         return Block(self, (), (update,), failure=self._failure)
 
     def _failure(self, time: float, given: Sequence[FloatArray]) -> SimulationError:
-        force, state = (each.copy() for each in given[2:4])
+        force, state = (each + 0.0 for each in given[2:4])  # Without -0.
         function = self._function
         recent = np.sqrt(function.evaluate(*given[:5], np.array([time]))[0])
         if function.failure().fault is not Fault.OUTSIDE:
