@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from drake_dae import LcmArm, build_scenario, export_controller, make_closed_loo
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import controller_part
 from drake_dae.running.export.steps.ticks import Ticks
+from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 RUNNING, HOLDING, STOPPED, WAITING = range(4)
@@ -84,6 +86,7 @@ def test_the_controller_does_what_it_does_in_drakes_simulator(name, settings, tm
     assert re.fullmatch(r"a step: .* us in the median, .* at the 99.9th percentile.*", lines[4])
 
 
+@pytest.mark.skipif(sys.version_info >= CRASHES, reason="LCM crashes with this Python")
 @needs_compiler
 def test_a_controller_that_samples_nothing_is_one_step_too(tmp_path):
     """It acts at each step of a discrete plant, here an arm that no driver moves."""

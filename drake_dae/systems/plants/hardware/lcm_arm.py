@@ -1,5 +1,6 @@
 """A real arm behind its LCM driver, in place of a simulated plant."""
 
+import sys
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -19,6 +20,9 @@ from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.hardware.arm_ports import STATUS_SIGNALS, ArmPorts
 from drake_dae.systems.plants.hardware.drivers import DRIVERS
+
+CRASHES = (3, 13)
+"""From this Python on a message that Drake 1.51 reads ends the process by a segmentation fault."""
 
 
 @checked(ModelError)
@@ -72,6 +76,10 @@ class LcmArm(Diagram, Plant):
         stop_time: float = 0.1,
     ) -> None:
         super().__init__()
+        if sys.version_info >= CRASHES:
+            raise ModelError(
+                "an LcmArm needs Python 3.11 or 3.12: with later ones Drake's LCM blocks crash here"
+            )
         if driver not in DRIVERS:
             raise ModelError(unknown_name("driver", driver, DRIVERS))
         for name, value in {"period": period, "max_age": max_age, "stop_time": stop_time}.items():
