@@ -168,7 +168,7 @@ class Manifold:
             return start
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
-            return near.copy()  # It was there but for round-off, which no level would move.
+            return near.copy()  # It was there up to round-off, which no level would move.
         found = self._settling.settled(start, p)
         return self.project(start if found is None else found, p)
 

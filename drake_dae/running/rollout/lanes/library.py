@@ -8,11 +8,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import DOP853
 
 from drake_dae.running.rollout.lanes.emitter import can_be_emitted, emitted
 from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.stepping.machine import RUN, c_table
+from drake_dae.running.rollout.stepping.machine import DOP_TABLES, RUN, c_table
 from drake_dae.trace.compiled import Compiled, library
 
 FOLDER = Path(__file__).parent
@@ -26,7 +25,7 @@ SLOWER = 4
 
 
 def can_run(program: Program) -> bool:
-    """Whether runs of a diagram can go side by side: no block changes, nor does Drake step one."""
+    """Whether runs of a diagram can go side by side: no block changes, and Drake steps none."""
     compiled = program.compiled
     if compiled.changes or compiled.has_stepped:
         return False
@@ -88,21 +87,11 @@ def _constants(program: Program, functions: Mapping[str, ca.Function]) -> str:
         "PROJECTS": int(compiled.projects),
         "RATES": len(compiled.rates),
     }
-    tables = {
-        "dop_a": DOP853.A,
-        "dop_b": DOP853.B,
-        "dop_c": DOP853.C,
-        "dop_e3": DOP853.E3,
-        "dop_e5": DOP853.E5,
-        "dop_d": DOP853.D,
-        "dop_a_more": DOP853.A_EXTRA,
-        "dop_c_more": DOP853.C_EXTRA,
-    }
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
         listed = ", ".join(map(str, [*rate.places, 0]))
         lines.append(f"CONSTANT int places_{number}[] = {{{listed}}};")
-    lines += [c_table(name, np.asarray(values), "CONSTANT") for name, values in tables.items()]
+    lines += [c_table(name, np.asarray(values), "CONSTANT") for name, values in DOP_TABLES.items()]
     return "\n".join([*lines, ""])
 
 

@@ -47,6 +47,19 @@ class RunState(ctypes.Structure):
     )
 
 
+DOP_TABLES = {
+    "dop_a": DOP853.A,
+    "dop_b": DOP853.B,
+    "dop_c": DOP853.C,
+    "dop_e3": DOP853.E3,
+    "dop_e5": DOP853.E5,
+    "dop_d": DOP853.D,
+    "dop_a_more": DOP853.A_EXTRA,
+    "dop_c_more": DOP853.C_EXTRA,
+}
+"""The tables of DOP853 by the names that the C sources have for them."""
+
+
 def load(program: Program, compiled: Compiled, make: bool) -> Library | None:
     """The library of a diagram; None if there is none.
 
@@ -160,22 +173,12 @@ def _source(program: Program) -> str:
         # At least as many as the initializers in stepper.c.
         sizes[f"{name.upper()}_ARG"] = max(6, function.sz_arg())
         sizes[f"{name.upper()}_RES"] = max(4, function.sz_res())
-    tables = {
-        "dop_a": DOP853.A,
-        "dop_b": DOP853.B,
-        "dop_c": DOP853.C,
-        "dop_e3": DOP853.E3,
-        "dop_e5": DOP853.E5,
-        "dop_d": DOP853.D,
-        "dop_a_more": DOP853.A_EXTRA,
-        "dop_c_more": DOP853.C_EXTRA,
-    }
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
         listed = ", ".join(map(str, [*rate.places, 0]))
         lines.append(f"static const int places_{number}[] = {{{listed}}};")
     lines.append(f"static const double TOUCHING = {TOUCHING!r};")
-    lines += [c_table(name, np.asarray(values)) for name, values in tables.items()]
+    lines += [c_table(name, np.asarray(values)) for name, values in DOP_TABLES.items()]
     words = {
         "run": RUN.read_text(encoding="utf-8"),
         "generated": without_branches(
