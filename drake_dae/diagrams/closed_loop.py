@@ -14,12 +14,12 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.force_feedback import seed_noise
+from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, recorded_values
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
@@ -63,7 +63,7 @@ class ClosedLoop:
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
-    observer: DisturbanceObserver | None = None
+    observer: Observer | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:

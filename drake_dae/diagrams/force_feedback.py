@@ -7,9 +7,9 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.diagrams.observing import Observer
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
@@ -21,7 +21,7 @@ def add_force_feedback(
     controller: Controller,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
-    others: Sequence[DisturbanceObserver] = (),
+    others: Sequence[Observer] = (),
 ) -> RandomSource | None:
     """Connects the constraint force to the controller, through the sensor if there is one.
 

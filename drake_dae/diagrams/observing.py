@@ -2,13 +2,18 @@
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_dae.errors import WiringError
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.estimator import StateEstimator
 from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.sensing.encoders import Encoders
+
+Observer = DisturbanceObserver | StateEstimator
 
 
 def add_observer(
@@ -21,23 +26,29 @@ def add_observer(
     control: OutputPort,
     reference: OutputPort,
     limits: ControlLimits | None,
-) -> DisturbanceObserver:
+    encoders: Encoders | None,
+) -> Observer:
     """Adds the observer that feeds a controller's exogenous signals, but not yet its force.
+
+    If it estimates the state, it also feeds the controller's state.
 
     Args:
         builder: The builder of the diagram, with the other blocks in it.
         plant: The plant.
         controller: The controller.
         observing: The rates of the observer.
-        state: The state input of the controller.
+        state: The measured state.
         sampling: The sampling of the hold after the controller.
         control: The control at the plant.
         reference: R(t).
         limits: The limits of the drives.
+        encoders: What measures the state; None if it is exact.
 
     Raises:
-        WiringError: There is no sampling, or the law uses no measured force.
-        ModelError: The law has no disturbance.
+        WiringError: There is no sampling, the law uses no measured force, or a state is to be
+            estimated that no encoders measure.
+        ModelError: The law has no disturbance, or is not for rigid joints where the state is to
+            be estimated.
     """
     step = plant.time_step
     period = step if sampling is None else sampling.period
@@ -52,8 +63,16 @@ def add_observer(
         )
     rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
     lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
-    observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag, delay))
-    builder.Connect(state, observer.GetInputPort("estimated_state"))
+    timing = period, lag, delay
+    observer: Observer
+    if observing.estimates_state:
+        observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
+        builder.Connect(state, observer.GetInputPort("measured_state"))
+        state = observer.GetOutputPort("estimated_state")
+    else:
+        observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, *timing))
+        builder.Connect(state, observer.GetInputPort("estimated_state"))
+    builder.Connect(state, controller.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
     builder.Connect(reference, observer.GetInputPort("reference"))
     builder.Connect(observer.GetOutputPort("exogenous"), controller.GetInputPort("exogenous"))
@@ -63,3 +82,27 @@ def add_observer(
     if limits is not None:
         builder.Connect(limits.GetOutputPort("is_limited"), observer.GetInputPort("hold"))
     return observer
+
+
+def _estimator(
+    law: TrackingLaw,
+    observing: Observing,
+    timing: tuple[float, float, float],
+    step: float,
+    encoders: Encoders | None,
+) -> StateEstimator:
+    if encoders is None:
+        raise WiringError(
+            "estimates_state is for encoders, whose noise it filters: give the loop encoders, or "
+            "leave it out"
+        )
+    if encoders.velocity_bandwidth is not None:
+        raise WiringError(
+            "an observer that estimates the state takes positions and forms no differences: leave "
+            "the encoders' velocity_bandwidth out"
+        )
+    noise = encoders.position_deviation, encoders.velocity_noise
+    try:
+        return StateEstimator(law, observing, *timing, step, *noise)
+    except ModelError as error:
+        raise WiringError(str(error)) from None

@@ -13,7 +13,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.force_feedback import add_force_feedback
-from drake_dae.diagrams.observing import add_observer
+from drake_dae.diagrams.observing import Observer, add_observer
 from drake_dae.diagrams.parts import (
     add_block,
     add_drives,
@@ -32,7 +32,6 @@ from drake_dae.pictures.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
@@ -147,7 +146,9 @@ def wire_loop(
     if parts.encoders is not None:
         measured = add_encoders(builder, plant, parts.encoders, parts.period(plant.time_step))
         state = measured.output
-    builder.Connect(state, controller.GetInputPort("estimated_state"))
+    observing = parts.observer if goal is not None else None
+    if observing is None:
+        builder.Connect(state, controller.GetInputPort("estimated_state"))
 
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
@@ -165,13 +166,12 @@ def wire_loop(
     moving = add_exogenous(builder, plant, plant.dae, own)
     known = add_exogenous(builder, controller, law.system, parts.exogenous)
 
-    # An observer estimates model errors for the law. Integrals are not updated while a contact is
+    # An observer estimates model errors for the law, and perhaps its state. Integrals are not updated while a contact is
     # open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
-    if parts.observer is not None and goal is not None:
-        observer = add_observer(
-            builder, plant, controller, parts.observer, state, held, control, goal, limits
-        )
+    if observing is not None and goal is not None:
+        wires = state, held, control, goal, limits
+        observer = add_observer(builder, plant, controller, observing, *wires, parts.encoders)
         holds.append(observer.GetOutputPort("hold"))
     elif limits is not None:
         holds.append(limits.GetOutputPort("is_limited"))
@@ -292,13 +292,17 @@ def _of_parts(
     controller: Controller,
     measured: MeasuredState | None,
     limits: ControlLimits | None,
-    observer: DisturbanceObserver | None,
+    observer: Observer | None,
     sensor: ForceSensor | None,
 ) -> Named:
     """What a record has besides of this controller, these parts and this plant."""
     dae, named = plant.dae, Named()
+    estimates = observer is not None and observer.HasOutputPort("estimated_state")
     if measured is not None:
-        named["estimated_state"] = (measured.output, dae.state_signals)
+        name = "measured_state" if estimates else "estimated_state"
+        named[name] = (measured.output, dae.state_signals)
+    if observer is not None and estimates:
+        named["estimated_state"] = (observer.GetOutputPort("estimated_state"), dae.state_signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     for block in (controller, observer):

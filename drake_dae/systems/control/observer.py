@@ -1,29 +1,23 @@
 """An observer of model errors: a disturbance, and coefficients of friction."""
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, positive
-from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
 from drake_dae.systems.control.observer_functions import ObserverFunctions
 from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.control.observing_system import ObservingSystem
 
 _READ = ("estimated_state", "measured_force", "reference")
 
 
 @checked(ModelError)
-class DisturbanceObserver(ParameterizedSystem):
+class DisturbanceObserver(ObservingSystem):
     """Observes the disturbance d of E x' = f + S d + g v + h u, and identifies friction.
 
     With the momentum p = S^T E x a sample of d is, for samples T apart,
@@ -88,84 +82,29 @@ class DisturbanceObserver(ParameterizedSystem):
         control_lag: float = 0.0,
         control_delay: float = 0.0,
     ) -> None:
-        system = law.system
-        signals = {
-            "state": system.state_signals,
-            "control": system.control_signals,
-            "constraint_input": system.constraint_input_signals,
-        }
-        super().__init__(system, system.parameter_values, signals, sees_steps=False)
+        super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("disturbance_observer")
-        self.observing, self.sample_period = observing, positive("sample_period", sample_period)
-        if not 0.0 <= control_lag <= 1.0:
-            raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
-        if not control_delay >= 0.0:
-            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
         self._functions = found = ObserverFunctions(
             law, observing, sample_period, control_lag, control_delay
         )
-        self.observation = observation = found.observation
-        size, names = len(observation.rows), list(observation.frictions)
-        self.disturbance_signals = tuple(
-            Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
-        )
-        self.friction_signals = tuple(Signal(name) for name in names)
-        self._mu = slice(size, size + len(names))
-        sizes = {
-            "estimated_state": system.num_states,
-            "control": system.num_controls,
-            "measured_force": system.num_constraints,
-            "hold": 1,
-            "reference": law.layout.reference_size,
-        }
-        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
         start = np.zeros(found.memory.column.numel())
-        for j, name in enumerate(names, size):
-            start[j : j + 1] = system.parameter_values[system.parameter_slice(name)]
-        self._held = self.DeclareDiscreteState(start)
+        self._declare(law, found, "estimated_state", start)
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
         for name, calc, count, read in (
             ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, _READ),
-            ("disturbance", self._calc_disturbance, size, ()),
-            ("friction", self._calc_friction, len(names), ()),
-            ("hold", self._calc_hold, 1, ("measured_force", "hold")),
+            ("disturbance", self._calc_disturbance, self._mu.start, ()),
+            ("friction", self._calc_friction, len(self.friction_signals), ()),
         ):
             tickets = {self.input_port_ticket(self._ports[port].get_index()) for port in read}
             self.DeclareVectorOutputPort(name, count, weakly(calc), sources | tickets)
 
     @property
-    def further_signals(self) -> dict[str, Sequence[Signal]]:
-        """Name of an output port in a record -> names and units of its entries."""
-        known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
-        return {name: signals for name, signals in known.items() if signals}
-
-    def set_friction(self, context: Context, friction: ArrayLike) -> None:
-        """Sets the initial coefficients of friction, shape (c,), or a number for all.
-
-        Raises:
-            ModelError: The shape is wrong, or a value is negative or above the largest.
-        """
-        self.check_context(context)
-        given, most = numbers("friction", friction), self.observing.largest_friction
-        count = len(self.friction_signals)
-        if given.shape not in ((), (count,)) or not np.all((given >= 0) & (given <= most)):
-            raise ModelError(
-                f"friction must be from 0 to {most:g}, a number or shape ({count},), got "
-                f"{friction!r}"
-            )
-        values = context.get_discrete_state(self._held).CopyToVector()
-        values[self._mu] = given
-        context.SetDiscreteState(self._held, values)
-
-    def _given(self, context: Context, *names: str) -> list[FloatArray]:
-        return [self._ports[name].Eval(context) for name in names]
-
-    def _holds(self, context: Context) -> FloatArray:
-        """What the input port `hold` has; 0 without a wire."""
-        port = self._ports["hold"]
-        return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
+    def _mu(self) -> slice:
+        memory = self._functions.memory
+        first = memory.disturbance.numel()
+        return slice(first, first + memory.friction.numel())
 
     def _sample(self, context: Context, state: State) -> EventStatus:
         x, u, force = self._given(context, "estimated_state", "control", "measured_force")
@@ -177,11 +116,7 @@ class DisturbanceObserver(ParameterizedSystem):
 
     def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
         x, force = self._given(context, "estimated_state", "measured_force")
-        held, port = context.get_discrete_state(self._held).value(), self._ports["reference"]
-        if port.HasValue(context):
-            reference = port.Eval(context)
-        else:
-            (reference,) = self._checked(self.observation.moving, context, x)
+        held, reference = context.get_discrete_state(self._held).value(), self._reference(context, x)
         function = self._functions.exogenous
         output.SetFromVector(self._checked(function, context, x, held, force, reference)[0])
 
@@ -192,16 +127,6 @@ class DisturbanceObserver(ParameterizedSystem):
     def _calc_friction(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._held).value()[self._mu])
 
-    def _calc_hold(self, context: Context, output: BasicVector) -> None:
-        (force,) = self._given(context, "measured_force")
-        output.SetFromVector(self._functions.hold.evaluate(force, self._holds(context))[0])
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
-            "derivative by the time"
-        )
-
     def traced(self) -> Block:
         functions, memory = self._functions, self._functions.memory
         read = ("estimated_state", HELD)
@@ -209,12 +134,11 @@ class DisturbanceObserver(ParameterizedSystem):
         sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
         parts = [memory.disturbance, memory.friction]
         shown = ca.Function("shown", [memory.column], parts)
-        moving = ("estimated_state", PARAMETERS)
         return Block(
             self,
             (
                 Computation.of(functions.exogenous, needed, ("exogenous",)),
-                Computation.of(functions.hold, ("measured_force", "hold"), ("hold",)),
+                self._traced_hold(),
                 Computation(shown, (HELD,), ("disturbance", "friction")),
             ),
             (
@@ -224,10 +148,7 @@ class DisturbanceObserver(ParameterizedSystem):
                     is_unrestricted=True,
                 ),
             ),
-            unwired={
-                "hold": Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",)),
-                "reference": Computation.of(self.observation.moving, moving, ("reference",)),
-            },
+            unwired=self._unwired("estimated_state"),
             signals=self._signals,
             ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
         )

@@ -10,12 +10,14 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class Observing:
-    """The rates of a `DisturbanceObserver`, and its thresholds for friction.
+    """The rates of a `DisturbanceObserver` or `StateEstimator`, and its thresholds for friction.
 
     Attributes:
         rate: k_o in 1/s, the rate of disturbances along the free directions.
         force_rate: k_n in 1/s, the rate of disturbances along the constrained directions, which
             change only constraint forces; None for k_o.
+        estimates_state: Whether the state is estimated as well, from measured positions, by a
+            `StateEstimator`: k_o and k_n are then the cutoffs of its filters.
         friction_rate: k_f in 1/s, the rate at which coefficients of friction are identified.
         largest_friction: The upper bound of coefficients of friction.
         least_speed: The speed in m/s below which a contact may stick, so that its friction is not
@@ -33,6 +35,7 @@ class Observing:
     least_speed: float = 0.005
     least_force: float = 1.0
     force_rate: float | None = None
+    estimates_state: bool = False
 
     def __post_init__(self) -> None:
         for name in ("rate", "friction_rate", "largest_friction", "least_speed", "least_force"):

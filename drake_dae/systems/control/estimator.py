@@ -1,0 +1,204 @@
+"""An estimator of state, disturbance and friction from measured positions."""
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    State,
+    ValueProducer,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation, Update
+from drake_dae.systems.control.estimator_functions import EstimatorFunctions, state_filters
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.control.observing_system import ObservingSystem
+
+
+@checked(ModelError)
+class StateEstimator(ObservingSystem):
+    """Estimates the state of a robot with rigid joints from its encoders, with model errors.
+
+    Between samples the state and the disturbance r are predicted by the model,
+
+        q' = v,    M v' = f + C mu + r + g lambda + h u,
+
+    with the control u that acted and the measured force lambda; so velocities need no differences.
+    At a sample the error of the predicted positions, e = qm - q, corrects all of them,
+
+        q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,
+
+    where (K_1, K_2, K_3) is the gain of the stationary Kalman filter of each position; see
+    `ChainFilter`. Since r is an acceleration there, M^-1 r, one gain serves all postures, and the
+    errors of the estimate are those of a linear filter whatever the motion. Along the constrained
+    directions, M^-1 J^T A^-1 J e, the gains are of the rate w_n, otherwise of w. Measured
+    velocities, if their noise is given, correct likewise. Friction takes its share of r, as in a
+    `DisturbanceObserver`, and a contact that sticks as well.
+
+    Input ports:
+        measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
+            later only if its noise is given.
+        control: The applied u, shape (p,).
+        measured_force: The constraint force, shape (m,).
+        hold, reference: As of a `DisturbanceObserver`.
+
+    Output ports:
+        estimated_state: The estimate of (q, v) at the present sample, shape (n,).
+        exogenous, disturbance, friction, hold: As of a `DisturbanceObserver`, at the present
+            sample.
+
+    Args:
+        law: The law, for a system that `with_disturbance` made.
+        observing: The rates, and the thresholds for friction.
+        sample_period: T in s.
+        control_lag, control_delay: As of a `DisturbanceObserver`.
+        plant_step: The step of a discrete plant in s; 0 for a continuous plant.
+        position_deviation: The standard deviation of a measured position, in rad or m, a number or
+            shape (k,).
+        velocity_deviation: That of a measured velocity, likewise; 0 if none is measured.
+
+    Attributes:
+        observation: The observed functions.
+        observing, sample_period: The arguments.
+        disturbance_signals, friction_signals: Names and units of the output ports.
+
+    Raises:
+        ModelError: The law's system has no disturbance, is no robot with rigid joints, or a number
+            is not valid.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        sample_period: float,
+        control_lag: float = 0.0,
+        control_delay: float = 0.0,
+        plant_step: float = 0.0,
+        position_deviation: ArrayLike = 0.0,
+        velocity_deviation: ArrayLike = 0.0,
+    ) -> None:
+        super().__init__(law, observing, sample_period, control_lag, control_delay)
+        self.set_name("state_estimator")
+        count = law.system.num_states // 2
+        noise = (
+            np.broadcast_to(numbers("deviation", given), (count,))
+            for given in (position_deviation, velocity_deviation)
+        )
+        filters = state_filters(observing, sample_period, *noise)
+        timing = sample_period, control_lag, control_delay, plant_step
+        self._functions = found = EstimatorFunctions(law, observing, *timing, filters)
+        start = np.zeros(found.size + law.system.num_controls + law.system.num_constraints)
+        start[0] = -1.0
+        self._declare(law, found, "measured_state", start)
+        self._read = (*(["control"] if found.reads_control else []), "measured_force", "hold")
+        held = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
+        names = "measured_state", *self._read
+        read = {self.input_port_ticket(self._ports[name].get_index()) for name in names}
+        entry = self.DeclareCacheEntry(
+            "estimate",
+            ValueProducer(lambda: AbstractValue.Make(start[: found.size].copy()), weakly(self._calc)),
+            held | read | {self.time_ticket()},
+        )
+        self._index = entry.cache_index()
+        self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
+        also = {self.input_port_ticket(self._ports["reference"].get_index())}
+        for name, calc, size, more in (
+            ("estimated_state", self._copy_state, law.system.num_states, set()),
+            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, also),
+            ("disturbance", self._copy_disturbance, count, set()),
+            ("friction", self._copy_friction, len(self.friction_signals), set()),
+        ):
+            tickets = {entry.ticket(), self.all_parameters_ticket(), *more}
+            self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
+
+    @property
+    def _places(self) -> tuple[slice, slice, slice]:
+        """Where state, disturbance and friction stand in an estimate."""
+        known, ends = self._functions.estimate, [1]
+        for part in (known.state, known.disturbance, known.friction):
+            ends.append(ends[-1] + part.numel())
+        first, second, third, last = ends
+        return slice(first, second), slice(second, third), slice(third, last)
+
+    @property
+    def _mu(self) -> slice:
+        return self._places[2]
+
+    def _calc(self, context: Context, value: AbstractValue) -> None:
+        (x,), held = (
+            self._given(context, "measured_state"),
+            context.get_discrete_state(self._held).value(),
+        )
+        read = [*self._given(context, *self._read[:-1]), self._holds(context)]
+        time = np.array([context.get_time()])
+        found = self._checked(self._functions.now, context, x, held, *read, time)
+        value.set_value(found[0].copy())
+
+    def _estimate(self, context: Context) -> FloatArray:
+        found: FloatArray = self.get_cache_entry(self._index).Eval(context)
+        return found
+
+    def _sample(self, context: Context, state: State) -> EventStatus:
+        held = [self._estimate(context), *self._given(context, "control", "measured_force")]
+        state.get_mutable_discrete_state().set_value(self._held, np.concatenate(held))
+        return EventStatus.Succeeded()
+
+    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
+        found, (force,) = self._estimate(context), self._given(context, "measured_force")
+        x = found[self._places[0]]
+        given = found, force, self._reference(context, x)
+        output.SetFromVector(self._checked(self._functions.exogenous, context, x, *given)[0])
+
+    def _copy_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._estimate(context)[self._places[0]])
+
+    def _copy_disturbance(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._estimate(context)[self._places[1]])
+
+    def _copy_friction(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._estimate(context)[self._places[2]])
+
+    def traced(self) -> Block:
+        functions, known = self._functions, self._functions.estimate
+        sources = ("measured_state", HELD, *self._read, TIME, PARAMETERS)
+        now = Computation.of(functions.now, sources, (_NOW,))
+        state = ("estimated_state", _NOW, "measured_force", "reference", PARAMETERS)
+        shown = ca.Function(
+            "shown", [known.column], [known.state, known.disturbance, known.friction]
+        )
+        u, v = (ca.SX.sym("given", n) for n in (self.dae.num_controls, self.dae.num_constraints))
+        after = ca.Function("after", [known.column, u, v], [ca.vertcat(known.column, u, v)])
+        return Block(
+            self,
+            (
+                now,
+                Computation(shown, (_NOW,), ("estimated_state", "disturbance", "friction")),
+                Computation.of(functions.exogenous, state, ("exogenous",)),
+                self._traced_hold(),
+            ),
+            (
+                Update(
+                    Computation(after, (_NOW, "control", "measured_force"), (HELD,)),
+                    self.sample_period,
+                    is_unrestricted=True,
+                ),
+            ),
+            unwired=self._unwired("estimated_state"),
+            signals=self._signals,
+            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
+        )
+
+
+_NOW = "estimate"
+"""The name of the estimate among the computations of the block."""

@@ -1,0 +1,210 @@
+"""What a `StateEstimator` computes at its samples, as traced functions."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.chain_filter import ChainFilter
+from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+from drake_dae.systems.control.observed import Observed
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What an estimator knows at a sample, as columns that stand below each other.
+
+    Attributes:
+        sample: The index k of the sample t_k = k T; -1 before the first, shape (1,).
+        state: The estimated x, shape (n,).
+        disturbance: r, shape (k,).
+        friction: mu, shape (c,).
+    """
+
+    sample: ca.SX
+    state: ca.SX
+    disturbance: ca.SX
+    friction: ca.SX
+
+    @classmethod
+    def of(cls, states: int, frictions: int) -> Self:
+        """Symbols, where x and mu have so many entries."""
+        sizes = (1, states, states // 2, frictions)
+        return cls(*(ca.SX.sym("estimate", size) for size in sizes))
+
+    @property
+    def rates(self) -> ca.SX:
+        """The derivatives of r: none."""
+        return ca.SX(0, 1)
+
+    @property
+    def column(self) -> ca.SX:
+        """All of it."""
+        return ca.vertcat(self.sample, self.state, self.disturbance, self.friction)
+
+
+class EstimatorFunctions(Observed):
+    """The functions of a `StateEstimator`, whose class has the equations.
+
+    Attributes:
+        estimate: The symbols of an estimate.
+        size: The number of entries of an estimate.
+        now: (xm, held, u, v, hold, time, parameters) -> the estimate of the present sample; held
+            is the estimate of a sample before, with u and v of that sample. It has no argument u
+            where the plant uses the previous control alone.
+        reads_control: Whether it has.
+        exogenous: (x, estimate, v, R, parameters) -> what to cancel, mu, and their derivatives.
+
+    Args:
+        law, observing: As of the estimator.
+        period, lag, delay, step: Its `sample_period`, `control_lag`, `control_delay` and
+            `plant_step`.
+        filters: Its filters along the free and the constrained directions, one for each position.
+
+    Raises:
+        ModelError: The law's system has no disturbance, or is no robot with rigid joints.
+    """
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        period: float,
+        lag: float,
+        delay: float,
+        step: float,
+        filters: tuple[list[ChainFilter], list[ChainFilter]],
+    ) -> None:
+        super().__init__(law, observing, period)
+        system = self._system
+        _check_rigid(law, self.observation.rows)
+        self._lag, self._step, self._filters = lag, step, filters
+        self.estimate = Estimate.of(system.num_states, len(self.observation.frictions))
+        self.size = self.estimate.column.numel()
+        self.reads_control = lag < 1.0
+        self.now = self._estimated()
+        self.exogenous = self.compensated(law, delay, self.estimate.column, self.estimate)
+
+    def _estimated(self) -> TracedFunction:
+        """The estimate of the present sample."""
+        system, old, period = self._system, self.estimate, self._period
+        measured, v, count = system.state, self._force, len(self.observation.rows)
+        u = ca.SX.sym("control", system.num_controls)
+        time, hold = ca.SX.sym("time"), ca.SX.sym("hold", 1)
+        before = ca.SX.sym("before", u.numel() + v.numel())
+        acted = self._lag * before[: u.numel()] + (1.0 - self._lag) * u
+        share = (1.0 + self._step / period) / 2.0  # A discrete plant's force is that of its step.
+        force = share * v + (1.0 - share) * before[u.numel() :]
+
+        # Prediction over a sample, from the middle of it; a discrete plant steps from its start.
+        q, qd = old.state[:count], old.state[count:]
+        r, mu = old.disturbance, old.friction
+        middle = ca.vertcat(q + (period - self._step) / 2.0 * qd, qd)
+        none = self._parameters(ca.SX.zeros(mu.numel()))
+        contact = self.contact(middle, none)
+        none[system.parameter_slice(DISTURBANCE)] = r + ca.mtimes(contact.friction, mu)
+        mass, push = self._balance()(middle, acted, force, none)
+        factors = PositiveDefiniteFactorization(mass)
+        moved = qd + period * factors.solve(push)
+        ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
+
+        # Correction by what is measured, along the free and the constrained directions.
+        steps = [
+            sum((kind * e for kind, e in zip(kinds, errors, strict=True)), ca.SX(0))
+            for errors in [(measured[:count] - ahead, measured[count:] - moved)]
+            for kinds in self._gains()
+        ]
+        free, constrained = steps[:3], steps[3:]
+        difference = ca.horzcat(*free) - ca.horzcat(*constrained)
+        along = ca.mtimes(contact.free, ca.mtimes(mass, difference))
+        turned = factors.solve(along[:, :2])
+        found_q = ahead + constrained[0] + turned[:, 0]
+        found_v = moved + constrained[1] + turned[:, 1]
+        jump = ca.mtimes(mass, constrained[2]) + along[:, 2]
+        found_r = r + beside(contact.held, contact.metric, jump)
+
+        # Friction takes its share of the disturbance.
+        change = self.change(contact, mu, found_r, hold)
+        found_r -= ca.mtimes(contact.friction, change)
+        found = ca.vertcat(found_q, found_v, found_r, mu + change)
+        begun = ca.vertcat(measured, r, mu)
+        sample = ca.floor(time / period + _SAME)
+        fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, found, begun))
+        shown = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
+        inputs = {"control": u} if self.reads_control else {}
+        inputs |= {"constraint_input": v, "hold": hold, "time": time}
+        return system.trace(
+            "estimate of the state",
+            {"estimate": shown, "valid": contact.valid},
+            {"held": ca.vertcat(old.column, before), **inputs},
+        )
+
+    def _balance(self) -> ca.Function:
+        """(x, u, v, parameters) -> M, and the force that accelerates it, disturbance included."""
+        system, rows = self._system, list(self.observation.rows)
+        u, v = ca.SX.sym("u", system.num_controls), self._force
+        push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
+        inputs = [system.state, u, v, system.parameter_symbol]
+        return ca.Function("balance", inputs, [system.mass_matrix[rows, rows], push[rows]])
+
+    def _gains(self) -> list[tuple[ca.DM, ca.DM]]:
+        """The gains of q, v and a by errors of positions and velocities; free, constrained."""
+        found = []
+        for kinds in self._filters:
+            gains = np.zeros((len(kinds), 3, 2))
+            for i, kind in enumerate(kinds):
+                gains[i, :, : kind.gain.shape[1]] = kind.gain
+            found += [tuple(ca.DM(gains[:, j, e]) for e in range(2)) for j in range(3)]
+        return found
+
+
+_SAME = 1e-9
+"""Times that differ by less than this, in periods, are one."""
+
+
+def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
+    system, count = law.system, len(rows)
+    is_rigid = rows == tuple(range(count, 2 * count)) and system.num_states == 2 * count
+    if not is_rigid or max(law.exogenous_degrees, default=0):
+        raise ModelError(
+            f"{system.name}: estimates_state is for robots with rigid joints, whose states are "
+            "positions and velocities; behind springs, motors or valves measure the velocities, "
+            "or let the encoders form differences by a velocity_bandwidth"
+        )
+    slope = system.f[:count] - system.state[count:]
+    if not ca.simplify(slope).is_zero():
+        raise ModelError(
+            f"{system.name}: estimates_state needs q' = v, and this robot has a body with "
+            "q' = N(q) v; measure its velocities"
+        )
+
+
+def state_filters(
+    observing: Observing, period: float, position: FloatArray, velocity: FloatArray
+) -> tuple[list[ChainFilter], list[ChainFilter]]:
+    """The filters of positions along the free and along the constrained directions.
+
+    Args:
+        observing: The rates.
+        period: T in s.
+        position: The standard deviations of measured positions, shape (k,).
+        velocity: Those of measured velocities, 0 where none is measured, shape (k,).
+
+    Raises:
+        ModelError: A rate is too high for the samples.
+    """
+    ratios = [
+        v / q if v > 0.0 and q > 0.0 else None for q, v in zip(position, velocity, strict=True)
+    ]
+    rates = observing.rate, observing.force_rate or observing.rate
+    free, constrained = (
+        [ChainFilter.of(rate, period, ratio) for ratio in ratios] for rate in rates
+    )
+    return free, constrained

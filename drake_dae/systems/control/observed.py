@@ -1,0 +1,158 @@
+"""What observers of a law's disturbance share: friction's part, and what the law compensates."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation, shares
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.trace.functions import TracedFunction
+
+_SHARP = 10.0
+"""Friction here is that of a motion so many times as fast: full from v_s / 10 on."""
+
+
+class Estimates(Protocol):
+    """What an observer holds of the disturbance, as columns of expressions.
+
+    Attributes:
+        disturbance: r, shape (k,).
+        friction: mu, shape (c,).
+        rates: r', ..., r^(n), shape (n k,).
+    """
+
+    @property
+    def disturbance(self) -> ca.SX: ...
+
+    @property
+    def friction(self) -> ca.SX: ...
+
+    @property
+    def rates(self) -> ca.SX: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """What friction and constraints do at a state, as expressions.
+
+    Attributes:
+        friction: C, the friction force per unit of each coefficient, shape (k, c).
+        metric, free: W and Q of `Observation.directions`.
+        held: T y of the contacts that stick, as columns; zero for others.
+        slides: 1 for each contact that certainly slides, shape (c,).
+        valid: Finite if all of these are valid.
+    """
+
+    friction: ca.SX
+    metric: ca.SX
+    free: ca.SX
+    held: ca.SX
+    slides: ca.SX
+    valid: ca.SX
+
+
+class Observed:
+    """What observers of a law's disturbance share: friction's part, and what the law compensates.
+
+    Attributes:
+        observation: What is observed.
+        hold: (v, hold) -> 1 where integrals stand still, else 0.
+
+    Args:
+        law, observing: As of the observer.
+        period: Its sample period in s.
+
+    Raises:
+        ModelError: The law's system has no disturbance.
+    """
+
+    def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
+        self.observation = found = Observation.of(law.structure)
+        self._system, self._observing, self._period = law.system, observing, period
+        self._force = ca.SX.sym("constraint_input", law.system.num_constraints)
+        pressed = [self._force[i] for i in found.frictions.values()]
+        self._is_lost = ca.vertcat(ca.SX(0, 1), *pressed) < observing.least_force
+        hold = ca.SX.sym("hold", 1)
+        holds = ca.fmax(hold != 0, ca.mmax(self._is_lost) if pressed else 0)
+        self.hold = TracedFunction(
+            "hold", {"constraint_input": self._force, "hold": hold}, {"hold": holds}
+        )
+
+    def _parameters(self, friction: ca.SX) -> ca.SX:
+        """The model's parameters with other coefficients of friction."""
+        found, system = ca.SX(self._system.parameter_symbol), self._system
+        for j, name in enumerate(self.observation.frictions):
+            found[system.parameter_slice(name)] = friction[j]
+        return found
+
+    def contact(self, state: ca.SX, parameters: ca.SX) -> Contact:
+        """What friction and constraints do at a state."""
+        observation, size = self.observation, len(self.observation.rows)
+        friction = observation.friction.function(self._faster(state), self._force, parameters)
+        directions = observation.directions.function(state, self._force, parameters)
+        metric, free, planes = directions[:3]
+        is_slow = friction[1] < _SHARP * self._observing.least_speed
+        sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
+        held = planes * ca.repmat(ca.vec(ca.repmat(sticks.T, size, 1)).T, size, 1)
+        slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
+        return Contact(friction[0], metric, free, held, slides, friction[-1] + directions[-1])
+
+    def change(self, contact: Contact, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
+        """How mu changes at a sample, at which friction takes its share of r."""
+        gain = -np.expm1(-self._observing.friction_rate * self._period)
+        found = mu + contact.slides * gain * shares(contact.friction, contact.metric, r)
+        found = ca.fmin(ca.fmax(found, 0.0), self._observing.largest_friction)
+        return ca.if_else(hold != 0, 0, found - mu)
+
+    def compensated(
+        self, law: TrackingLaw, delay: float, held: ca.SX, estimates: Estimates
+    ) -> TracedFunction:
+        """What the law compensates: disturbance, coefficients of friction and their derivatives.
+
+        Args:
+            law: The law.
+            delay: The mean time in s until its control acts.
+            held: The symbols of the memory.
+            estimates: What the memory has of the disturbance.
+
+        Returns:
+            (x, held, v, R, parameters) -> the port `exogenous` of its controller.
+        """
+        observation, mu = self.observation, estimates.friction
+        x, v = self._system.state, self._force
+        reference = ca.SX.sym("reference", law.layout.reference_size)
+        parameters, r, pivot = self._parameters(mu), estimates.disturbance, None
+        if mu.numel():
+            goal = x
+            if observation.wanted is not None:
+                wanted = observation.wanted.function(x, reference, delay, parameters)
+                goal, pivot = wanted[:2]
+            own, goes = (
+                observation.friction.function(each, v, parameters)[0]
+                for each in (x, self._faster(goal))
+            )
+            r = r + ca.mtimes(goes - own, mu)
+        size, rates = r.numel(), estimates.rates
+        rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
+        zeros = [ca.SX(0.0)] * (rates.numel() // size)
+        for j, name in enumerate(observation.frictions):
+            rows[name] = [[mu[j], *zeros]]
+        stacked, left = list[ca.SX](), iter(law.exogenous_degrees)
+        for p in self._system.exogenous.moving:
+            for row in rows[p.name]:
+                stacked += row[: 1 + next(left)]
+        return self._system.trace(
+            "exogenous signals of the observer",
+            {"exogenous": ca.vertcat(*stacked)},
+            {"held": held, "constraint_input": v, "reference": reference},
+            pivot,
+        )
+
+    def _faster(self, state: ca.SX) -> ca.SX:
+        """The state in a motion that is so fast that friction is full."""
+        found, rows = ca.SX(state), list(self.observation.rows)
+        found[rows] = _SHARP * found[rows]
+        return found

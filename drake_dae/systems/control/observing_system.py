@@ -1,0 +1,160 @@
+"""What observers of model errors share as Drake systems: ports, friction, and when integrals stop."""
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, positive
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.formulas import Formula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import PARAMETERS, Computation
+from drake_dae.systems.control.observed import Observed
+from drake_dae.systems.control.observer_rates import Observing
+
+
+@checked(ModelError)
+class ObservingSystem(ParameterizedSystem):
+    """A sampled observer of a law's disturbance and coefficients of friction.
+
+    Args:
+        law: The law.
+        observing: The rates, and the thresholds for friction.
+        sample_period: T in s.
+        control_lag: The fraction of T for which the plant uses the previous control, from 0 to 1.
+        control_delay: tau in s, the mean time from a sample until its control acts.
+
+    Attributes:
+        observing, sample_period: The arguments.
+        observation: The observed functions.
+        disturbance_signals, friction_signals: Names and units of the output ports.
+
+    Raises:
+        ModelError: A number is not valid.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        sample_period: float,
+        control_lag: float,
+        control_delay: float,
+    ) -> None:
+        system = law.system
+        signals = {
+            "state": system.state_signals,
+            "control": system.control_signals,
+            "constraint_input": system.constraint_input_signals,
+        }
+        super().__init__(system, system.parameter_values, signals, sees_steps=False)
+        self.observing, self.sample_period = observing, positive("sample_period", sample_period)
+        if not 0.0 <= control_lag <= 1.0:
+            raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
+        if not control_delay >= 0.0:
+            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
+
+    def _declare(self, law: TrackingLaw, found: Observed, state: str, start: FloatArray) -> None:
+        """Declares inputs and held values.
+
+        Args:
+            law: The law.
+            found: The functions.
+            state: The name of the port of the state.
+            start: What is held before the first sample, with zeros for friction at `_mu`.
+        """
+        system, self._observed = law.system, found
+        self.observation = observation = found.observation
+        names = list(observation.frictions)
+        self.disturbance_signals = tuple(
+            Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
+        )
+        self.friction_signals = tuple(Signal(name) for name in names)
+        sizes = {
+            state: system.num_states,
+            "control": system.num_controls,
+            "measured_force": system.num_constraints,
+            "hold": 1,
+            "reference": law.layout.reference_size,
+        }
+        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
+        for j, name in enumerate(names, self._mu.start):
+            start[j : j + 1] = system.parameter_values[system.parameter_slice(name)]
+        self._held = self.DeclareDiscreteState(start)
+        read = {self.input_port_ticket(self._ports[n].get_index()) for n in _READ_BY_HOLD}
+        self.DeclareVectorOutputPort("hold", 1, weakly(self._calc_hold), read)
+
+    @property
+    def _mu(self) -> slice:
+        """Where mu stands among the held values."""
+        raise NotImplementedError
+
+    @property
+    def further_signals(self) -> dict[str, Sequence[Signal]]:
+        """Name of an output port in a record -> names and units of its entries."""
+        known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
+        return {name: signals for name, signals in known.items() if signals}
+
+    def set_friction(self, context: Context, friction: ArrayLike) -> None:
+        """Sets the initial coefficients of friction, shape (c,), or a number for all.
+
+        Raises:
+            ModelError: The shape is wrong, or a value is negative or above the largest.
+        """
+        self.check_context(context)
+        given, most = numbers("friction", friction), self.observing.largest_friction
+        count = len(self.friction_signals)
+        if given.shape not in ((), (count,)) or not np.all((given >= 0) & (given <= most)):
+            raise ModelError(
+                f"friction must be from 0 to {most:g}, a number or shape ({count},), got "
+                f"{friction!r}"
+            )
+        values = context.get_discrete_state(self._held).CopyToVector()
+        values[self._mu] = given
+        context.SetDiscreteState(self._held, values)
+
+    def _given(self, context: Context, *names: str) -> list[FloatArray]:
+        return [self._ports[name].Eval(context) for name in names]
+
+    def _holds(self, context: Context) -> FloatArray:
+        """What the input port `hold` has; 0 without a wire."""
+        port = self._ports["hold"]
+        return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
+
+    def _reference(self, context: Context, state: FloatArray) -> FloatArray:
+        """What the input port `reference` has; without a wire the present rates."""
+        port = self._ports["reference"]
+        if port.HasValue(context):
+            return np.asarray(port.Eval(context))
+        return self._checked(self.observation.moving, context, state)[0].copy()
+
+    def _calc_hold(self, context: Context, output: BasicVector) -> None:
+        (force,) = self._given(context, "measured_force")
+        output.SetFromVector(self._observed.hold.evaluate(force, self._holds(context))[0])
+
+    def _formulas(self) -> dict[str, Formula]:
+        raise ModelError(
+            f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
+            "derivative by the time"
+        )
+
+    def _traced_hold(self) -> Computation:
+        return Computation.of(self._observed.hold, _READ_BY_HOLD, ("hold",))
+
+    def _unwired(self, state: str) -> dict[str, Computation]:
+        """What stands at inputs without a wire, by the name of the state among the sources."""
+        moving = Computation.of(self.observation.moving, (state, PARAMETERS), ("reference",))
+        none = ca.Function("none", [], [ca.SX.zeros(1)])
+        return {"hold": Computation(none, (), ("hold",)), "reference": moving}
+
+
+_READ_BY_HOLD = ("measured_force", "hold")
