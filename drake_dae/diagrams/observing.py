@@ -65,7 +65,7 @@ def add_observer(
     lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
     timing = period, lag, delay
     observer: Observer
-    if observing.estimates_state:
+    if observing.state_rate is not None:
         observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
         builder.Connect(state, observer.GetInputPort("measured_state"))
         state = observer.GetOutputPort("estimated_state")
@@ -93,8 +93,8 @@ def _estimator(
 ) -> StateEstimator:
     if encoders is None:
         raise WiringError(
-            "estimates_state is for encoders, whose noise it filters: give the loop encoders, or "
-            "leave it out"
+            "a state_rate is for encoders, whose noise the observer filters: give the loop encoders, "
+            "or leave it out"
         )
     if encoders.velocity_bandwidth is not None:
         raise WiringError(

@@ -13,18 +13,19 @@ from drake_dae.errors import ModelError
 class ChainFilter:
     """The stationary Kalman filter of (q, v, a) from samples of q, and of v if it is measured:
 
-        q' = v,    v' = known acceleration + a,    a' = white noise,
+        q' = v,    v' = known acceleration + a + white noise,    a' = white noise,
 
     where the known acceleration is that of the model. With samples T apart,
 
         prediction:   q = q + T v + T^2 / 2 a,   v = v + T (known acceleration + a),
         correction:   (q, v, a) = (q, v, a) + K (measured - predicted).
 
-    The noise of a' is W = T sigma^2 w^6 with the standard deviation sigma of a position. Without a
-    measured v the estimator's poles are then those of a Butterworth filter of third order with
-    the cutoff w, up to terms of the order of w T (B. D. O. Anderson, J. B. Moore, Optimal
-    Filtering, 1979, section 4.4, for the stationary filter). So w is the rate at which a model
-    error is followed: a constant one leaves no error, and a ramp a' the error a' / w^3 in q.
+    Two rates choose the noises: R = T sigma^2 is the intensity of the noise of positions with the
+    standard deviation sigma, R w^4 that of v', and R w^4 k_o^2 that of a'. If no velocity is
+    measured, the filter's poles solve s^6 + w^4 s^2 - w^4 k_o^2 = 0, up to terms of the order of
+    w T (H. Kwakernaak, R. Sivan, Linear Optimal Control Systems, 1972, theorem 4.14): for k_o << w
+    a pair at the distance w with the damping ratio 0.71, for the velocity, and one at -k_o, the
+    rate at which a model error a is followed.
 
     Attributes:
         gain: K, shape (3, 1), or (3, 2) with a measured v.
@@ -41,35 +42,33 @@ class ChainFilter:
     @classmethod
     def of(
         cls,
-        rate: float,
+        state_rate: float,
+        disturbance_rate: float,
         period: float,
         velocity_ratio: float | None = None,
-        acceleration_ratio: float = 0.0,
     ) -> "ChainFilter":
-        """The filter of a given rate.
+        """The filter of given rates.
 
         Args:
-            rate: w in 1/s.
+            state_rate: w in 1/s.
+            disturbance_rate: k_o in 1/s.
             period: T in s.
             velocity_ratio: The standard deviation of a measured velocity over sigma, in 1/s; None
                 if no velocity is measured.
-            acceleration_ratio: The standard deviation, from sample to sample, of white noise of
-                the known acceleration over sigma, in 1/s^2.
 
         Raises:
             ModelError: A number is not positive, or w T is above 1, where a sample is too long.
         """
-        positive("rate", rate), positive("period", period)
-        if rate * period > 1.0:
+        w, slow = positive("state_rate", state_rate), positive("disturbance_rate", disturbance_rate)
+        if w * positive("period", period) > 1.0:
             raise ModelError(
-                f"a rate of {rate:g} 1/s is too high for samples {period:g} s apart: at most "
+                f"a state_rate of {w:g} 1/s is too high for samples {period:g} s apart: at most "
                 f"{1.0 / period:g} 1/s"
             )
-        step = transition(period)
-        # Scaled by T: q, T v, T^2 a have about the size of sigma.
+        # Scaled: q, T v, T^2 a in units of sigma.
         size = period ** np.arange(3)
-        step = size[:, None] * step / size
-        noise = np.diag([0.0, (acceleration_ratio * period**2) ** 2, (rate * period) ** 6])
+        step = size[:, None] * transition(period) / size
+        noise = np.diag([0.0, (w * period) ** 4, (w * period) ** 4 * (slow * period) ** 2])
         shown = np.eye(3)[:1] if velocity_ratio is None else np.eye(3)[:2]
         error = np.eye(len(shown))
         if velocity_ratio is not None:
@@ -78,9 +77,8 @@ class ChainFilter:
         gain = np.linalg.solve(shown @ before @ shown.T + error, shown @ before).T
         after = before - gain @ shown @ before
         both = np.outer(1.0 / size, 1.0 / size)
-        return cls(
-            gain / size[:, None] * size[: len(shown)], after * both, before * both, period
-        )
+        units = size[: len(shown)] / size[:, None]
+        return cls(gain * units, after * both, before * both, period)
 
 
 def transition(period: float) -> FloatArray:

@@ -174,14 +174,14 @@ def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
     is_rigid = rows == tuple(range(count, 2 * count)) and system.num_states == 2 * count
     if not is_rigid or max(law.exogenous_degrees, default=0):
         raise ModelError(
-            f"{system.name}: estimates_state is for robots with rigid joints, whose states are "
+            f"{system.name}: a state_rate is for robots with rigid joints, whose states are "
             "positions and velocities; behind springs, motors or valves measure the velocities, "
             "or let the encoders form differences by a velocity_bandwidth"
         )
     slope = system.f[:count] - system.state[count:]
     if not ca.simplify(slope).is_zero():
         raise ModelError(
-            f"{system.name}: estimates_state needs q' = v, and this robot has a body with "
+            f"{system.name}: a state_rate needs q' = v, and this robot has a body with "
             "q' = N(q) v; measure its velocities"
         )
 
@@ -192,7 +192,7 @@ def state_filters(
     """The filters of positions along the free and along the constrained directions.
 
     Args:
-        observing: The rates.
+        observing: The rates, with a state_rate.
         period: T in s.
         position: The standard deviations of measured positions, shape (k,).
         velocity: Those of measured velocities, 0 where none is measured, shape (k,).
@@ -203,8 +203,9 @@ def state_filters(
     ratios = [
         v / q if v > 0.0 and q > 0.0 else None for q, v in zip(position, velocity, strict=True)
     ]
-    rates = observing.rate, observing.force_rate or observing.rate
+    rates, fast = (observing.rate, observing.force_rate or observing.rate), observing.state_rate
+    assert fast is not None
     free, constrained = (
-        [ChainFilter.of(rate, period, ratio) for ratio in ratios] for rate in rates
+        [ChainFilter.of(fast, rate, period, ratio) for ratio in ratios] for rate in rates
     )
     return free, constrained

@@ -16,8 +16,8 @@ class Observing:
         rate: k_o in 1/s, the rate of disturbances along the free directions.
         force_rate: k_n in 1/s, the rate of disturbances along the constrained directions, which
             change only constraint forces; None for k_o.
-        estimates_state: Whether the state is estimated as well, from measured positions, by a
-            `StateEstimator`: k_o and k_n are then the cutoffs of its filters.
+        state_rate: w in 1/s, the rate at which a `StateEstimator` corrects the state by measured
+            positions; None for the state as it is measured.
         friction_rate: k_f in 1/s, the rate at which coefficients of friction are identified.
         largest_friction: The upper bound of coefficients of friction.
         least_speed: The speed in m/s below which a contact may stick, so that its friction is not
@@ -35,10 +35,11 @@ class Observing:
     least_speed: float = 0.005
     least_force: float = 1.0
     force_rate: float | None = None
-    estimates_state: bool = False
+    state_rate: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("rate", "friction_rate", "largest_friction", "least_speed", "least_force"):
             positive(name, getattr(self, name))
-        if self.force_rate is not None:
-            positive("force_rate", self.force_rate)
+        for name in ("force_rate", "state_rate"):
+            if getattr(self, name) is not None:
+                positive(name, getattr(self, name))
