@@ -32,7 +32,14 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+DEAR = ("tiago",)
+"""A minute and more."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=[pytest.mark.thorough] * (one in DEAR)) for one in ROBOTS],
+)
 def test_a_robot_runs_as_predicted_on_a_surface_that_new_finds(name, tmp_path):
     file = tmp_path / "task.yaml"
     assert main(["new", str(FOLDER / ROBOTS[name]), "--out", str(file)]) == 0

@@ -408,7 +408,13 @@ def test_a_task_on_a_continuous_contact_is_sampled():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["wall_point_contact", "wall_flexible_contact"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "wall_point_contact",
+        pytest.param("wall_flexible_contact", marks=pytest.mark.thorough),
+    ],
+)
 def test_a_run_of_a_shipped_scenario_is_that_of_drakes_plant(name):
     """What Drake's solver leaves, 1e-6 of each step's change, stays so small in a closed loop.
 
