@@ -1,0 +1,288 @@
+"""Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import check_whole_number, positive
+from drake_dae.dae.beyond.contact_gains import ContactGains
+from drake_dae.dae.beyond.one_direction import Direction, Noise, Rates, SampledLoop, sampled_loop
+from drake_dae.dae.tracking.constraint_damping import best_damping
+from drake_dae.errors import GainError, ModelError
+
+MASSES = (0.5, 1.0, 2.0)
+"""What a force does, over what the law believes: the loop is stable for these in free directions."""
+
+CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
+STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
+"""The same along a contact, each with stiffnesses relative to the given one."""
+
+DECAY = 0.05
+"""With half of the stiffness and more, all of these loops settle at least at this share of w."""
+
+MODEL_ERROR, EVERY = 1.0, 2.0
+"""An unknown force of 1 N appears or turns every 2 s."""
+
+RAMP = 10.0
+"""The reference of a force changes by 10 N/s."""
+
+_PHASE = 0.15
+"""As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
+it with an estimator, where a force along the contact that is taken for friction couples it to the
+free directions: at the full phase 1 kg that the law does not know made them swing."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class SensedContact:
+    """A robot in contact, its sampling and its sensors, as far as the choice of gains needs them.
+
+    Attributes:
+        period: T in s.
+        delay: The delay of the control in samples.
+        stiffness: k of the contact in N/m.
+        mobility: J M^-1 J^T of the contact in 1/kg, the largest on the way.
+        free_mobility: The same for the points that follow a path, in 1/kg.
+        lever, contact_lever: The distance that such a point, and the contact, move per radian of
+            noise of all joints: the length of a row of J, in m/rad.
+        inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
+        noise: The noise of a joint's angle and velocity, in rad and rad/s, and of the force in N;
+            and whether velocities are differences.
+        estimates: Whether a `StateEstimator` has the state.
+
+    Raises:
+        ModelError: A number is not positive, or a noise is negative.
+    """
+
+    period: float
+    delay: int
+    stiffness: float
+    mobility: float
+    free_mobility: float
+    lever: float
+    contact_lever: float
+    inertia: float
+    noise: Noise
+    estimates: bool
+
+    def __post_init__(self) -> None:
+        names = ("period", "stiffness", "mobility", "free_mobility", "lever", "contact_lever")
+        for name in (*names, "inertia"):
+            positive(name, getattr(self, name))
+        check_whole_number("delay", self.delay, 0)
+        for name, value in vars(self.noise).items():
+            if not value >= 0.0:
+                raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
+
+    def free(self, mass_error: float = 1.0) -> Direction:
+        """A free direction."""
+        return Direction(self.period, self.delay, mass_error=mass_error)
+
+    def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
+        """The direction of the contact, with a share of its stiffness."""
+        stiffness = share * self.stiffness
+        return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
+
+    def seen(self, lever: float) -> Noise:
+        """The noise of a distance that angles move."""
+        noise = self.noise
+        position, velocity = lever * noise.position, lever * noise.velocity
+        return replace(noise, position=position, velocity=velocity)
+
+    @property
+    def quiet(self) -> Noise:
+        """No noise, with the lag of differences."""
+        return Noise(velocity_bandwidth=self.noise.velocity_bandwidth)
+
+
+@dataclass(frozen=True)
+class AdvisedGains:
+    """Gains, and what they are predicted to come to.
+
+    Attributes:
+        gains: The gains.
+        state_rate: w of the estimator in 1/s; None without one.
+        position_error: The rms error of a point in m: by noise, and by an unknown force of
+            `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
+        force_error: The same of the contact force in N, also by a reference that changes by `RAMP`.
+        noise_error, noise_force: The parts by noise alone.
+        roughness: The rms change of the controls from sample to sample, over all joints, in N m.
+    """
+
+    gains: ContactGains
+    state_rate: float | None
+    position_error: float
+    force_error: float
+    noise_error: float
+    noise_force: float
+    roughness: float
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What gains come to in one direction: of the rate, error, by noise, and roughness in N m."""
+
+    rate: float
+    error: float
+    by_noise: float
+    roughness: float
+
+
+@checked(ModelError)
+def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
+    """The gains with the least predicted errors, of those that are smooth and stable enough.
+
+    The gains are those of `contact_gains`, as functions of its rate w, for which free directions
+    and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
+    For each of them the loop of one direction is a linear system with samples, delay, law,
+    observer and contact; its errors and its roughness follow from Lyapunov's equation, its
+    stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
+    is least among those gains that
+
+    - change the controls by at most `roughness` from sample to sample, in rms,
+    - are stable, and settle at least at the rate `DECAY` w, if a force does 1/2 to 2 times what the
+      law believes in free directions, and 2/3 to 3/2 times along a contact whose stiffness is up to
+      2 times the given one,
+    - lose at most 0.15 rad of phase to samples and delay, with an estimator half of it.
+
+    Args:
+        situation: The contact and its sensors.
+        roughness: The largest rms change of the controls from sample to sample, in N m.
+
+    Raises:
+        GainError: No gains do so; the message names the noise that prevents it, or the contact.
+        ModelError: The roughness is not positive.
+    """
+    positive("roughness", roughness)
+    phase = _PHASE / 2.0 if situation.estimates else _PHASE
+    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
+    rates = np.geomspace(highest, highest / 32.0, 16).tolist()
+    found = [
+        (free, contact, fast)
+        for fast in _state_rates(situation, highest)
+        for free, contact in _best(situation, rates, fast, roughness)
+    ]
+    if not found:
+        raise GainError(_reason(situation, rates, roughness, highest))
+    free, contact, fast = min(found, key=lambda parts: parts[0].error * parts[1].error)
+    rates_of = _contact_rates(situation, contact.rate, fast)
+    w = free.rate
+    return AdvisedGains(
+        ContactGains(
+            1.5 * w, rates_of.force_gain, rates_of.gains[2], 2.0 * w, contact.rate, w / 2.0
+        ),
+        fast,
+        free.error,
+        contact.error,
+        free.by_noise,
+        contact.by_noise,
+        float(np.hypot(free.roughness, contact.roughness)),
+    )
+
+
+def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | None]:
+    if not situation.estimates:
+        yield None
+        return
+    for share in (4.0, 6.0, 9.0, 13.0, 20.0):
+        if share * highest * situation.period <= 0.5:
+            yield share * highest
+
+
+def _best(
+    situation: SensedContact, rates: Iterable[float], fast: float | None, roughness: float
+) -> Iterator[tuple[_Part, _Part]]:
+    """The best rates of free directions and of contacts, if there are any; half and half."""
+    parts = []
+    for kind in (_free, _contact):
+        tried = [part for w in rates if (part := kind(situation, w, fast)) is not None]
+        smooth = [part for part in tried if part.roughness <= roughness / 2.0**0.5]
+        if not smooth:
+            return
+        parts.append(min(smooth, key=lambda part: part.error))
+    yield parts[0], parts[1]
+
+
+def _free_rates(w: float, fast: float | None) -> Rates:
+    p = 1.5 * w
+    return Rates((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+
+
+def _contact_rates(situation: SensedContact, w: float, fast: float | None) -> Rates:
+    best = best_damping(
+        situation.stiffness, situation.mobility, situation.period, situation.delay
+    )
+    damping = min(2.3 * w, best)
+    return Rates((0.0, 0.0, damping), 0.4 * (damping or w / 2.0), w, fast)
+
+
+def _free(situation: SensedContact, w: float, fast: float | None) -> _Part | None:
+    rates = _free_rates(w, fast)
+    loops = (sampled_loop(situation.free(mass), rates, situation.quiet) for mass in MASSES)
+    if any(loop.radius > 1.0 - DECAY * w * loop.period for loop in loops):
+        return None
+    loop = sampled_loop(situation.free(), rates, situation.seen(situation.lever))
+    error, _ = loop.deviations()
+    _, jump = sampled_loop(situation.free(), rates, situation.seen(1.0)).deviations()
+    step = MODEL_ERROR * situation.free_mobility * _rms(situation, loop)
+    return _Part(w, float(np.hypot(error, step)), error, situation.inertia * jump)
+
+
+def _contact(situation: SensedContact, w: float, fast: float | None) -> _Part | None:
+    rates = _contact_rates(situation, w, fast)
+    for mass, share in product(CONTACT_MASSES, STIFFNESSES):
+        loop = sampled_loop(situation.contact(mass, share), rates, situation.quiet)
+        least = DECAY * w * loop.period if share >= 0.5 else 0.0
+        if not loop.radius < 1.0 - least:
+            return None
+    loop = sampled_loop(situation.contact(), rates, situation.seen(situation.contact_lever))
+    error, jump = loop.deviations()
+    step = MODEL_ERROR * situation.mobility * _rms(situation, loop)
+    ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
+    whole = float(np.linalg.norm([error, step, ramp]))
+    return _Part(w, whole, error, situation.contact_lever * jump / situation.mobility)
+
+
+def _rms(situation: SensedContact, loop: SampledLoop) -> float:
+    """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
+    return loop.after_step() * float(np.sqrt(situation.period / EVERY))
+
+
+def _reason(
+    situation: SensedContact, rates: Iterable[float], roughness: float, highest: float
+) -> str:
+    """Why no gains are found."""
+    fast = next(iter(_state_rates(situation, highest)))
+    for kind, where in ((_free, "in free directions"), (_contact, "along the contact")):
+        tried = [part for w in rates if (part := kind(situation, w, fast)) is not None]
+        if not tried:
+            return (
+                f"no gains are stable {where} with a margin, for a contact of "
+                f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
+                f"{situation.delay} samples of delay: sample more often, or make it softer"
+            )
+        least = min(part.roughness for part in tried)
+        if least > roughness / 2.0**0.5:
+            blamed = _blamed(situation)
+            return (
+                f"the noise of the {blamed} alone changes the controls by {least:.3g} N m from "
+                f"sample to sample {where}, and {roughness / 2.0**0.5:.3g} N m are allowed: allow "
+                "more roughness, or use a better sensor"
+            )
+    return "no gains are stable and smooth enough together: allow more roughness"
+
+
+def _blamed(situation: SensedContact) -> str:
+    """The noise without which the roughness is least."""
+
+    def without(name: str) -> float:
+        quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
+        found = sampled_loop(
+            quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.seen(1.0)
+        )
+        return found.deviations()[1]
+
+    return min(("position", "velocity"), key=without)

@@ -1,0 +1,240 @@
+"""The sampled loop of a law in one direction, as a linear system driven by noise."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The standard deviations of measurements in one direction, from sample to sample.
+
+    Attributes:
+        position: In m, or rad.
+        velocity: In m/s, or rad/s; 0 if it is exact, not measured, or a difference.
+        force: In N, or N m.
+        velocity_bandwidth: That of filtered differences of the positions, in rad/s, which are then
+            the velocities; 0 for measured velocities. See `Encoders`.
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    force: float = 0.0
+    velocity_bandwidth: float = 0.0
+
+
+@dataclass(frozen=True)
+class Direction:
+    """What moves in a direction, and how it is sampled.
+
+    Attributes:
+        period: T in s.
+        delay: The number of samples until the control acts.
+        mobility: A in 1/kg, by which the law knows what a force does.
+        stiffness: k of a contact in N/m; 0 for a free direction.
+        mass_error: What a force does, over what the law believes; 1 if the model is right.
+    """
+
+    period: float
+    delay: int
+    mobility: float = 1.0
+    stiffness: float = 0.0
+    mass_error: float = 1.0
+
+
+@dataclass(frozen=True)
+class Rates:
+    """The gains of a law and its observer in a direction, in 1/s.
+
+    Attributes:
+        gains: Of the integral of the error, of the error, and of its derivative, in 1/s^3, 1/s^2
+            and 1/s; along a contact the damping c alone is used, as the last.
+        force_gain: K_i of the integral of a contact's force.
+        observer_rate: k_o, or k_n along a contact.
+        state_rate: w of a `StateEstimator`; None with a measured velocity.
+    """
+
+    gains: tuple[float, float, float]
+    force_gain: float
+    observer_rate: float
+    state_rate: float | None = None
+
+
+@dataclass(frozen=True)
+class SampledLoop:
+    """x = A x + B n of the next sample, for noise n of deviation 1; rows C x + D n are looked at.
+
+    Attributes:
+        step, noise: A and B.
+        shown: The rows of the error (of a contact: of its force, in N) and of the acceleration that
+            the law asks for, over (x, n).
+        push: What a disturbing acceleration of 1 does to x during a sample.
+        period: T in s.
+    """
+
+    step: FloatArray
+    noise: FloatArray
+    shown: FloatArray
+    push: FloatArray
+    period: float
+
+    @property
+    def radius(self) -> float:
+        """The spectral radius; the loop is stable below 1."""
+        return float(np.abs(np.linalg.eigvals(self.step)).max())
+
+    def deviations(self) -> tuple[float, float]:
+        """The standard deviations of the error, and of the acceleration from sample to sample."""
+        size = len(self.step)
+        spread = solve_discrete_lyapunov(
+            self.step, self.noise @ self.noise.T, method="bilinear"
+        )
+        error, asked = self.shown
+        c, d = error[:size], error[size:]
+        first = float(c @ spread @ c + d @ d)
+        # The difference of two samples: C x+ + D n+ - (C x + D n), with x+ = A x + B n.
+        c, d = asked[:size], asked[size:]
+        change, along = c @ self.step - c, c @ self.noise - d
+        second = float(change @ spread @ change + along @ along + d @ d)
+        return max(first, 0.0) ** 0.5, max(second, 0.0) ** 0.5
+
+    def after_step(self) -> float:
+        """sqrt(sum of squares) of the error after a disturbing acceleration rises from 0 to 1."""
+        size = len(self.step)
+        rest = np.linalg.solve(np.eye(size) - self.step, self.push)
+        spread = solve_discrete_lyapunov(
+            self.step.T, np.outer(*[self.shown[0, :size]] * 2), method="bilinear"
+        )
+        return float(max(rest @ spread @ rest, 0.0)) ** 0.5
+
+
+def sampled_loop(direction: Direction, rates: Rates, noise: Noise) -> SampledLoop:
+    """The loop of a law whose model is right but for what `direction` says.
+
+    In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
+    asks for, held for a sample after its delay, and m the mass_error. In a contact the depth moves
+    as phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates
+    e, e' and d of observer or estimator the law asks for
+
+        a = -K_1 sigma - K_2 e - K_3 e' - d            free,
+        a = -c phi' - A K_i sigma_F - d                in a contact,
+
+    with the sums sigma of the error and sigma_F of the force's error.
+
+    Args:
+        direction: What moves.
+        rates: The gains.
+        noise: The noise of what is measured.
+    """
+    parts = ["e", "v", "sum", *(f"held{i}" for i in range(direction.delay))]
+    parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]
+    parts += ["difference", "measured"] if noise.velocity_bandwidth else []
+    kinds = ["position", "velocity", "force", "held"]
+    size, count = len(parts), len(parts) + 3
+    # Each quantity is a row of its dependence on the state, the three noises and the disturbance.
+    rows = dict(zip([*parts, *kinds], np.eye(count + 1), strict=True))
+    after, shown = _step(direction, rates, noise, rows)
+    # In units of e, e / T and e / T^2, so that all parts are of one size.
+    orders = {**_ORDERS, "sum": 1 if direction.stiffness else -1}
+    units = direction.period ** np.array([orders.get(name, 2) for name in parts])
+    both = np.array([after[name] for name in parts]) * units[:, None]
+    both[:, :size] /= units
+    looked = np.array([row[:count] for row in shown])
+    looked[:, :size] /= units
+    return SampledLoop(both[:, :size], both[:, size:count], looked, both[:, count], direction.period)
+
+
+_ORDERS = {"e": 0, "q": 0, "measured": 0, "v": 1, "w": 1, "before": 1, "difference": 1}
+"""How often the parts are differentiated; others are accelerations."""
+
+
+Rows = dict[str, FloatArray]
+
+
+def _step(
+    direction: Direction, rates: Rates, noise: Noise, now: Rows
+) -> tuple[Rows, tuple[FloatArray, FloatArray]]:
+    """What a sample makes of the quantities; and the error, and the acceleration asked for."""
+    period, mass = direction.period, direction.mass_error
+    stiff = direction.mobility * direction.stiffness
+    after = dict(now)
+    position = now["e"] + noise.position * now["position"]
+    velocity = now["v"] + noise.velocity * now["velocity"]
+    if noise.velocity_bandwidth:
+        a = np.exp(-noise.velocity_bandwidth * period)
+        rise = (position - now["measured"]) / period
+        velocity = a * now["difference"] + (1.0 - a) * rise
+        after |= {"difference": velocity, "measured": position}
+    pressed = -stiff * now["e"] + direction.mobility * noise.force * now["force"]
+
+    known, update = (_estimated if rates.state_rate else _observed)(rates, period, noise, now)
+    error, rate, disturbance = known(position, velocity)
+    if stiff:
+        asked = -rates.gains[2] * rate - rates.force_gain * now["sum"] - disturbance
+        after["sum"] = now["sum"] - period * pressed
+    else:
+        gains = rates.gains
+        asked = -gains[0] * now["sum"] - gains[1] * error - gains[2] * rate - disturbance
+        after["sum"] = now["sum"] + period * error
+    held = [now[f"held{i}"] for i in range(direction.delay)] + [asked]
+    acts = held[0]
+    for i in range(direction.delay):
+        after[f"held{i}"] = held[i + 1]
+
+    # The motion over the sample, exact for what is held.
+    push = mass * acts + now["held"]
+    w = (mass * stiff) ** 0.5
+    c, s = np.cos(w * period), np.sinc(w * period / np.pi) * period
+    half = (1.0 - c) / w**2 if w else period**2 / 2.0
+    after["e"] = c * now["e"] + s * now["v"] + half * push
+    after["v"] = -(w**2) * s * now["e"] + c * now["v"] + s * push
+    mean = -stiff * (now["e"] + after["e"]) / 2.0 if stiff else 0.0 * push
+    mean = mean + direction.mobility * noise.force * now["force"] * bool(stiff)
+    after |= update(position, velocity, acts + mean)
+    force = -direction.stiffness * now["e"] if stiff else now["e"]
+    return after, (force, asked)
+
+
+Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
+
+
+def _observed(rates: Rates, period: float, noise: Noise, now: Rows) -> tuple[Known, Update]:
+    """A `DisturbanceObserver`: what the law reads, and what is held after the sample."""
+    gain = -np.expm1(-rates.observer_rate * period)
+
+    def known(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
+        return position, velocity, now["r"]
+
+    def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
+        d = (velocity - now["before"]) / period - now["acted"]
+        return {"r": now["r"] + gain * (d - now["r"]), "before": velocity, "acted": acted}
+
+    return known, update  # type: ignore[return-value]
+
+
+def _estimated(rates: Rates, period: float, noise: Noise, now: Rows) -> tuple[Known, Update]:
+    """A `StateEstimator`, likewise; q, w and a are its prediction."""
+    ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
+    assert rates.state_rate is not None
+    found = ChainFilter.of(rates.state_rate, rates.observer_rate, period, ratio)
+    ahead = np.array([now["q"], now["w"], now["a"]])
+
+    def corrected(position: FloatArray, velocity: FloatArray) -> FloatArray:
+        measured = np.array([position, velocity][: found.gain.shape[1]])
+        result: FloatArray = ahead + found.gain @ (measured - ahead[: len(measured)])
+        return result
+
+    def known(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
+        return tuple(corrected(position, velocity))
+
+    def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
+        q, w, a = transition(period) @ corrected(position, velocity)
+        return {"q": q + period**2 / 2.0 * acted, "w": w + period * acted, "a": a}
+
+    return known, update  # type: ignore[return-value]
