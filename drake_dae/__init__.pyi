@@ -4,9 +4,13 @@ from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
 from .compiler.compile import compile_diagram as compile_diagram
+from .dae.beyond.contact_advice import AdvisedGains as AdvisedGains
+from .dae.beyond.contact_advice import SensedContact as SensedContact
+from .dae.beyond.contact_advice import advised_gains as advised_gains
 from .dae.beyond.contact_gains import ContactGains as ContactGains
 from .dae.beyond.contact_gains import contact_gains as contact_gains
 from .dae.beyond.disturbance import with_disturbance as with_disturbance
+from .dae.beyond.one_direction import SensorNoise as SensorNoise
 from .dae.beyond.sampled import sampled_poles as sampled_poles
 from .dae.beyond.sampled import sampling_error as sampling_error
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
@@ -117,6 +121,7 @@ from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
+from .systems.control.estimator import StateEstimator as StateEstimator
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.observer import DisturbanceObserver as DisturbanceObserver
 from .systems.control.observer_rates import Observing as Observing

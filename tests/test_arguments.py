@@ -89,6 +89,11 @@ def observed_law() -> dd.TrackingLaw:
     return dd.TrackingLaw(dae, dd.poles(-4.0))
 
 
+def sensed() -> dd.SensedContact:
+    noise = dd.SensorNoise(1e-5, force=0.1)
+    return dd.SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
+
+
 @cache
 def record() -> dd.Record:
     context = loop().diagram.CreateDefaultContext()
@@ -181,6 +186,12 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.DisturbanceObserver: lambda: dd.DisturbanceObserver(
         observed_law(), dd.Observing(10.0), 0.01
     ),
+    dd.StateEstimator: lambda: dd.StateEstimator(
+        observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01
+    ),
+    dd.SensedContact: sensed,
+    dd.SensorNoise: lambda: dd.SensorNoise(),
+    dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),
     dd.LinkExpressions: textbook,
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
@@ -261,6 +272,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "duration": lambda: 0.01,
     "max_integrators": lambda: 2,
     "law of DisturbanceObserver": observed_law,
+    "law of StateEstimator": observed_law,
+    "observing of StateEstimator": lambda: dd.Observing(10.0, state_rate=40.0),
     "states of with_disturbance": lambda: ["joint1_w", "joint2_w"],
     "region": lambda: None,
     "measured_force": lambda: None,

@@ -5,8 +5,8 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.estimator import StateEstimator
+from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.systems.control.sampling import Sampling
@@ -93,8 +93,8 @@ def _estimator(
 ) -> StateEstimator:
     if encoders is None:
         raise WiringError(
-            "a state_rate is for encoders, whose noise the observer filters: give the loop encoders, "
-            "or leave it out"
+            "a state_rate is for encoders, whose noise the observer filters: give the loop "
+            "encoders, or leave it out"
         )
     if encoders.velocity_bandwidth is not None:
         raise WiringError(

@@ -166,8 +166,8 @@ def wire_loop(
     moving = add_exogenous(builder, plant, plant.dae, own)
     known = add_exogenous(builder, controller, law.system, parts.exogenous)
 
-    # An observer estimates model errors for the law, and perhaps its state. Integrals are not updated while a contact is
-    # open or lost, or a drive is at its limit.
+    # An observer estimates model errors for the law, and perhaps its state. Integrals are not
+    # updated while a contact is open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if observing is not None and goal is not None:
         wires = state, held, control, goal, limits

@@ -13,7 +13,7 @@ from drake_dae.dae.beyond.contact_advice import (
     advised_gains,
 )
 from drake_dae.dae.beyond.contact_gains import contact_gains
-from drake_dae.dae.beyond.one_direction import Noise
+from drake_dae.dae.beyond.one_direction import SensorNoise
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -28,7 +28,7 @@ _FORCE = 10.0
 _NOISE = 1e-3
 """The default standard deviation of velocity noise in rad/s, without encoders."""
 
-_SHARE = 0.005
+_SHARE = 0.003
 """The default of the largest roughness, as a share of the largest effort limit."""
 
 _DIGITS = 3
@@ -171,7 +171,8 @@ def sensed_contact(
     free, contact = slice(len(points)), slice(len(points), None)
     forces = scenario.force_feedback
     deviation = float(np.max(getattr(forces, "noise_deviation", 0.0)))
-    estimates = encoders.velocity_bandwidth is None and scenario.actuation == []
+    given = scenario.observer is None or scenario.observer.state_rate is not None
+    estimates = given and encoders.velocity_bandwidth is None
     position, velocity = np.max(encoders.position_deviation), np.max(encoders.velocity_noise)
     return SensedContact(
         *timing,
@@ -181,20 +182,26 @@ def sensed_contact(
         float(np.max(levers[free], initial=np.max(levers[contact]))),
         float(np.max(levers[contact])),
         float(np.linalg.norm(inertia)),
-        Noise(float(position), float(velocity), deviation, encoders.velocity_bandwidth or 0.0),
+        SensorNoise(
+            float(position), float(velocity), deviation, encoders.velocity_bandwidth or 0.0
+        ),
         estimates,
     )
 
 
 def predicted(best: AdvisedGains) -> str:
     """What gains are predicted to come to, in words."""
-    fast = "" if best.state_rate is None else f" of an estimate of the state at {best.state_rate:.3g} 1/s"
+    fast = (
+        ""
+        if best.state_rate is None
+        else f" of an estimate of the state at {best.state_rate:.3g} 1/s"
+    )
+    by_noise = f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N"
     return (
-        f"these sensors, for which the law{fast} is predicted to be {1e3 * best.position_error:.2g} "
-        f"mm and {best.force_error:.2g} N off in rms, {1e3 * best.noise_error:.2g} mm and "
-        f"{best.noise_force:.2g} N by noise alone and the rest by an unknown force of "
-        f"{MODEL_ERROR:g} N that appears every {EVERY:g} s, with controls that change by "
-        f"{best.roughness:.2g} N m from sample to sample"
+        f"these sensors, for which the law{fast} is predicted to be "
+        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N off in rms, {by_noise} "
+        f"by noise alone and the rest by an unknown force of {MODEL_ERROR:g} N that appears every "
+        f"{EVERY:g} s, with controls that change by {best.roughness:.2g} N m from sample to sample"
     )
 
 

@@ -118,8 +118,8 @@ class Scenario:
         observer: The observer of a disturbance and of coefficients of friction, for a sampled law
             with measured `force_feedback`; none if left out while `gains` are given.
         largest_roughness: The largest rms change of the controls from sample to sample that
-            computed gains may make of the sensors' noise, over all joints, in N m; 0.5 % of the
-            largest effort limit if left out, or 1 N m without limits.
+            computed gains may make of the noise of `encoders`, over all joints, in N m; 0.3 % of
+            the largest effort limit if left out, or 1 N m without limits.
         plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
             MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.

@@ -1,7 +1,8 @@
 """Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -9,12 +10,18 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number, positive
 from drake_dae.dae.beyond.contact_gains import ContactGains
-from drake_dae.dae.beyond.one_direction import Direction, Noise, Rates, SampledLoop, sampled_loop
+from drake_dae.dae.beyond.one_direction import (
+    Direction,
+    Rates,
+    SampledLoop,
+    SensorNoise,
+    sampled_loop,
+)
 from drake_dae.dae.tracking.constraint_damping import best_damping
 from drake_dae.errors import GainError, ModelError
 
 MASSES = (0.5, 1.0, 2.0)
-"""What a force does, over what the law believes: the loop is stable for these in free directions."""
+"""What a force does, over what the law believes: free directions are stable for these."""
 
 CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
 STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
@@ -65,7 +72,7 @@ class SensedContact:
     lever: float
     contact_lever: float
     inertia: float
-    noise: Noise
+    noise: SensorNoise
     estimates: bool
 
     def __post_init__(self) -> None:
@@ -86,16 +93,21 @@ class SensedContact:
         stiffness = share * self.stiffness
         return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
 
-    def seen(self, lever: float) -> Noise:
+    def seen(self, lever: float) -> SensorNoise:
         """The noise of a distance that angles move."""
         noise = self.noise
         position, velocity = lever * noise.position, lever * noise.velocity
         return replace(noise, position=position, velocity=velocity)
 
+    @cached_property
+    def best_damping(self) -> float:
+        """`contact_damping` of the contact, in 1/s."""
+        return best_damping(self.stiffness, self.mobility, self.period, self.delay)
+
     @property
-    def quiet(self) -> Noise:
+    def quiet(self) -> SensorNoise:
         """No noise, with the lag of differences."""
-        return Noise(velocity_bandwidth=self.noise.velocity_bandwidth)
+        return SensorNoise(velocity_bandwidth=self.noise.velocity_bandwidth)
 
 
 @dataclass(frozen=True)
@@ -123,9 +135,11 @@ class AdvisedGains:
 
 @dataclass(frozen=True)
 class _Part:
-    """What gains come to in one direction: of the rate, error, by noise, and roughness in N m."""
+    """What gains come to in one direction: the rate w, error, by noise, and roughness in N m."""
 
     rate: float
+    rates: Rates
+    is_contact: bool
     error: float
     by_noise: float
     roughness: float
@@ -159,20 +173,27 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     positive("roughness", roughness)
     phase = _PHASE / 2.0 if situation.estimates else _PHASE
     highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
-    rates = np.geomspace(highest, highest / 32.0, 16).tolist()
-    found = [
-        (free, contact, fast)
-        for fast in _state_rates(situation, highest)
-        for free, contact in _best(situation, rates, fast, roughness)
-    ]
+    rates = np.geomspace(highest, highest / 30.0, 14).tolist()
+    found = []
+    for fast in _state_rates(situation, highest):
+        contacts = [_contact(situation, w, fast) for w in rates]
+        if (contact := _best(situation, contacts, roughness / 2.0**0.5)) is None:
+            continue
+        left = (roughness**2 - contact.roughness**2) ** 0.5
+        if (free := _best(situation, [_free(situation, w, fast) for w in rates], left)) is not None:
+            found.append((free, contact, fast))
     if not found:
-        raise GainError(_reason(situation, rates, roughness, highest))
-    free, contact, fast = min(found, key=lambda parts: parts[0].error * parts[1].error)
-    rates_of = _contact_rates(situation, contact.rate, fast)
-    w = free.rate
+        raise GainError(_reason(situation, rates, roughness / 2.0**0.5, highest))
+    free, contact, fast = min(found, key=lambda each: each[0].error * each[1].error)
+    w, of_contact = free.rate, contact.rates
     return AdvisedGains(
         ContactGains(
-            1.5 * w, rates_of.force_gain, rates_of.gains[2], 2.0 * w, contact.rate, w / 2.0
+            1.5 * w,
+            of_contact.force_gain,
+            of_contact.gains[2],
+            2.0 * w,
+            of_contact.observer_rate,
+            w / 2.0,
         ),
         fast,
         free.error,
@@ -187,23 +208,33 @@ def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | N
     if not situation.estimates:
         yield None
         return
-    for share in (4.0, 6.0, 9.0, 13.0, 20.0):
+    for share in (4.0, 7.0, 12.0, 20.0):
         if share * highest * situation.period <= 0.5:
             yield share * highest
 
 
-def _best(
-    situation: SensedContact, rates: Iterable[float], fast: float | None, roughness: float
-) -> Iterator[tuple[_Part, _Part]]:
-    """The best rates of free directions and of contacts, if there are any; half and half."""
-    parts = []
-    for kind in (_free, _contact):
-        tried = [part for w in rates if (part := kind(situation, w, fast)) is not None]
-        smooth = [part for part in tried if part.roughness <= roughness / 2.0**0.5]
-        if not smooth:
-            return
-        parts.append(min(smooth, key=lambda part: part.error))
-    yield parts[0], parts[1]
+def _best(situation: SensedContact, parts: list[_Part], allowed: float) -> _Part | None:
+    """The part with the least error that is smooth and stable enough, if there is one."""
+    smooth = [part for part in parts if part.roughness <= allowed]
+    for part in sorted(smooth, key=lambda part: part.error):
+        if _is_stable(situation, part):
+            return part
+    return None
+
+
+def _is_stable(situation: SensedContact, part: _Part) -> bool:
+    """Whether a loop settles for all masses and stiffnesses that it has to bear."""
+    cases = [(situation.free(mass), DECAY) for mass in MASSES]
+    if part.is_contact:
+        cases = [
+            (situation.contact(mass, share), DECAY if share >= 0.5 else 0.0)
+            for mass, share in product(CONTACT_MASSES, STIFFNESSES)
+        ]
+    for direction, decay in cases:
+        loop = sampled_loop(direction, part.rates, situation.quiet)
+        if not loop.radius < 1.0 - decay * part.rate * loop.period:
+            return False
+    return True
 
 
 def _free_rates(w: float, fast: float | None) -> Rates:
@@ -212,67 +243,51 @@ def _free_rates(w: float, fast: float | None) -> Rates:
 
 
 def _contact_rates(situation: SensedContact, w: float, fast: float | None) -> Rates:
-    best = best_damping(
-        situation.stiffness, situation.mobility, situation.period, situation.delay
-    )
-    damping = min(2.3 * w, best)
+    damping = min(2.3 * w, situation.best_damping)
     return Rates((0.0, 0.0, damping), 0.4 * (damping or w / 2.0), w, fast)
 
 
-def _free(situation: SensedContact, w: float, fast: float | None) -> _Part | None:
+def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:
     rates = _free_rates(w, fast)
-    loops = (sampled_loop(situation.free(mass), rates, situation.quiet) for mass in MASSES)
-    if any(loop.radius > 1.0 - DECAY * w * loop.period for loop in loops):
-        return None
     loop = sampled_loop(situation.free(), rates, situation.seen(situation.lever))
     error, _ = loop.deviations()
     _, jump = sampled_loop(situation.free(), rates, situation.seen(1.0)).deviations()
-    step = MODEL_ERROR * situation.free_mobility * _rms(situation, loop)
-    return _Part(w, float(np.hypot(error, step)), error, situation.inertia * jump)
+    step = MODEL_ERROR * situation.free_mobility * _rms(loop)
+    return _Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
 
 
-def _contact(situation: SensedContact, w: float, fast: float | None) -> _Part | None:
+def _contact(situation: SensedContact, w: float, fast: float | None) -> _Part:
     rates = _contact_rates(situation, w, fast)
-    for mass, share in product(CONTACT_MASSES, STIFFNESSES):
-        loop = sampled_loop(situation.contact(mass, share), rates, situation.quiet)
-        least = DECAY * w * loop.period if share >= 0.5 else 0.0
-        if not loop.radius < 1.0 - least:
-            return None
     loop = sampled_loop(situation.contact(), rates, situation.seen(situation.contact_lever))
     error, jump = loop.deviations()
-    step = MODEL_ERROR * situation.mobility * _rms(situation, loop)
+    step = MODEL_ERROR * situation.mobility * _rms(loop)
     ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
     whole = float(np.linalg.norm([error, step, ramp]))
-    return _Part(w, whole, error, situation.contact_lever * jump / situation.mobility)
+    return _Part(w, rates, True, whole, error, situation.contact_lever * jump / situation.mobility)
 
 
-def _rms(situation: SensedContact, loop: SampledLoop) -> float:
+def _rms(loop: SampledLoop) -> float:
     """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
-    return loop.after_step() * float(np.sqrt(situation.period / EVERY))
+    return loop.after_step() * float(np.sqrt(loop.period / EVERY))
 
 
-def _reason(
-    situation: SensedContact, rates: Iterable[float], roughness: float, highest: float
-) -> str:
+def _reason(situation: SensedContact, rates: list[float], allowed: float, highest: float) -> str:
     """Why no gains are found."""
-    fast = next(iter(_state_rates(situation, highest)))
+    fast = list(_state_rates(situation, highest))[-1]
     for kind, where in ((_free, "in free directions"), (_contact, "along the contact")):
-        tried = [part for w in rates if (part := kind(situation, w, fast)) is not None]
-        if not tried:
+        parts = [kind(situation, w, fast) for w in rates]
+        if _best(situation, parts, np.inf) is None:
             return (
                 f"no gains are stable {where} with a margin, for a contact of "
                 f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
                 f"{situation.delay} samples of delay: sample more often, or make it softer"
             )
-        least = min(part.roughness for part in tried)
-        if least > roughness / 2.0**0.5:
-            blamed = _blamed(situation)
-            return (
-                f"the noise of the {blamed} alone changes the controls by {least:.3g} N m from "
-                f"sample to sample {where}, and {roughness / 2.0**0.5:.3g} N m are allowed: allow "
-                "more roughness, or use a better sensor"
-            )
-    return "no gains are stable and smooth enough together: allow more roughness"
+    least = min(part.roughness for part in parts if _is_stable(situation, part))
+    return (
+        f"the noise of the {_blamed(situation)} changes the controls by {least:.3g} N m from "
+        f"sample to sample with all gains that are stable, and {allowed:.3g} N m are allowed in "
+        "each direction: allow more roughness, or use a better sensor"
+    )
 
 
 def _blamed(situation: SensedContact) -> str:

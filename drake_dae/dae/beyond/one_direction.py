@@ -1,7 +1,8 @@
 """The sampled loop of a law in one direction, as a linear system driven by noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
@@ -11,7 +12,7 @@ from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """The standard deviations of measurements in one direction, from sample to sample.
 
     Attributes:
@@ -91,9 +92,7 @@ class SampledLoop:
     def deviations(self) -> tuple[float, float]:
         """The standard deviations of the error, and of the acceleration from sample to sample."""
         size = len(self.step)
-        spread = solve_discrete_lyapunov(
-            self.step, self.noise @ self.noise.T, method="bilinear"
-        )
+        spread = solve_discrete_lyapunov(self.step, self.noise @ self.noise.T, method="bilinear")
         error, asked = self.shown
         c, d = error[:size], error[size:]
         first = float(c @ spread @ c + d @ d)
@@ -113,7 +112,7 @@ class SampledLoop:
         return float(max(rest @ spread @ rest, 0.0)) ** 0.5
 
 
-def sampled_loop(direction: Direction, rates: Rates, noise: Noise) -> SampledLoop:
+def sampled_loop(direction: Direction, rates: Rates, noise: SensorNoise) -> SampledLoop:
     """The loop of a law whose model is right but for what `direction` says.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
@@ -146,7 +145,9 @@ def sampled_loop(direction: Direction, rates: Rates, noise: Noise) -> SampledLoo
     both[:, :size] /= units
     looked = np.array([row[:count] for row in shown])
     looked[:, :size] /= units
-    return SampledLoop(both[:, :size], both[:, size:count], looked, both[:, count], direction.period)
+    return SampledLoop(
+        both[:, :size], both[:, size:count], looked, both[:, count], direction.period
+    )
 
 
 _ORDERS = {"e": 0, "q": 0, "measured": 0, "v": 1, "w": 1, "before": 1, "difference": 1}
@@ -157,7 +158,7 @@ Rows = dict[str, FloatArray]
 
 
 def _step(
-    direction: Direction, rates: Rates, noise: Noise, now: Rows
+    direction: Direction, rates: Rates, noise: SensorNoise, now: Rows
 ) -> tuple[Rows, tuple[FloatArray, FloatArray]]:
     """What a sample makes of the quantities; and the error, and the acceleration asked for."""
     period, mass = direction.period, direction.mass_error
@@ -200,11 +201,14 @@ def _step(
     return after, (force, asked)
 
 
+_filter = lru_cache(maxsize=256)(ChainFilter.of)
+"""The same filter serves all masses and stiffnesses."""
+
 Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 
 
-def _observed(rates: Rates, period: float, noise: Noise, now: Rows) -> tuple[Known, Update]:
+def _observed(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tuple[Known, Update]:
     """A `DisturbanceObserver`: what the law reads, and what is held after the sample."""
     gain = -np.expm1(-rates.observer_rate * period)
 
@@ -218,11 +222,11 @@ def _observed(rates: Rates, period: float, noise: Noise, now: Rows) -> tuple[Kno
     return known, update  # type: ignore[return-value]
 
 
-def _estimated(rates: Rates, period: float, noise: Noise, now: Rows) -> tuple[Known, Update]:
+def _estimated(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tuple[Known, Update]:
     """A `StateEstimator`, likewise; q, w and a are its prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None
-    found = ChainFilter.of(rates.state_rate, rates.observer_rate, period, ratio)
+    found = _filter(rates.state_rate, rates.observer_rate, period, ratio)
     ahead = np.array([now["q"], now["w"], now["a"]])
 
     def corrected(position: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -107,7 +107,9 @@ class StateEstimator(ObservingSystem):
         read = {self.input_port_ticket(self._ports[name].get_index()) for name in names}
         entry = self.DeclareCacheEntry(
             "estimate",
-            ValueProducer(lambda: AbstractValue.Make(start[: found.size].copy()), weakly(self._calc)),
+            ValueProducer(
+                lambda: AbstractValue.Make(start[: found.size].copy()), weakly(self._calc)
+            ),
             held | read | {self.time_ticket()},
         )
         self._index = entry.cache_index()

@@ -98,10 +98,10 @@ class EstimatorFunctions(Observed):
         measured, v, count = system.state, self._force, len(self.observation.rows)
         u = ca.SX.sym("control", system.num_controls)
         time, hold = ca.SX.sym("time"), ca.SX.sym("hold", 1)
-        before = ca.SX.sym("before", u.numel() + v.numel())
-        acted = self._lag * before[: u.numel()] + (1.0 - self._lag) * u
+        last_u, last_v = (ca.SX.sym("before", each.numel()) for each in (u, v))
+        acted = self._lag * last_u + (1.0 - self._lag) * u
         share = (1.0 + self._step / period) / 2.0  # A discrete plant's force is that of its step.
-        force = share * v + (1.0 - share) * before[u.numel() :]
+        force = share * v + (1.0 - share) * last_v
 
         # Prediction over a sample, from the middle of it; a discrete plant steps from its start.
         q, qd = old.state[:count], old.state[count:]
@@ -143,7 +143,7 @@ class EstimatorFunctions(Observed):
         return system.trace(
             "estimate of the state",
             {"estimate": shown, "valid": contact.valid},
-            {"held": ca.vertcat(old.column, before), **inputs},
+            {"held": ca.vertcat(old.column, last_u, last_v), **inputs},
         )
 
     def _balance(self) -> ca.Function:

@@ -116,7 +116,10 @@ class DisturbanceObserver(ObservingSystem):
 
     def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
         x, force = self._given(context, "estimated_state", "measured_force")
-        held, reference = context.get_discrete_state(self._held).value(), self._reference(context, x)
+        held, reference = (
+            context.get_discrete_state(self._held).value(),
+            self._reference(context, x),
+        )
         function = self._functions.exogenous
         output.SetFromVector(self._checked(function, context, x, held, force, reference)[0])
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import casadi as ca
-import numpy as np
 
 from drake_dae.dae.beyond.disturbance import beside
 from drake_dae.dae.beyond.lags import Lags

@@ -1,4 +1,4 @@
-"""What observers of model errors share as Drake systems: ports, friction, and when integrals stop."""
+"""What observers of model errors share as Drake systems: ports, friction, integrals that wait."""
 
 from collections.abc import Sequence
 

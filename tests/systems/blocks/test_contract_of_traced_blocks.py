@@ -21,6 +21,7 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     SinusoidReference,
+    StateEstimator,
     TrackingController,
     TrackingLaw,
     UnilateralRobotPlant,
@@ -64,16 +65,25 @@ def opening(kind):
     return UnilateralRobotPlant(found.model, {"wall": 0.5})
 
 
-def observer(**more):
-    """Of the arm on a wall whose friction is found: contact that sticks, is lost, or neither."""
+def found_friction():
+    """The law of the arm on a wall whose friction is found."""
     found = arm("two_link")
     smooth = found.model.constraints[0]
     wall = replace(smooth, friction=0.2, stiction_tolerance=0.1)
     model = RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
     names = [signal.name for signal in model.links.velocity_signals]
-    dae = with_disturbance(model.dae, names, ["wall.friction"])
+    return TrackingLaw(with_disturbance(model.dae, names, ["wall.friction"]), poles(-4.0))
+
+
+def observer(**more):
+    """Of a contact that sticks, is lost, or neither."""
     rates = Observing(20.0, force_rate=30.0, **more)
-    return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), rates, 0.01, 0.5, 0.02)
+    return DisturbanceObserver(found_friction(), rates, 0.01, 0.5, 0.02)
+
+
+def estimator(lag, **more):
+    rates = Observing(10.0, force_rate=15.0, state_rate=30.0, **more)
+    return StateEstimator(found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0])
 
 
 def observer_behind_springs():
@@ -121,6 +131,11 @@ BLOCKS = {
     ),
     "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
     "DisturbanceObserver behind springs": observer_behind_springs,
+    "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
+    "StateEstimator of a discrete plant": lambda: estimator(1.0, least_force=1e-3),
+    "StateEstimator of a contact that sticks": lambda: estimator(
+        0.5, least_speed=1e3, least_force=1e-3
+    ),
     "UnilateralRobotPlant": lambda: opening(None),
     "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),

@@ -1,0 +1,55 @@
+"""The filter of a position with an unknown acceleration, against its poles and a recursion."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
+from drake_dae.errors import ModelError
+
+T = 1e-4
+
+
+@pytest.mark.parametrize(("fast", "slow"), [(50.0, 5.0), (50.0, 50.0), (20.0, 200.0)])
+def test_poles_are_those_of_the_docstring(fast, slow):
+    """The stable roots of s^6 + w^4 s^2 - w^4 k_o^2 = 0; samples move them by some w T."""
+    found = ChainFilter.of(fast, slow, T)
+    closed = (np.eye(3) - found.gain @ np.eye(3)[:1]) @ transition(T)
+    poles = np.sort_complex(np.log(np.linalg.eigvals(closed)) / T)
+    roots = np.roots([1.0, 0.0, 0.0, 0.0, fast**4, 0.0, -(fast**4) * slow**2])
+    wanted = np.sort_complex(roots[roots.real < 0.0])
+    assert_allclose(poles, wanted, rtol=20.0 * fast * T)
+
+
+def test_a_slow_disturbance_leaves_a_pair_with_the_damping_ratio_of_butterworth():
+    found = ChainFilter.of(100.0, 1.0, T)
+    closed = (np.eye(3) - found.gain @ np.eye(3)[:1]) @ transition(T)
+    poles = np.log(np.linalg.eigvals(closed)) / T
+    slow, pair = poles[np.argmin(np.abs(poles))], poles[np.abs(poles) > 50.0]
+    assert slow == pytest.approx(-1.0, rel=1e-2)
+    assert_allclose(-pair.real / np.abs(pair), 0.5**0.5, rtol=1e-2)
+
+
+@pytest.mark.parametrize("ratio", [None, 30.0])
+def test_gain_and_covariance_are_where_riccatis_recursion_ends(ratio):
+    """From no knowledge at all, 20,000 samples; round-off of the recursion is about 1e-10."""
+    fast, slow, period = 40.0, 10.0, 1e-3
+    found = ChainFilter.of(fast, slow, period, ratio)
+    shown = np.eye(3)[: 1 if ratio is None else 2]
+    error = np.diag([1.0, ratio**2] if ratio else [1.0])
+    noise = np.diag([0.0, fast**4, fast**4 * slow**2]) * period**2
+    step, spread = transition(period), 1e8 * np.eye(3)
+    for _ in range(20_000):
+        before = step @ spread @ step.T + noise
+        gain = before @ shown.T @ np.linalg.inv(shown @ before @ shown.T + error)
+        spread = (np.eye(3) - gain @ shown) @ before
+    assert_allclose(found.gain, gain, rtol=1e-6)
+    assert_allclose(found.covariance, spread, rtol=1e-6)
+    assert_allclose(found.predicted, before, rtol=1e-6)
+
+
+def test_what_makes_no_filter_is_refused():
+    with pytest.raises(ModelError, match="at most 1000 1/s"):
+        ChainFilter.of(2000.0, 10.0, 1e-3)
+    with pytest.raises(ModelError, match="disturbance_rate must be positive"):
+        ChainFilter.of(20.0, 0.0, 1e-3)
