@@ -16,14 +16,6 @@ from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 
 
-class Estimate(Protocol):
-    """The source of a controller's state in place of the plant."""
-
-    @property
-    def output(self) -> OutputPort:
-        """The state that the controller gets."""
-
-
 class RecordedLoop(Protocol):
     """The parts of a closed loop from which a record is computed; see `ClosedLoop`."""
 
@@ -52,8 +44,8 @@ class RecordedLoop(Protocol):
         """The source of the plant's exogenous signals, or None."""
 
     @property
-    def encoders(self) -> Estimate | None:
-        """The sensor of the state for the law, or None."""
+    def state_source(self) -> OutputPort:
+        """The port of the state that the controller gets."""
 
 
 def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
@@ -127,8 +119,7 @@ def _parameters_along(
 def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:
     plant, taker = loop.plant, loop.controller
     own = taker.GetMyContextFromRoot(context)
-    source = plant.GetOutputPort("state") if loop.encoders is None else loop.encoders.output
-    wires = {"estimated_state": source}
+    wires = {"estimated_state": loop.state_source}
     if loop.generator is not None:
         wires["reference"] = loop.generator.GetOutputPort("reference")
     for name, giver in wires.items():

@@ -136,13 +136,14 @@ class EstimatorFunctions(Observed):
         found = ca.vertcat(found_q, found_v, found_r, mu + change)
         begun = ca.vertcat(measured, r, mu)
         sample = ca.floor(time / period + _SAME)
+        is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
         fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, found, begun))
         shown = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
         inputs = {"control": u} if self.reads_control else {}
         inputs |= {"constraint_input": v, "hold": hold, "time": time}
         return system.trace(
             "estimate of the state",
-            {"estimate": shown, "valid": contact.valid},
+            {"estimate": shown, "valid": ca.if_else(is_corrected, contact.valid, 0)},
             {"held": ca.vertcat(old.column, last_u, last_v), **inputs},
         )
 
