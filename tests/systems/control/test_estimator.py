@@ -23,11 +23,13 @@ from drake_dae import (
     StateEstimator,
     TrackingController,
     TrackingLaw,
+    build_scenario,
     poles,
     with_disturbance,
 )
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.systems.sensing.encoders import StateSensor
 
 T, MASS, FAST, SLOW = 0.01, 2.5, 20.0, 5.0
@@ -181,3 +183,33 @@ def test_what_cannot_be_estimated_is_refused():
                 "encoders={resolution: 1.0e-5}",
             )
         )
+
+
+SENSED = (
+    "encoders={position_noise: 1.0e-5}",
+    "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.01}",
+    "observer={rate: 20, force_rate: 10, state_rate: 150, identify_friction: [wall]}",
+    "constraints.0.friction=0.1",
+    "duration=0.05",
+    "integrator={integration_scheme: runge_kutta3, use_error_control: false, max_step_size: 0.001}",
+)
+
+
+@pytest.mark.parametrize("delay", [0.001, 0.0015])
+@pytest.mark.parametrize(
+    "plant",
+    ["!IdealConstraints {}", "!Unilateral {}", "!CompliantContact {time_step: 0.001}"],
+)
+def test_a_rollout_with_an_estimator_is_drakes_run(plant, delay):
+    """The same functions at the same samples, to 1e-9 of the largest value."""
+    sampling = f"sampling={{period: 0.001, delay: {delay}}}"
+    chosen = scenario("two_link_wall", *SENSED, sampling, f"plant={plant}")
+    record = run_scenario(chosen)[2]
+    fresh, start = build_scenario(chosen)
+    found = roll_scenario(chosen, fresh, start).record
+    shared = np.isin(found.time.round(9), record.time.round(9))
+    rows = np.isin(record.time.round(9), found.time.round(9))
+    for name in ("state", "control", "estimated_state", "disturbance"):
+        values, others = record[name][rows], found[name][shared]
+        assert_allclose(others[-10:], values[-10:], atol=1e-9 * np.abs(values).max())
+    assert rows.sum() > 10
