@@ -57,15 +57,17 @@ def add_observer(
             "an observer observes at samples: give the loop a sampling=Sampling(period), or a "
             "ContactPlant"
         )
-    if plant.dae.num_constraints and not controller.law.measured_force:
+    estimates = observing.state_rate is not None
+    if plant.dae.num_constraints and not (controller.law.measured_force or estimates):
         raise WiringError(
-            "an observer needs the measured force; make the law with measured_force=True"
+            "an observer needs the measured force: make the law with measured_force=True, or give "
+            "the observer a state_rate and the loop encoders, by which the model's force serves"
         )
     rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
     lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
     timing = period, lag, delay
     observer: Observer
-    if observing.state_rate is not None:
+    if estimates:
         observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
         builder.Connect(state, observer.GetInputPort("measured_state"))
         state = observer.GetOutputPort("estimated_state")

@@ -1,5 +1,8 @@
 """An estimator of state, disturbance and friction from measured positions."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +17,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
@@ -47,13 +51,16 @@ class StateEstimator(ObservingSystem):
         measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
             later only if its noise is given.
         control: The applied u, shape (p,).
-        measured_force: The constraint force, shape (m,).
+        measured_force: The constraint force, shape (m,); if the law measures it.
         hold, reference: As of a `DisturbanceObserver`.
 
     Output ports:
         estimated_state: The estimate of (q, v) at the present sample, shape (n,).
         exogenous, disturbance, friction, hold: As of a `DisturbanceObserver`, at the present
             sample.
+        estimated_force: If the law measures no force: that of the model in the last sample, v =
+            alpha(x) + beta(x) u (25) with the disturbance and the friction that are observed, shape
+            (m,). A model error along the constrained directions stays in it.
 
     Args:
         law: The law, for a system that `with_disturbance` made.
@@ -101,7 +108,7 @@ class StateEstimator(ObservingSystem):
         start = np.zeros(found.size + law.system.num_controls + law.system.num_constraints)
         start[0] = -1.0
         self._declare(law, found, "measured_state", start)
-        self._read = (*(["control"] if found.reads_control else []), "measured_force", "hold")
+        self._read = found.reads
         held = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
         names = "measured_state", *self._read
         read = {self.input_port_ticket(self._ports[name].get_index()) for name in names}
@@ -113,25 +120,48 @@ class StateEstimator(ObservingSystem):
             held | read | {self.time_ticket()},
         )
         self._index = entry.cache_index()
+        force = entry.ticket()
+        if self._measures:
+            force = self.input_port_ticket(self._ports["measured_force"].get_index())
+        self._declare_hold(force)
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         also = {self.input_port_ticket(self._ports["reference"].get_index())}
         for name, calc, size, more in (
             ("estimated_state", self._copy_state, law.system.num_states, set()),
-            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, also),
+            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, {force, *also}),
             ("disturbance", self._copy_disturbance, count, set()),
             ("friction", self._copy_friction, len(self.friction_signals), set()),
         ):
             tickets = {entry.ticket(), self.all_parameters_ticket(), *more}
             self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
+        if not self._measures:
+            size = law.system.num_constraints
+            self.DeclareVectorOutputPort(_FORCE, size, weakly(self._copy_force), {force})
 
     @property
-    def _places(self) -> tuple[slice, slice, slice]:
-        """Where state, disturbance and friction stand in an estimate."""
-        known, ends = self._functions.estimate, [1]
-        for part in (known.state, known.disturbance, known.friction):
-            ends.append(ends[-1] + part.numel())
-        first, second, third, last = ends
-        return slice(first, second), slice(second, third), slice(third, last)
+    def _places(self) -> tuple[slice, ...]:
+        """Where state, disturbance, friction and force stand in an estimate."""
+        known = self._functions.estimate
+        parts = known.sample, known.state, known.disturbance, known.friction, known.force
+        ends = np.cumsum([part.numel() for part in parts]).tolist()
+        return tuple(slice(*pair) for pair in pairwise(ends))
+
+    @property
+    def _measures(self) -> bool:
+        return self._functions.measures
+
+    @property
+    def further_signals(self) -> dict[str, Sequence[Signal]]:
+        """Name of an output port in a record -> names and units of its entries."""
+        known = dict(super().further_signals)
+        if not self._measures:
+            known[_FORCE] = self.dae.constraint_input_signals
+        return known
+
+    def _force(self, context: Context) -> FloatArray:
+        if self._measures:
+            return super()._force(context)
+        return self._estimate(context)[self._places[3]]
 
     @property
     def _mu(self) -> slice:
@@ -152,14 +182,14 @@ class StateEstimator(ObservingSystem):
         return found
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        held = [self._estimate(context), *self._given(context, "control", "measured_force")]
+        held = [self._estimate(context), *self._given(context, "control"), self._force(context)]
         state.get_mutable_discrete_state().set_value(self._held, np.concatenate(held))
         return EventStatus.Succeeded()
 
     def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
-        found, (force,) = self._estimate(context), self._given(context, "measured_force")
+        found = self._estimate(context)
         x = found[self._places[0]]
-        given = found, force, self._reference(context, x)
+        given = found, self._force(context), self._reference(context, x)
         output.SetFromVector(self._checked(self._functions.exogenous, context, x, *given)[0])
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
@@ -171,27 +201,35 @@ class StateEstimator(ObservingSystem):
     def _copy_friction(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._estimate(context)[self._places[2]])
 
+    def _copy_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._force(context))
+
     def traced(self) -> Block:
         functions, known = self._functions, self._functions.estimate
         sources = ("measured_state", HELD, *self._read, TIME, PARAMETERS)
         now = Computation.of(functions.now, sources, (_NOW,))
-        state = ("estimated_state", _NOW, "measured_force", "reference", PARAMETERS)
-        shown = ca.Function(
-            "shown", [known.column], [known.state, known.disturbance, known.friction]
-        )
+        force = "measured_force" if self._measures else _FORCE
+        state = ("estimated_state", _NOW, force, "reference", PARAMETERS)
+        parts = {
+            "estimated_state": known.state,
+            "disturbance": known.disturbance,
+            "friction": known.friction,
+        }
+        parts |= {} if self._measures else {_FORCE: known.force}
+        shown = ca.Function("shown", [known.column], list(parts.values()))
         u, v = (ca.SX.sym("given", n) for n in (self.dae.num_controls, self.dae.num_constraints))
         after = ca.Function("after", [known.column, u, v], [ca.vertcat(known.column, u, v)])
         return Block(
             self,
             (
                 now,
-                Computation(shown, (_NOW,), ("estimated_state", "disturbance", "friction")),
+                Computation(shown, (_NOW,), tuple(parts)),
                 Computation.of(functions.exogenous, state, ("exogenous",)),
-                self._traced_hold(),
+                self._traced_hold(force),
             ),
             (
                 Update(
-                    Computation(after, (_NOW, "control", "measured_force"), (HELD,)),
+                    Computation(after, (_NOW, "control", force), (HELD,)),
                     self.sample_period,
                     is_unrestricted=True,
                 ),
@@ -202,5 +240,5 @@ class StateEstimator(ObservingSystem):
         )
 
 
-_NOW = "estimate"
-"""The name of the estimate among the computations of the block."""
+_NOW, _FORCE = "estimate", "estimated_force"
+"""The name of the estimate among the computations of the block, and a port."""

@@ -26,17 +26,19 @@ class Estimate:
         state: The estimated x, shape (n,).
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
+        force: The constraint force of the model, shape (m,); none if it is measured.
     """
 
     sample: ca.SX
     state: ca.SX
     disturbance: ca.SX
     friction: ca.SX
+    force: ca.SX
 
     @classmethod
-    def of(cls, states: int, frictions: int) -> Self:
-        """Symbols, where x and mu have so many entries."""
-        sizes = (1, states, states // 2, frictions)
+    def of(cls, states: int, frictions: int, forces: int) -> Self:
+        """Symbols, where x, mu and the force have so many entries."""
+        sizes = (1, states, states // 2, frictions, forces)
         return cls(*(ca.SX.sym("estimate", size) for size in sizes))
 
     @property
@@ -47,7 +49,7 @@ class Estimate:
     @property
     def column(self) -> ca.SX:
         """All of it."""
-        return ca.vertcat(self.sample, self.state, self.disturbance, self.friction)
+        return ca.vertcat(*vars(self).values())
 
 
 class EstimatorFunctions(Observed):
@@ -58,8 +60,9 @@ class EstimatorFunctions(Observed):
         size: The number of entries of an estimate.
         now: (xm, held, u, v, hold, time, parameters) -> the estimate of the present sample; held
             is the estimate of a sample before, with u and v of that sample. It has no argument u
-            where the plant uses the previous control alone.
-        reads_control: Whether it has.
+            where the plant uses the previous control alone, and no v if the law measures no force.
+        measures: Whether the constraint force is measured, or there is none.
+        reads: Its arguments u, v and hold, as names of the ports.
         exogenous: (x, estimate, v, R, parameters) -> what to cancel, mu, and their derivatives.
 
     Args:
@@ -86,9 +89,14 @@ class EstimatorFunctions(Observed):
         system = self._system
         _check_rigid(law, self.observation.rows)
         self._lag, self._step, self._filters = lag, step, filters
-        self.estimate = Estimate.of(system.num_states, len(self.observation.frictions))
+        self.measures = law.measured_force is not None or not system.num_constraints
+        forces = 0 if self.measures else system.num_constraints
+        self.estimate = Estimate.of(system.num_states, len(self.observation.frictions), forces)
         self.size = self.estimate.column.numel()
-        self.reads_control = lag < 1.0
+        elimination = law.structure.elimination
+        self._model_force = elimination.alpha, elimination.beta
+        named = {"control": lag < 1.0, "measured_force": self.measures, "hold": True}
+        self.reads = tuple(name for name, is_read in named.items() if is_read)
         self.now = self._estimated()
         self.exogenous = self.compensated(law, delay, self.estimate.column, self.estimate)
 
@@ -109,6 +117,8 @@ class EstimatorFunctions(Observed):
         middle = ca.vertcat(q + (period - self._step) / 2.0 * qd, qd)
         none = self._parameters(ca.SX.zeros(mu.numel()))
         contact = self.contact(middle, none)
+        if not self.measures:
+            force = v
         none[system.parameter_slice(DISTURBANCE)] = r + ca.mtimes(contact.friction, mu)
         mass, push = self._balance()(middle, acted, force, none)
         factors = PositiveDefiniteFactorization(mass)
@@ -134,18 +144,33 @@ class EstimatorFunctions(Observed):
         change = self.change(contact, mu, found_r, hold)
         found_r -= ca.mtimes(contact.friction, change)
         found = ca.vertcat(found_q, found_v, found_r, mu + change)
-        begun = ca.vertcat(measured, r, mu)
+        begun, valid = ca.vertcat(measured, r, mu), contact.valid
+        if not self.measures:
+            by_model = self._forces(middle, acted, r, mu)
+            found, valid = ca.substitute([found, valid], [v], [by_model])
+            state, r_now, mu_now = ca.vertsplit(found, [0, 2 * count, 3 * count, found.numel()])
+            found = ca.vertcat(found, self._forces(state, acted, r_now, mu_now))
+            begun = ca.vertcat(begun, ca.SX.zeros(v.numel()))  # No control has acted yet.
         sample = ca.floor(time / period + _SAME)
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
         fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, found, begun))
         shown = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
-        inputs = {"control": u} if self.reads_control else {}
-        inputs |= {"constraint_input": v, "hold": hold, "time": time}
+        known = {"control": u, "measured_force": v, "hold": hold}
+        inputs = {name: known[name] for name in self.reads} | {"time": time}
         return system.trace(
             "estimate of the state",
-            {"estimate": shown, "valid": ca.if_else(is_corrected, contact.valid, 0)},
+            {"estimate": shown, "valid": ca.if_else(is_corrected, valid, 0)},
             {"held": ca.vertcat(old.column, last_u, last_v), **inputs},
         )
+
+    def _forces(self, state: ca.SX, control: ca.SX, r: ca.SX, mu: ca.SX) -> ca.SX:
+        """v = alpha(x) + beta(x) u (25) with the disturbance and the friction that are observed."""
+        system, (alpha, beta) = self._system, self._model_force
+        parameters = self._parameters(mu)
+        parameters[system.parameter_slice(DISTURBANCE)] = r
+        inputs = [system.state, system.parameter_symbol]
+        found = ca.Function("force", inputs, [alpha, ca.densify(beta)])(state, parameters)
+        return found[0] + ca.mtimes(found[1], control)
 
     def _balance(self) -> ca.Function:
         """(x, u, v, parameters) -> M, and the force that accelerates it, disturbance included."""

@@ -89,6 +89,7 @@ class DisturbanceObserver(ObservingSystem):
         )
         start = np.zeros(found.memory.column.numel())
         self._declare(law, found, "estimated_state", start)
+        self._declare_hold(self.input_port_ticket(self._ports["measured_force"].get_index()))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
@@ -82,16 +82,29 @@ class ObservingSystem(ParameterizedSystem):
         sizes = {
             state: system.num_states,
             "control": system.num_controls,
-            "measured_force": system.num_constraints,
             "hold": 1,
             "reference": law.layout.reference_size,
         }
+        if self._measures:
+            sizes["measured_force"] = system.num_constraints
         self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
         for j, name in enumerate(names, self._mu.start):
             start[j : j + 1] = system.parameter_values[system.parameter_slice(name)]
         self._held = self.DeclareDiscreteState(start)
-        read = {self.input_port_ticket(self._ports[n].get_index()) for n in _READ_BY_HOLD}
-        self.DeclareVectorOutputPort("hold", 1, weakly(self._calc_hold), read)
+
+    def _declare_hold(self, force: DependencyTicket) -> None:
+        """Declares the output port `hold`, which depends on the force."""
+        tickets = {force, self.input_port_ticket(self._ports["hold"].get_index())}
+        self.DeclareVectorOutputPort("hold", 1, weakly(self._calc_hold), tickets)
+
+    @property
+    def _measures(self) -> bool:
+        """Whether the constraint force comes from a sensor."""
+        return True
+
+    def _force(self, context: Context) -> FloatArray:
+        """The constraint force."""
+        return np.asarray(self._ports["measured_force"].Eval(context))
 
     @property
     def _mu(self) -> slice:
@@ -138,8 +151,8 @@ class ObservingSystem(ParameterizedSystem):
         return self._checked(self.observation.moving, context, state)[0].copy()
 
     def _calc_hold(self, context: Context, output: BasicVector) -> None:
-        (force,) = self._given(context, "measured_force")
-        output.SetFromVector(self._observed.hold.evaluate(force, self._holds(context))[0])
+        given = self._force(context), self._holds(context)
+        output.SetFromVector(self._observed.hold.evaluate(*given)[0])
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(
@@ -147,14 +160,11 @@ class ObservingSystem(ParameterizedSystem):
             "derivative by the time"
         )
 
-    def _traced_hold(self) -> Computation:
-        return Computation.of(self._observed.hold, _READ_BY_HOLD, ("hold",))
+    def _traced_hold(self, force: str = "measured_force") -> Computation:
+        return Computation.of(self._observed.hold, (force, "hold"), ("hold",))
 
     def _unwired(self, state: str) -> dict[str, Computation]:
         """What stands at inputs without a wire, by the name of the state among the sources."""
         moving = Computation.of(self.observation.moving, (state, PARAMETERS), ("reference",))
         none = ca.Function("none", [], [ca.SX.zeros(1)])
         return {"hold": Computation(none, (), ("hold",)), "reference": moving}
-
-
-_READ_BY_HOLD = ("measured_force", "hold")

@@ -65,14 +65,15 @@ def opening(kind):
     return UnilateralRobotPlant(found.model, {"wall": 0.5})
 
 
-def found_friction():
+def found_friction(is_measured=True):
     """The law of the arm on a wall whose friction is found."""
     found = arm("two_link")
     smooth = found.model.constraints[0]
     wall = replace(smooth, friction=0.2, stiction_tolerance=0.1)
     model = RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
     names = [signal.name for signal in model.links.velocity_signals]
-    return TrackingLaw(with_disturbance(model.dae, names, ["wall.friction"]), poles(-4.0))
+    dae = with_disturbance(model.dae, names, ["wall.friction"])
+    return TrackingLaw(dae, poles(-4.0), measured_force=is_measured)
 
 
 def observer(**more):
@@ -81,9 +82,11 @@ def observer(**more):
     return DisturbanceObserver(found_friction(), rates, 0.01, 0.5, 0.02)
 
 
-def estimator(lag, **more):
+def estimator(lag, law=None, **more):
     rates = Observing(10.0, force_rate=15.0, state_rate=30.0, **more)
-    return StateEstimator(found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0])
+    return StateEstimator(
+        law or found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0]
+    )
 
 
 def observer_behind_springs():
@@ -132,6 +135,7 @@ BLOCKS = {
     "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
     "DisturbanceObserver behind springs": observer_behind_springs,
     "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
+    "StateEstimator without a force sensor": lambda: estimator(0.5, law=found_friction(False)),
     "StateEstimator of a discrete plant": lambda: estimator(1.0, least_force=1e-3),
     "StateEstimator of a contact that sticks": lambda: estimator(
         0.5, least_speed=1e3, least_force=1e-3

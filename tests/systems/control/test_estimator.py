@@ -162,6 +162,32 @@ def test_encoders_alone_track_as_promised_and_innovations_are_consistent():
     assert 0.93 < np.mean((low < squares) & (squares < high)) < 0.97
 
 
+@pytest.mark.slow
+def test_without_a_force_sensor_the_force_is_that_of_the_model():
+    """Below 0.1 mm and 0.5 N on a plant without model errors but for its friction."""
+    points = ", ".join(f"tool.{axis}: [15625.0, 1250.0, 50.0]" for axis in "yz")
+    names = ("tool.z_axis.y", "tool.z_axis.z", "joint3", "joint7")
+    others = ", ".join(f"{name}: [625.0, 35.4]" for name in names)
+    loop, _, record = run_scenario(
+        scenario(
+            "wall_point_contact",
+            "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
+            "encoders={resolution: 1.0e-5}",
+            f"gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
+            "integral=[tool.y, tool.z]",
+            "observer={rate: 33.3, friction_rate: 8.3, state_rate: 333.0, identify_friction: [wall]}",
+            "duration=4",
+        )
+    )
+    assert not loop.controller.law.measured_force
+    late = record.time > 2.0
+    error = record["tracking_error"][late]
+    assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 1e-4
+    assert np.sqrt(np.mean(error[:, -1] ** 2)) < 0.5
+    missed = record["estimated_force"][late] - record["constraint_force"][late]
+    assert np.sqrt(np.mean(missed**2)) < 0.5
+
+
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(ScenarioError, match="give the loop encoders, or leave it out"):
         run_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 100}"))
