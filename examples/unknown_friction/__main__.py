@@ -85,7 +85,7 @@ class Condition:
         noise: Whether the sensors are noisy.
         load: What the tool has more than the law knows, in kg.
         is_ideal: Whether the law that is advised for Drake's contact is on the ideal plant.
-        position, force: What is to be kept, in mm and N.
+        position, force, roughness: What is to be kept, in mm, N and N m.
     """
 
     name: str
@@ -96,6 +96,7 @@ class Condition:
     is_ideal: bool = False
     position: float = 0.02
     force: float = 0.03
+    roughness: float = ROUGHNESS
 
 
 TUNED = (
@@ -109,7 +110,16 @@ TUNED = (
     Condition("noise", noise=True, force=0.1),
     Condition("0.5 kg more in the tool", load=0.5, position=0.1),
 )
+FORCE_SENSOR = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}"
+FINE, COARSE = ((f"encoders={{resolution: {size}}}", FORCE_SENSOR) for size in ("1.0e-5", "1.0e-4"))
+NOISY = ("encoders={position_noise: 5.0e-5, velocity_noise: 0.01}", FORCE_SENSOR)
 OTHERS = (
+    Condition("encoders of 1e-5 rad alone", settings=FINE, position=0.01, force=0.1),
+    Condition("the same, 1 kg more", settings=FINE, load=1.0, position=0.1, force=0.2),
+    Condition(
+        "encoders of 1e-4 rad alone", settings=COARSE, position=0.1, force=0.3, roughness=1.0
+    ),
+    Condition("5e-5 rad, 0.01 rad/s", settings=NOISY, position=0.1, force=0.4),
     Condition("friction 0.1", settings=("plant.friction=0.1",)),
     Condition("friction 0.6", settings=("plant.friction=0.6",)),
     Condition("a line with reversals", settings=TURNS),
@@ -256,7 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
             kept = kept and condition not in TUNED
             continue
         is_kept = row.position <= condition.position and row.force <= condition.force
-        is_kept = is_kept and row.roughness <= ROUGHNESS
+        is_kept = is_kept and row.roughness <= condition.roughness
         kept = kept and (is_kept or condition not in TUNED)
         print(
             f"{condition.name:32}{row.position:9.4f}{condition.position:7.2f}{row.force:9.4f}"

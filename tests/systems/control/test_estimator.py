@@ -175,7 +175,7 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
             "encoders={resolution: 1.0e-5}",
             f"gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
             "integral=[tool.y, tool.z]",
-            "observer={rate: 33.3, friction_rate: 8.3, state_rate: 333.0, identify_friction: [wall]}",
+            "observer={rate: 33, friction_rate: 8, state_rate: 333, identify_friction: [wall]}",
             "duration=4",
         )
     )
