@@ -273,6 +273,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "max_integrators": lambda: 2,
     "law of DisturbanceObserver": observed_law,
     "law of StateEstimator": observed_law,
+    "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
     "observing of StateEstimator": lambda: dd.Observing(10.0, state_rate=40.0),
     "states of with_disturbance": lambda: ["joint1_w", "joint2_w"],
     "region": lambda: None,

@@ -5,11 +5,11 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.estimator import StateEstimator
 from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.observer import DisturbanceObserver
-from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.observing.estimator import StateEstimator
+from drake_dae.systems.observing.observer import DisturbanceObserver
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders
 

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
 from drake_dae.errors import WiringError
-from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.sensing.tolerances import Tolerances

@@ -56,11 +56,23 @@ def test_what_is_left_out_is_advised_and_reported():
     assert loop.observer.friction_signals[0].name == "wall.friction"
 
 
-@pytest.mark.slow
-def test_advice_takes_the_noise_of_the_encoders():
-    found = chosen(two_link("encoders={velocity_noise: 2.0e-3}"))
-    usual = chosen(two_link())
-    assert found.observer.rate == pytest.approx(usual.observer.rate / 2.0, rel=1e-2)
+def test_encoders_are_estimated_at_rates_for_their_noise():
+    """What is predicted is printed; coarser encoders have slower rates and larger errors."""
+    fine, coarse = (
+        build_completed(two_link(f"encoders={{resolution: {size}}}"))[0]
+        for size in ("1.0e-6", "1.0e-3")
+    )
+    assert "estimate of the state" in fine.notes[0]
+    assert fine.scenario.observer.state_rate > coarse.scenario.observer.state_rate
+    differences = chosen(two_link("encoders={resolution: 1.0e-6, velocity_bandwidth: 500}"))
+    assert differences.observer.state_rate is None
+    own = chosen(two_link("encoders={resolution: 1.0e-6}", "observer={rate: 20.0}"))
+    assert own.observer.state_rate is None
+
+
+def test_a_noise_that_no_gains_smooth_is_named():
+    with pytest.raises(ScenarioError, match="noise of the position changes"):
+        chosen(two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4"))
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.scenario.forms.values import Numbers
-from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 

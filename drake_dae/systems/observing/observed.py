@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation, shares
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 _SHARP = 10.0

@@ -22,9 +22,9 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation, Update
-from drake_dae.systems.control.estimator_functions import EstimatorFunctions, state_filters
-from drake_dae.systems.control.observer_rates import Observing
-from drake_dae.systems.control.observing_system import ObservingSystem
+from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
+from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing_system import ObservingSystem
 
 
 @checked(ModelError)
@@ -98,10 +98,13 @@ class StateEstimator(ObservingSystem):
         super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("state_estimator")
         count = law.system.num_states // 2
-        noise = (
-            np.broadcast_to(numbers("deviation", given), (count,))
-            for given in (position_deviation, velocity_deviation)
-        )
+        noise = [
+            _each(name, given, count)
+            for name, given in (
+                ("position_deviation", position_deviation),
+                ("velocity_deviation", velocity_deviation),
+            )
+        ]
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
         self._functions = found = EstimatorFunctions(law, observing, *timing, filters)
@@ -238,6 +241,14 @@ class StateEstimator(ObservingSystem):
             signals=self._signals,
             ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
         )
+
+
+def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
+    """One number for each position."""
+    found = numbers(name, given)
+    if found.shape not in ((), (count,)) or not np.all(found >= 0.0):
+        raise ModelError(f"{name} must be 0 or more, a number or shape ({count},), got {given!r}")
+    return np.broadcast_to(found, (count,))
 
 
 _NOW, _FORCE = "estimate", "estimated_force"

@@ -9,9 +9,9 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
-from drake_dae.systems.control.observer_functions import ObserverFunctions
-from drake_dae.systems.control.observer_rates import Observing
-from drake_dae.systems.control.observing_system import ObservingSystem
+from drake_dae.systems.observing.observer_functions import ObserverFunctions
+from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing_system import ObservingSystem
 
 _READ = ("estimated_state", "measured_force", "reference")
 

@@ -11,8 +11,8 @@ from drake_dae.dae.beyond.chain_filter import ChainFilter
 from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.control.observed import Observed
-from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.observing.observed import Observed
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 

@@ -16,8 +16,8 @@ from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import PARAMETERS, Computation
-from drake_dae.systems.control.observed import Observed
-from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.observing.observed import Observed
+from drake_dae.systems.observing.observer_rates import Observing
 
 
 @checked(ModelError)

@@ -8,8 +8,8 @@ import casadi as ca
 from drake_dae.dae.beyond.disturbance import beside
 from drake_dae.dae.beyond.lags import Lags
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.systems.control.observed import Observed
-from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.observing.observed import Observed
+from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 
