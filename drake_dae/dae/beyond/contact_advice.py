@@ -30,6 +30,9 @@ STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
 DECAY = 0.05
 """With half of the stiffness and more, all of these loops settle at least at this share of w."""
 
+_SLOWER = (1.0, 0.5, 0.25)
+"""Shares of the integral and of the observer's rate along a contact, which both take damping."""
+
 MODEL_ERROR, EVERY = 1.0, 2.0
 """An unknown force of 1 N appears or turns every 2 s."""
 
@@ -176,7 +179,7 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     rates = np.geomspace(highest, highest / 30.0, 14).tolist()
     found = []
     for fast in _state_rates(situation, highest):
-        contacts = [_contact(situation, w, fast) for w in rates]
+        contacts = [_contact(situation, w, fast, share) for w in rates for share in _SLOWER]
         if (contact := _best(situation, contacts, roughness / 2.0**0.5)) is None:
             continue
         left = (roughness**2 - contact.roughness**2) ** 0.5
@@ -242,9 +245,9 @@ def _free_rates(w: float, fast: float | None) -> Rates:
     return Rates((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
 
 
-def _contact_rates(situation: SensedContact, w: float, fast: float | None) -> Rates:
+def _contact_rates(situation: SensedContact, w: float, fast: float | None, share: float) -> Rates:
     damping = min(2.3 * w, situation.best_damping)
-    return Rates((0.0, 0.0, damping), 0.4 * (damping or w / 2.0), w, fast)
+    return Rates((0.0, 0.0, damping), share * 0.4 * (damping or w / 2.0), share * w, fast)
 
 
 def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:
@@ -256,8 +259,10 @@ def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:
     return _Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
 
 
-def _contact(situation: SensedContact, w: float, fast: float | None) -> _Part:
-    rates = _contact_rates(situation, w, fast)
+def _contact(
+    situation: SensedContact, w: float, fast: float | None, share: float = _SLOWER[-1]
+) -> _Part:
+    rates = _contact_rates(situation, w, fast, share)
     loop = sampled_loop(situation.contact(), rates, situation.seen(situation.contact_lever))
     error, jump = loop.deviations()
     step = MODEL_ERROR * situation.mobility * _rms(loop)

@@ -90,8 +90,13 @@ class SampledLoop:
         return float(np.abs(np.linalg.eigvals(self.step)).max())
 
     def deviations(self) -> tuple[float, float]:
-        """The standard deviations of the error, and of the acceleration from sample to sample."""
+        """The standard deviations of the error, and of the acceleration from sample to sample.
+
+        They are infinite if the loop is not stable.
+        """
         size = len(self.step)
+        if not self.radius < 1.0:
+            return np.inf, np.inf
         spread = solve_discrete_lyapunov(self.step, self.noise @ self.noise.T, method="bilinear")
         error, asked = self.shown
         c, d = error[:size], error[size:]
@@ -103,8 +108,13 @@ class SampledLoop:
         return max(first, 0.0) ** 0.5, max(second, 0.0) ** 0.5
 
     def after_step(self) -> float:
-        """sqrt(sum of squares) of the error after a disturbing acceleration rises from 0 to 1."""
+        """sqrt(sum of squares) of the error after a disturbing acceleration rises from 0 to 1.
+
+        It is infinite if the loop is not stable.
+        """
         size = len(self.step)
+        if not self.radius < 1.0:
+            return np.inf
         rest = np.linalg.solve(np.eye(size) - self.step, self.push)
         spread = solve_discrete_lyapunov(
             self.step.T, np.outer(*[self.shown[0, :size]] * 2), method="bilinear"
