@@ -51,10 +51,24 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         The scenario, unchanged if nothing is left out, and the choices in words.
 
     Raises:
-        ScenarioError: There are no default gains with a task, or with stages of actuation.
+        ScenarioError: There are no default gains with a task, or with stages of actuation, or none
+            are smooth and stable enough; or a roughness is given that nothing uses.
     """
     material = scenario.plant.material
-    if material is None or not scenario.is_advised:
+    is_advised = material is not None and scenario.is_advised
+    if scenario.largest_roughness is not None:
+        if not is_advised or scenario.encoders is None:
+            raise ScenarioError(
+                (
+                    "largest_roughness",
+                    "it limits gains that are computed for the noise of encoders in Drake's "
+                    "contact; leave it out, or leave the gains out and give encoders",
+                )
+            )
+        if not scenario.largest_roughness > 0.0:
+            value = f"must be positive, got {scenario.largest_roughness:g} N m"
+            raise ScenarioError(("largest_roughness", value))
+    if material is None or not is_advised:
         return Completed(scenario)
     if scenario.task is not None:
         raise ScenarioError(
@@ -127,6 +141,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         constraint_damping=damping,
         observer=observer,
         force_feedback=force,
+        largest_roughness=None,
     )
     known = ", ".join(observer.identify_friction) or "none"
     note = (

@@ -70,6 +70,13 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
     assert own.observer.state_rate is None
 
 
+def test_a_roughness_without_use_is_refused():
+    with pytest.raises(ScenarioError, match="leave the gains out and give encoders"):
+        chosen(two_link("largest_roughness=1.0"))
+    with pytest.raises(ScenarioError, match="must be positive, got -1 N m"):
+        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_roughness=-1.0"))
+
+
 def test_a_noise_that_no_gains_smooth_is_named():
     with pytest.raises(ScenarioError, match="noise of the position changes"):
         chosen(two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4"))
