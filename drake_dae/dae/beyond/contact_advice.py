@@ -31,7 +31,8 @@ DECAY = 0.05
 """With half of the stiffness and more, all of these loops settle at least at this share of w."""
 
 _SLOWER = (1.0, 0.5, 0.25)
-"""Shares of the integral and of the observer's rate along a contact, which both take damping."""
+"""Shares of the integral and of the observer's rate along a contact, which both take damping: the
+first for which there are gains."""
 
 MODEL_ERROR, EVERY = 1.0, 2.0
 """An unknown force of 1 N appears or turns every 2 s."""
@@ -179,8 +180,9 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     rates = np.geomspace(highest, highest / 30.0, 14).tolist()
     found = []
     for fast in _state_rates(situation, highest):
-        contacts = [_contact(situation, w, fast, share) for w in rates for share in _SLOWER]
-        if (contact := _best(situation, contacts, roughness / 2.0**0.5)) is None:
+        tried = ([_contact(situation, w, fast, share) for w in rates] for share in _SLOWER)
+        best = (_best(situation, parts, roughness / 2.0**0.5) for parts in tried)
+        if (contact := next(filter(None, best), None)) is None:
             continue
         left = (roughness**2 - contact.roughness**2) ** 0.5
         if (free := _best(situation, [_free(situation, w, fast) for w in rates], left)) is not None:
