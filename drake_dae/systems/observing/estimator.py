@@ -36,6 +36,8 @@ class StateEstimator(ObservingSystem):
         q' = v,    M v' = f + C mu + r + g lambda + h u,
 
     with the control u that acted and the measured force lambda; so velocities need no differences.
+    Viscous friction D in joints, which makes light links stiff, is taken implicitly: M + T D then
+    stands in place of M in the prediction and before K_3.
     At a sample the error of the predicted positions, e = qm - q, corrects all of them,
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,

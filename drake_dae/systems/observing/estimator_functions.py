@@ -120,9 +120,13 @@ class EstimatorFunctions(Observed):
         if not self.measures:
             force = v
         none[system.parameter_slice(DISTURBANCE)] = r + ca.mtimes(contact.friction, mu)
-        mass, push = self._balance()(middle, acted, force, none)
-        factors = PositiveDefiniteFactorization(mass)
-        moved = qd + period * factors.solve(push)
+        mass, push, damping = self._balance()(middle, acted, force, none)
+        factors = stepping = PositiveDefiniteFactorization(mass)
+        moves = mass
+        if not damping.is_zero():  # Implicit, as in Drake's discrete plants: a light link is stiff.
+            moves = mass + period * ca.diag(damping)
+            stepping = PositiveDefiniteFactorization(moves)
+        moved = qd + period * stepping.solve(push)
         ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
 
         # Correction by what is measured, along the free and the constrained directions.
@@ -133,11 +137,11 @@ class EstimatorFunctions(Observed):
         ]
         free, constrained = steps[:3], steps[3:]
         difference = ca.horzcat(*free) - ca.horzcat(*constrained)
-        along = ca.mtimes(contact.free, ca.mtimes(mass, difference))
-        turned = factors.solve(along[:, :2])
+        turned = factors.solve(ca.mtimes(contact.free, ca.mtimes(mass, difference[:, :2])))
         found_q = ahead + constrained[0] + turned[:, 0]
         found_v = moved + constrained[1] + turned[:, 1]
-        jump = ca.mtimes(mass, constrained[2]) + along[:, 2]
+        jump = ca.mtimes(moves, constrained[2])
+        jump += ca.mtimes(contact.free, ca.mtimes(moves, difference[:, 2]))
         found_r = r + beside(contact.held, contact.metric, jump)
 
         # Friction takes its share of the disturbance.
@@ -173,12 +177,15 @@ class EstimatorFunctions(Observed):
         return found[0] + ca.mtimes(found[1], control)
 
     def _balance(self) -> ca.Function:
-        """(x, u, v, parameters) -> M, and the force that accelerates it, disturbance included."""
+        """(x, u, v, parameters) -> M, the force that accelerates it, and the joints' damping."""
         system, rows = self._system, list(self.observation.rows)
-        u, v = ca.SX.sym("u", system.num_controls), self._force
+        u, v, speed = ca.SX.sym("u", system.num_controls), self._force, self._system.state[rows]
         push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
+        slope = [-ca.jacobian(system.f[i], speed[j]) for j, i in enumerate(rows)]
+        damping = ca.substitute(ca.vertcat(*slope), speed, 0 * speed)  # Without Coriolis forces.
         inputs = [system.state, u, v, system.parameter_symbol]
-        return ca.Function("balance", inputs, [system.mass_matrix[rows, rows], push[rows]])
+        outputs = [system.mass_matrix[rows, rows], push[rows], ca.sparsify(ca.simplify(damping))]
+        return ca.Function("balance", inputs, outputs)
 
     def _gains(self) -> list[tuple[ca.DM, ca.DM]]:
         """The gains of q, v and a by errors of positions and velocities; free, constrained."""

@@ -37,12 +37,12 @@ RATES = Observing(SLOW, state_rate=FAST)
 STEPS = error_controlled(1e-12)
 
 
-def body() -> DaeSystem:
-    """M q'' = u + d, with M = 2.5 kg."""
+def body(damping: float = 0.0) -> DaeSystem:
+    """M q'' = u - D q' + d, with M = 2.5 kg."""
     x, none = ca.SX.sym("x", 2), ca.SX(0, 1)
     system = DaeSystem(
         x,
-        ca.vertcat(x[1], 0.0),
+        ca.vertcat(x[1], -damping * x[1]),
         ca.SX(2, 0),
         ca.vertcat(0, 1),
         none,
@@ -54,9 +54,15 @@ def body() -> DaeSystem:
     return with_disturbance(system, ["v"])
 
 
-def observed(push: float, duration: float, noise: float = 0.0, velocity_noise: float = 0.0):
+def observed(
+    push: float,
+    duration: float,
+    noise: float = 0.0,
+    velocity_noise: float = 0.0,
+    damping: float = 0.0,
+):
     """What the estimator says of the body under its law, and the body's states, at the samples."""
-    system = body()
+    system = body(damping)
     law = TrackingLaw(system, poles(-2.0))
     builder = DiagramBuilder()
     plant, controller = builder.AddSystem(DaePlant(system)), TrackingController(law)
@@ -121,6 +127,13 @@ def test_errors_of_the_estimate_are_those_of_the_filter():
     actual = np.hstack([states - estimates, (4.0 - found) / MASS])
     assert_allclose(actual[1:], wanted[1:], atol=1e-6)
     assert abs(found[-1, 0] - 4.0) < 1e-3
+
+
+def test_friction_that_is_stiff_for_the_samples_is_borne():
+    """D T / M = 8: an explicit prediction grows sevenfold a sample. A push is found, slowly."""
+    states, estimates, found = observed(4.0, 3.0, damping=8.0 * MASS / T)
+    assert np.abs(states - estimates).max() < 0.05
+    assert 3.0 < found[-1, 0] < 4.0
 
 
 @pytest.mark.parametrize("ratio", [None, 3.0])
