@@ -45,9 +45,9 @@ class StateEstimator(ObservingSystem):
     where (K_1, K_2, K_3) is the gain of the stationary Kalman filter of each position; see
     `ChainFilter`. Since r is an acceleration there, M^-1 r, one gain serves all postures, and the
     errors of the estimate are those of a linear filter whatever the motion. Along the constrained
-    directions, M^-1 J^T A^-1 J e, the gains are of the rate w_n, otherwise of w. Measured
-    velocities, if their noise is given, correct likewise. Friction takes its share of r, as in a
-    `DisturbanceObserver`, and a contact that sticks as well.
+    directions, M^-1 J^T A^-1 J e, the gains are those of k_n in place of k_o. Measured velocities,
+    if their noise is given, correct likewise. Friction takes its share of r as in a
+    `DisturbanceObserver`, and so does a contact that sticks.
 
     Input ports:
         measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
