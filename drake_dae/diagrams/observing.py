@@ -31,7 +31,8 @@ def add_observer(
         observing: The rates of the observer.
         state: The state input of the controller.
         sampling: The sampling of the hold after the controller.
-        control: The control at the plant.
+        control: The control at the plant. An observer of a controller with `observed` ports takes
+            these in place of both.
         reference: R(t).
         limits: The limits of the drives.
 
@@ -50,8 +51,11 @@ def add_observer(
         raise WiringError(
             "an observer needs the measured force; make the law with measured_force=True"
         )
-    rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
-    lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
+    late = 0.0 if sampling is None else sampling.delay + step
+    lag, delay = control_lag(plant, sampling), late + period / 2.0
+    if controller.observed is not None:
+        state, control = (controller.GetOutputPort(name) for name in controller.observed)
+        lag = 0.5  # What is measured at both ends of a sample: their mean.
     observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag, delay))
     builder.Connect(state, observer.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
@@ -63,3 +67,16 @@ def add_observer(
     if limits is not None:
         builder.Connect(limits.GetOutputPort("is_limited"), observer.GetInputPort("hold"))
     return observer
+
+
+def control_lag(plant: Plant, sampling: Sampling | None) -> float:
+    """The fraction of a sample for which a plant uses the previous control.
+
+    Args:
+        plant: The plant.
+        sampling: The sampling of the hold after the controller.
+    """
+    step = plant.time_step
+    period = step if sampling is None else sampling.period
+    rest = 0.0 if sampling is None else sampling.rest
+    return min((rest + step) / period, 1.0) if period else 0.0

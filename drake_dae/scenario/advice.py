@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from drake_dae.dae.beyond.contact_gains import contact_gains
+from drake_dae.dae.beyond.spring_loop import SpringLoop, contact_gains_behind, spring_loop
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
 
@@ -41,7 +43,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         ScenarioError: There are no default gains with a task, or with stages of actuation.
     """
     material = scenario.plant.material
-    if material is None or not scenario.is_advised:
+    is_left_out = scenario.is_advised
+    if scenario.is_cascade:
+        scenario = _with_loop(scenario)
+        model, structure = law_robot(scenario, model, structure)
+    if material is None or not is_left_out:
         return Completed(scenario)
     if scenario.task is not None:
         raise ScenarioError(
@@ -51,9 +57,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         raise ScenarioError(
             (
                 "gains",
-                "for Drake's own contact with springs, motors or valves no gains are "
-                "recommended; give them, with integral and observer, as in the scenario "
-                "wall_flexible_contact",
+                "for Drake's own contact with motors or valves, or with the tracking law and springs, "
+                "no gains are recommended; give them, with integral and observer, as in the scenario "
+                "wall_flexible_contact, or take the law !SpringCascade for springs",
             )
         )
     sampling = scenario.sampling
@@ -72,7 +78,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     noise = _NOISE
     if scenario.encoders is not None:
         noise = float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
-    found = contact_gains(stiffness, mobility, period, late, noise)
+    if isinstance(scenario.law, parts.SpringCascade):
+        loop = scenario.law.loop()
+        found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
+    else:
+        found = contact_gains(stiffness, mobility, period, late, noise)
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = _moved(model)
@@ -116,9 +126,32 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"at {_rounded(found.position_rate):g} 1/s, and of forces one at "
         f"{-_rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {_rounded(found.constraint_damping):g} 1/s, an observer of "
-        f"{observer.rate:g} 1/s that identifies the friction of: {known}"
+        f"{observer.rate:g} 1/s that identifies the friction of: {known}{_loop_note(scenario)}"
     )
     return Completed(chosen, (note,))
+
+
+def _loop_note(scenario: Scenario) -> str:
+    """The numbers of a cascade in words; empty without one."""
+    law = scenario.law
+    if not isinstance(law, parts.SpringCascade):
+        return ""
+    return f"; a cascade with a loop of {law.rate:g} rad/s around the springs"
+
+
+def _with_loop(scenario: Scenario) -> Scenario:
+    """The scenario with all numbers of the loop around its springs."""
+    law, sampling = scenario.law, scenario.sampling
+    if not isinstance(law, parts.SpringCascade):
+        law = parts.SpringCascade()
+    if sampling is None:
+        return replace(scenario, law=law.filled(SpringLoop(1.0)))  # law_robot refuses it.
+    found = spring_loop(sampling.period, sampling.late_samples, law.damping)
+    numbers = (_rounded(each) for each in (found.rate, found.current_rate))
+    rate, current_rate = numbers
+    return replace(
+        scenario, law=law.filled(SpringLoop(rate, law.damping, rate, current_rate))
+    )
 
 
 def _rounded(value: float) -> float:

@@ -58,7 +58,10 @@ class Controller(System):
     7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
        from a generator, and a run starts at their start. A run starts on the manifold of
        `start_structure`.
-    8. Phases. `changes` are the times at which phases of a run began, with reasons; empty without
+    8. Observers. A controller whose law has another state and control than the plant names its
+       output ports with these in `observed`, and has the input port `acting_control` for what acts
+       on the plant. None if they are those of the plant.
+    9. Phases. `changes` are the times at which phases of a run began, with reasons; empty without
        phases.
     """
 
@@ -71,6 +74,11 @@ class Controller(System):
     takes_over: bool = False
     exogenous_layout: Layout = Layout(())
     exogenous_places: list[int] = NOWHERE
+
+    @property
+    def observed(self) -> tuple[str, str] | None:
+        """The output ports with state and control of the law; None if they are the plant's."""
+        return None
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:

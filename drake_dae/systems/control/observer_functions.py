@@ -128,7 +128,9 @@ class ObserverFunctions:
         # Friction takes its share of it.
         gain = -np.expm1(-observing.friction_rate * self._period)
         is_sure = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
-        found = mu + is_sure * gain * shares(frictional, metric, chain[:, -1])
+        velocity = x[list(observation.rows)]
+        share = shares(frictional, planes, velocity, metric, chain[:, -1])
+        found = mu + is_sure * gain * share
         found = ca.fmin(ca.fmax(found, 0.0), observing.largest_friction)
         change = ca.if_else(hold != 0, 0, found - mu)
         chain -= ca.repmat(ca.mtimes(frictional, change), 1, chain.shape[1])
