@@ -149,9 +149,7 @@ def _with_loop(scenario: Scenario) -> Scenario:
     found = spring_loop(sampling.period, sampling.late_samples, law.damping)
     numbers = (_rounded(each) for each in (found.rate, found.current_rate))
     rate, current_rate = numbers
-    return replace(
-        scenario, law=law.filled(SpringLoop(rate, law.damping, rate, current_rate))
-    )
+    return replace(scenario, law=law.filled(SpringLoop(rate, law.damping, rate, current_rate)))
 
 
 def _rounded(value: float) -> float:

@@ -36,7 +36,9 @@ def law_robot(
         }
         for key, is_given in refused.items():
             if is_given:
-                raise ModelError(f"a cascade does not know `{key}`: leave it out, or take !Tracking")
+                raise ModelError(
+                    f"a cascade does not know `{key}`: leave it out, or take !Tracking"
+                )
         if scenario.sampling is None:
             raise ModelError(
                 "a cascade is sampled; give the scenario a sampling, for example "

@@ -91,7 +91,9 @@ class SpringCascade(Diagram, Controller):
         # The links' state goes to the rigid law, and its torque to the loop.
         builder.ExportInput(view.GetInputPort("estimated_state"), "estimated_state")
         builder.ConnectInput("estimated_state", inner.GetInputPort("estimated_state"))
-        builder.Connect(view.GetOutputPort("link_state"), controller.GetInputPort("estimated_state"))
+        builder.Connect(
+            view.GetOutputPort("link_state"), controller.GetInputPort("estimated_state")
+        )
         builder.Connect(controller.GetOutputPort("control"), inner.GetInputPort("wanted_torque"))
         for name in ("reference", "measured_force", "exogenous", "hold"):
             if controller.HasInputPort(name):

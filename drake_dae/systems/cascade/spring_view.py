@@ -39,9 +39,7 @@ class SpringView(ParameterizedSystem):
         dae = model.dae
         if model.joint_force is None:
             raise ModelError(f"{model.name} has rigid joints, and so no springs with a torque")
-        super().__init__(
-            dae, dae.parameter_values, {"state": dae.state_signals}, sees_steps=False
-        )
+        super().__init__(dae, dae.parameter_values, {"state": dae.state_signals}, sees_steps=False)
         self.set_name("spring_view")
         size = model.links.q.numel() + model.links.v.numel()
         self._functions = {

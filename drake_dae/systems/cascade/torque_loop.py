@@ -20,6 +20,9 @@ from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
+_EXCESS = 0.01
+"""The largest torque, in effort limits, by which the motors go ahead of a measured acceleration."""
+
 
 @checked(ModelError)
 class TorqueLoop(ParameterizedSystem):
@@ -92,9 +95,9 @@ class TorqueLoop(ParameterizedSystem):
         self._drive, self._lag, self._model = drive, control_lag, model
         p = dae.num_controls
         numbers = ca.vertcat(system.parameter_symbol, *(one.symbol for one in own))
-        self._memory = [ca.SX.sym("held", p) for _ in range(6)]
+        self._memory = [ca.SX.sym("held", p) for _ in range(7)]
         self._seen = ca.SX.sym("seen", 1)
-        self._function = self._trace(law.structure, spring, numbers)
+        self._sampled, self._function = self._trace(law.structure, spring, numbers)
         self.disturbance_signals = tuple(
             Signal(f"disturbance of {signal.name}", signal.unit)
             for signal in model.links.actuator_signals
@@ -102,67 +105,93 @@ class TorqueLoop(ParameterizedSystem):
         sizes = {"estimated_state": dae.num_states, "wanted_torque": p, "control": p}
         self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
         self._declare_exogenous(law.exogenous_degrees)
-        self._held = self.DeclareDiscreteState(np.zeros(6 * p + 1))
+        self._held = self.DeclareDiscreteState(np.zeros(7 * p + 1))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        self.DeclareVectorOutputPort("control", p, weakly(self._calc_control))
-        sources = {self.discrete_state_ticket(self._held)}
-        self.DeclareVectorOutputPort("motor_disturbance", p, weakly(self._calc_shown), sources)
+        # What acts on the plant enters the control one sample later.
+        held = {self.discrete_state_ticket(self._held)}
+        read = [self.GetInputPort(name) for name in self._ports if name != "control"]
+        read += [] if self._exogenous is None else [self._exogenous]
+        sources = held | {self.input_port_ticket(port.get_index()) for port in read}
+        sources.add(self.all_parameters_ticket())
+        self.DeclareVectorOutputPort("control", p, weakly(self._calc_control), sources)
+        self.DeclareVectorOutputPort("motor_disturbance", p, weakly(self._calc_shown), held)
 
-    def _trace(self, structure: Structure, spring: Spring, numbers: ca.SX) -> TracedFunction:
-        """The control, and what is held after a sample."""
+    def _trace(
+        self, structure: Structure, spring: Spring, numbers: ca.SX
+    ) -> tuple[TracedFunction, TracedFunction]:
+        """What is held after a sample, and the control."""
         model, loop, period = self._model, self.loop, self.sample_period
         state, p = model.dae.state, model.dae.num_controls
         wanted, acting = ca.SX.sym("wanted_torque", p), ca.SX.sym("control", p)
         seen = self._seen
-        disturbance, last_wanted, slope, momentum, torque, last = self._memory
+        disturbance, last_wanted, slope, momentum, torque, last, slow = self._memory
         position, velocity, shaft = self._velocities()
         tau = model.joint_force
 
-        # The slope of the wanted torque, and the motors' disturbance, from differences.
+        # The slope of the wanted torque, the motors' disturbance, the links' acceleration.
         def follow(old: ca.SX, new: ca.SX, rate: float) -> ca.SX:
             return old + seen * -np.expm1(-rate * period) * (new - old)
 
-        limits = ca.DM(loop.slope * np.array(model.links.effort_limits))
-        rise = (wanted - last_wanted) / period
-        slope = follow(slope, ca.fmax(-limits, ca.fmin(limits, rise)), 2.0 * loop.rate)
+        efforts = np.array(model.links.effort_limits)
+        rise = _within((wanted - last_wanted) / period, ca.DM(loop.slope * efforts))
+        slope = follow(slope, rise, 2.0 * loop.rate)
         own = ca.mtimes(spring.inertia, shaft)
         if self._drive is None:
             now, acted = acting, self._lag * last + (1.0 - self._lag) * acting
         else:
             now = self._drive.force(position, shaft)
             acted = (last + now) / 2.0
-        found = acted - (torque + tau) / 2.0 - (own - momentum) / period
-        disturbance = follow(disturbance, -found, loop.motor_rate)
+        lost = acted - (torque + tau) / 2.0 - (own - momentum) / period
+        slower = ca.if_else(
+            seen, slow + -np.expm1(-2.0 * loop.rate * period) * (velocity - slow), velocity
+        )
+        after = ca.vertcat(
+            follow(disturbance, -lost, loop.motor_rate), wanted, slope, own, tau, now, slower, 1.0
+        )
 
-        # The law.
+        # The acceleration by the model, near the measured one.
         elimination, rows = structure.elimination, self._rows()
         rate = elimination.f_star + ca.mtimes(elimination.h_star, wanted)  # On N*.
         B = ca.SX(ca.sparsify(ca.DM(model.links.actuation_matrix)))
-        ahead = ca.mtimes(B.T, rate[rows, :])
+        springs = PositiveDefiniteFactorization(spring.stiffness)
+        measured = 2.0 * loop.rate * (velocity - slower)
+        excess = ca.mtimes(spring.stiffness, ca.mtimes(B.T, rate[rows, :]) - measured)
+        excess = _within(excess / loop.rate**2, ca.DM(_EXCESS * efforts))
+        ahead = measured + loop.rate**2 * springs.solve(excess)
+
+        # The law.
         w, zeta = loop.rate, loop.damping
-        v = w**2 * (wanted - tau)
-        v += 2.0 * zeta * w * (slope - ca.mtimes(spring.stiffness, shaft - velocity))
-        added = ahead + PositiveDefiniteFactorization(spring.stiffness).solve(v)
-        control = tau + ca.mtimes(spring.inertia, added) - disturbance
+        moves = ca.mtimes(spring.stiffness, shaft - velocity)
+        v = w**2 * (wanted - tau) + 2.0 * zeta * w * (slope - moves)
+        control = tau + ca.mtimes(spring.inertia, ahead + springs.solve(v)) - disturbance
         if self._drive is not None:
             assert self._drive.drive_for is not None
-            control = self._drive.drive_for(control, shaft, ca.SX(loop.current_rate))
-        held = ca.vertcat(disturbance, wanted, slope, own, tau, now, 1.0)
-        return TracedFunction(
-            f"{model.dae.name} torque loop",
-            {
-                "state": state,
-                "wanted_torque": wanted,
-                "control": acting,
-                "held": ca.vertcat(*self._memory, seen),
-                "parameters": numbers,
-            },
-            {"control": control, "held": held},
+            inner = PositiveDefiniteFactorization(spring.inertia).solve(now + disturbance - tau)
+            bends = ca.mtimes(spring.stiffness, inner - ahead)  # tau''.
+            change = w**2 * (slope - moves) - 2.0 * zeta * w * bends  # v'.
+            rises = moves + ca.mtimes(spring.inertia, springs.solve(change))
+            wished = control + rises / loop.current_rate
+            control = self._drive.drive_for(wished, shaft, ca.SX(loop.current_rate))
+        held = ca.vertcat(*self._memory, seen)
+        name, compiled = model.dae.name, model.dae.compiled
+        inputs = {"state": state, "wanted_torque": wanted}
+        rest = {"held": held, "parameters": numbers}
+        sample = TracedFunction(
+            f"{name} sample of the torque loop",
+            {**inputs, "control": acting, **rest},
+            {"held": after},
+            compiled=compiled,
+        )
+        function = TracedFunction(
+            f"{name} torque loop",
+            {**inputs, **rest},
+            {"control": control},
             elimination.pivot,
             "A(x) of Assumption (2)",
-            compiled=model.dae.compiled,
+            compiled=compiled,
         )
+        return sample, function
 
     def _rows(self) -> list[int]:
         links = self._model.links
@@ -176,17 +205,19 @@ class TorqueLoop(ParameterizedSystem):
         B = ca.SX(ca.sparsify(ca.DM(self._model.links.actuation_matrix)))
         return shaft[0], ca.mtimes(B.T, self._model.links.v), shaft[1]
 
-    def _run(self, context: Context) -> tuple[FloatArray, ...]:
-        x, wanted, acting = (port.Eval(context) for port in self._ports.values())
+    def _given(self, context: Context, *names: str) -> list[FloatArray]:
         held = context.get_discrete_state(self._held).value()
-        return self._checked(self._function, context, x, wanted, acting, held)
+        return [*(self._ports[name].Eval(context) for name in names), held]
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        state.get_mutable_discrete_state().set_value(self._held, self._run(context)[1])
+        given = self._given(context, "estimated_state", "wanted_torque", "control")
+        found = self._checked(self._sampled, context, *given)[0]
+        state.get_mutable_discrete_state().set_value(self._held, found)
         return EventStatus.Succeeded()
 
     def _calc_control(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._run(context)[0])
+        given = self._given(context, "estimated_state", "wanted_torque")
+        output.SetFromVector(self._checked(self._function, context, *given)[0])
 
     def _calc_shown(self, context: Context, output: BasicVector) -> None:
         held = context.get_discrete_state(self._held).value()
@@ -199,14 +230,14 @@ class TorqueLoop(ParameterizedSystem):
         )
 
     def traced(self) -> Block:
-        sources = ("estimated_state", "wanted_torque", "control", HELD, PARAMETERS)
+        read, last = ("estimated_state", "wanted_torque"), (HELD, PARAMETERS)
         held = ca.vertcat(*self._memory, self._seen)
         shown = ca.Function("shown", [held], [self._memory[0]])
-        update = Computation.of(self._function, sources, ("", HELD))
+        update = Computation.of(self._sampled, (*read, "control", *last), (HELD,))
         return Block(
             self,
             (
-                Computation.of(self._function, sources, ("control", "")),
+                Computation.of(self._function, (*read, *last), ("control",)),
                 Computation(shown, (HELD,), ("motor_disturbance",)),
             ),
             (Update(update, self.sample_period, is_unrestricted=True),),
@@ -214,6 +245,11 @@ class TorqueLoop(ParameterizedSystem):
             signals=self._signals,
             ports={"motor_disturbance": self.disturbance_signals},
         )
+
+
+def _within(value: ca.SX, limits: ca.DM) -> ca.SX:
+    """A column within limits, shape (p, 1)."""
+    return ca.fmax(-limits, ca.fmin(limits, value))
 
 
 def stages_of(model: RobotModel) -> tuple[Spring, AttachedStage | None]:
