@@ -162,7 +162,7 @@ def _cascade(
     """The controller of a cascade."""
     assert sampling is not None  # law_robot.
     lag = control_lag(plant, hold_before(plant, sampling))
-    return SpringCascade(law, model, loop, sampling.period, lag)
+    return SpringCascade(law, model, loop, sampling.period, lag, sampling.delay)
 
 
 def make_plant(

@@ -1,24 +1,29 @@
 """A law of low degree for robots with springs in their joints: a cascade of two laws."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.spring_bound import spring_error_bound
 from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.cascade.spring_view import SpringView
-from drake_dae.systems.cascade.torque_loop import TorqueLoop
+from drake_dae.systems.cascade.torque_loop import TorqueLoop, stages_of
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.plants.contract import Plant
+
+_SAMPLES = 501
+"""The number of times along a reference at which its torques are examined."""
 
 
 @checked(ModelError)
@@ -28,9 +33,11 @@ class SpringCascade(Diagram, Controller):
     The law (28) of the links alone, `link_side(model)`, gives the torque tau_d that they need; a
     `TorqueLoop` makes the springs have it. So no derivative of the model is taken beyond those of
     the rigid law, where the law (28) of the whole robot takes four: it needs smooth friction, an
-    exact model and little noise. In exchange the errors no longer follow (30) exactly. A
-    `DisturbanceObserver` of the rigid law takes the torque of the springs as its control, so that
-    it sees disturbances of the links without the loop in between.
+    exact model and little noise. In exchange the errors no longer follow (30) exactly: by singular
+    perturbation the springs add errors of the order of the squared ratio of the rates of motion and
+    loop, of which `spring_error_bound` is a bound. A `DisturbanceObserver` of the rigid law takes
+    the torque of the springs as its control, so that it sees disturbances of the links without the
+    loop in between.
 
     Input ports:
         estimated_state: x = (q, v, s) of the whole robot, shape (n,).
@@ -50,9 +57,10 @@ class SpringCascade(Diagram, Controller):
         loop: The rates of the loop.
         sample_period: T in s, positive; also of integrals.
         control_lag: As of the `TorqueLoop`.
+        delay: The delay of the control in s, for `error_bound`.
 
     Attributes:
-        law, model: The arguments.
+        law, model, delay: The arguments.
         view, controller, torque_loop: The blocks in it.
 
     Raises:
@@ -69,9 +77,11 @@ class SpringCascade(Diagram, Controller):
         loop: SpringLoop,
         sample_period: float,
         control_lag: float = 0.0,
+        delay: float = 0.0,
     ) -> None:
         super().__init__()
         self.law, self.model, self.sample_period = law, model, sample_period
+        self.delay = delay
         size = model.links.q.numel() + model.links.v.numel()
         if law.system.num_states != size or law.system.num_controls != model.dae.num_controls:
             raise ModelError(
@@ -158,3 +168,36 @@ class SpringCascade(Diagram, Controller):
         """That of the rigid law, as if the springs had the wanted torque."""
         states = np.asarray(values["state"])[:, : self.law.system.num_states]
         return self.controller.predicted_error(times, {**values, "state": states}, parameters)
+
+    def error_bound(
+        self, reference: Callable[[float], FloatArray], times: FloatArray, state: FloatArray
+    ) -> FloatArray | None:
+        """The `spring_error_bound` along the reference; None where no motion leads along it."""
+        law, links = self.law, self.law.system.num_states
+        if times.size < 2 or not times[-1] > times[0]:
+            return None
+        grid = np.linspace(times[0], times[-1], _SAMPLES)
+        motion = ZeroDynamics(law.system, structure=law.structure).motion(
+            reference, grid, np.asarray(state)[:links]
+        )
+        if motion.ending is not None:
+            return None
+        spring = stages_of(self.model)[0]
+        function = self.model.dae.trace(
+            "springs", {"K": spring.stiffness, "B": spring.inertia}, often=False
+        )
+        p = self.model.dae.num_controls
+        dae = self.model.dae
+        matrices = function(dae.nominal_state, dae.parameter_values)
+        stiffness, inertia = (np.array(each).reshape(p, p) for each in matrices)
+        return spring_error_bound(
+            law,
+            grid,
+            motion.states,
+            motion.controls,
+            stiffness,
+            inertia,
+            self.torque_loop.loop,
+            self.sample_period,
+            self.delay,
+        )
