@@ -1,6 +1,6 @@
 """The links of a robot by themselves: what stands before the springs of its joints."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -11,11 +11,6 @@ from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.links.kinematics import Reaction
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
-
-if TYPE_CHECKING:
-    _Links = Links
-else:
-    _Links = object
 
 
 def link_side(model: RobotModel) -> RobotModel:
@@ -36,7 +31,7 @@ def link_side(model: RobotModel) -> RobotModel:
         raise ModelError(
             f"{model.name} has no springs in its joints, so that its links are not moved by springs"
         )
-    links = _WithoutRotors(model.links)
+    links = cast(Links, _WithoutRotors(model.links))
     own = model.constraints[: len(model.constraints) - len(plant_constraints(model.links))]
     known = [parameter.name for parameter in model.dae.parameters if parameter.exogenous]
     found = RobotModel(
@@ -55,7 +50,7 @@ def link_side(model: RobotModel) -> RobotModel:
     return found
 
 
-class _WithoutRotors(_Links):
+class _WithoutRotors:
     """Links whose M is without the inertia of rotors; all else is that of the given links."""
 
     def __init__(self, links: Links) -> None:
@@ -68,13 +63,16 @@ class _WithoutRotors(_Links):
 
     @property
     def mass_matrix(self) -> ca.SX:
+        """M(q) without rotors, shape (nv, nv)."""
         return self._links.mass_matrix - ca.SX(ca.sparsify(ca.DM(self._rotors)))
 
     @property
     def reflected_inertia(self) -> FloatArray:
+        """Zeros, shape (nu,)."""
         return np.zeros_like(self._links.reflected_inertia)
 
     def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
+        """M(q) v' + H(q, v) - tau of (37) with that M, shape (nv, 1)."""
         found = self._links.inverse_dynamics(kinematics, reaction)
         rotors = ca.SX(ca.sparsify(ca.DM(self._rotors)))
         return found - ca.mtimes(rotors, kinematics.acceleration)

@@ -57,9 +57,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         raise ScenarioError(
             (
                 "gains",
-                "for Drake's own contact with motors or valves, or with the tracking law and springs, "
-                "no gains are recommended; give them, with integral and observer, as in the scenario "
-                "wall_flexible_contact, or take the law !SpringCascade for springs",
+                "for Drake's own contact no gains are recommended with motors or valves, or with the "
+                "tracking law and springs; give them, with integral and observer, as in the scenario "
+                "wall_flexible_contact, or for springs leave `law` out",
             )
         )
     sampling = scenario.sampling
@@ -75,11 +75,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_at(_FORCE)
-    noise = _NOISE
-    if scenario.encoders is not None:
-        noise = float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
-    if isinstance(scenario.law, parts.SpringCascade):
-        loop = scenario.law.loop()
+    noise = velocity_noise(scenario, period)
+    loop = None if scenario.law is None else scenario.law.loop()
+    if loop is not None:
         found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
     else:
         found = contact_gains(stiffness, mobility, period, late, noise)
@@ -131,12 +129,24 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     return Completed(chosen, (note,))
 
 
+def velocity_noise(scenario: Scenario, period: float) -> float:
+    """The standard deviation of measured velocities, in rad/s.
+
+    Args:
+        scenario: The scenario.
+        period: The time between samples, in s.
+    """
+    if scenario.encoders is None:
+        return _NOISE
+    return float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
+
+
 def _loop_note(scenario: Scenario) -> str:
     """The numbers of a cascade in words; empty without one."""
-    law = scenario.law
-    if not isinstance(law, parts.SpringCascade):
+    loop = None if scenario.law is None else scenario.law.loop()
+    if loop is None:
         return ""
-    return f"; a cascade with a loop of {law.rate:g} rad/s around the springs"
+    return f"; a cascade with a loop of {loop.rate:g} rad/s around the springs"
 
 
 def _with_loop(scenario: Scenario) -> Scenario:

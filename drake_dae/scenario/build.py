@@ -141,9 +141,10 @@ def build_loop(
             return wire_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
-    if scenario.law is not None and scenario.law.is_cascade:
+    loop = None if scenario.law is None else scenario.law.loop()
+    if loop is not None:
         with at("law"):
-            cascade = _cascade(scenario.law.loop(), law, model, plant, sampling)
+            cascade = _cascade(loop, law, model, plant, sampling)
             generator = ReferenceGenerator(references, law.degrees)
             return wire_loop(
                 plant, cascade, generator, settings, scene_graph=scene_graph, meshcat=meshcat

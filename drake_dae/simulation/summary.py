@@ -20,9 +20,7 @@ from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
 _PROJECTED = "before each step's projection"
 
-_ADDED = (
-    "springs add: at most, after transients, with an exact model (singular perturbation)"
-)
+_ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
 
 _WIDTH = 100
 """The width of a paragraph, in characters."""
@@ -98,7 +96,11 @@ def summary(
             it adds nothing.
     """
     limits = limits or Limits()
-    sections = [_errors(record, predicted, bound), _forces(record, limits), _controls(record, limits)]
+    sections = [
+        _errors(record, predicted, bound),
+        _forces(record, limits),
+        _controls(record, limits),
+    ]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     # Of compliant contact the state is not projected.
     kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED

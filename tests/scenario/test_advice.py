@@ -101,8 +101,9 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
     assert found.observer is None
 
 
-def test_nothing_is_advised_behind_springs():
-    found = two_link("actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]")
+def test_nothing_is_advised_for_the_tracking_law_behind_springs():
+    springs = "actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]"
+    found = two_link(springs, "law=!Tracking {}")
     with pytest.raises(ScenarioError, match=r"gains: .* springs") as told:
         build_completed(found)
     assert "wall_flexible_contact" in str(told.value)

@@ -198,6 +198,8 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
         # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
         power = ca.fmin(ca.mtimes(velocity.T, force), -_TINY)
         across = plane - ca.mtimes(force, ca.mtimes(velocity.T, plane)) / power
+        sizes = [ca.mmax(ca.sum1(each * ca.mtimes(metric, each))) for each in (across, plane)]
+        across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
         matched = ca.mtimes(metric, beside(across, metric, force))
         square = ca.fmax(ca.dot(matched, force), _TINY)
         found.append(ca.dot(matched, d) / square)

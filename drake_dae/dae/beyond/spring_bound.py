@@ -246,9 +246,7 @@ def stable_scales(
     """
     arguments = loop, period, delay
     is_stable = [
-        all(
-            spring_loop_radius(stiffness, inertia, L, *arguments, scale) < 1.0 for L in mobilities
-        )
+        all(spring_loop_radius(stiffness, inertia, L, *arguments, scale) < 1.0 for L in mobilities)
         for scale in SCALES
     ]
     low = high = SCALES.index(1.0)

@@ -67,18 +67,22 @@ class MeasuredForce:
 
 @dataclass(frozen=True)
 class Tracking:
-    """The tracking law (28) of the whole robot: errors by its gains alone, four derivatives of the
-    model behind springs."""
+    """The tracking law (28) of the whole robot: four derivatives of the model behind springs."""
 
     is_cascade: ClassVar = False
+
+    def loop(self) -> SpringLoop | None:
+        """None: there is no loop around springs."""
+        return None
 
 
 @dataclass(frozen=True)
 class SpringCascade:
-    """The tracking law of the links alone, and a loop around the springs of the joints: a
-    `systems.cascade.SpringCascade`. It needs `sampling`, and FlexibleJoints in `actuation`, with
-    DcMotors or nothing behind them. `gains`, `integral` and `observer` are those of the rigid law;
-    where `gains` are left out in compliant contact, all are recommended.
+    """The tracking law of the links alone, and a loop around the springs of the joints.
+
+    It is a `systems.cascade.SpringCascade`, and needs `sampling`, and FlexibleJoints in
+    `actuation` with DcMotors or nothing behind them. `gains`, `integral` and `observer` are those
+    of the rigid law; where `gains` are left out in compliant contact, all are recommended.
 
     Attributes:
         rate: The rate of the loop in rad/s, the same for all joints; recommended if left out.
@@ -107,10 +111,10 @@ class SpringCascade:
         current_rate = numbers.current_rate if self.current_rate is None else self.current_rate
         return SpringCascade(rate, self.damping, motor_rate, current_rate)
 
-    def loop(self) -> SpringLoop:
-        """The numbers of the loop, where none is left out."""
-        assert self.rate is not None and self.motor_rate is not None
-        assert self.current_rate is not None  # filled.
+    def loop(self) -> SpringLoop | None:
+        """The numbers of the loop; None if one is left out."""
+        if self.rate is None or self.motor_rate is None or self.current_rate is None:
+            return None
         return SpringLoop(self.rate, self.damping, self.motor_rate, self.current_rate)
 
 
