@@ -57,9 +57,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         raise ScenarioError(
             (
                 "gains",
-                "for Drake's own contact no gains are recommended with motors or valves, or with the "
-                "tracking law and springs; give them, with integral and observer, as in the scenario "
-                "wall_flexible_contact, or for springs leave `law` out",
+                "for Drake's own contact no gains are recommended with motors or valves, or with "
+                "the tracking law and springs; give them, with integral and observer, as in the "
+                "scenario wall_flexible_contact, or for springs leave `law` out",
             )
         )
     sampling = scenario.sampling

@@ -150,11 +150,12 @@ class SpringCascade(Diagram, Controller):
 
     def check_plant(self, plant: Plant) -> None:
         dae, own = plant.dae, self.model.dae
-        if (dae.num_states, dae.num_controls) != (own.num_states, own.num_controls):
+        sizes = [(each.num_states, each.num_controls) for each in (own, dae)]
+        if sizes[0] != sizes[1]:
+            needs, has = ("{} states, {} controls".format(*size) for size in sizes)
             raise WiringError(
-                f"the cascade is for '{own.name}' with {own.num_states} states and "
-                f"{own.num_controls} controls, the plant '{dae.name}' has {dae.num_states} and "
-                f"{dae.num_controls}. Make it with the plant's model"
+                f"the cascade is for '{own.name}' with {needs}, the plant '{dae.name}' has {has}. "
+                "Make it with the plant's model"
             )
 
     def derived(

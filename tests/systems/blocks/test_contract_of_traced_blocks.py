@@ -21,9 +21,13 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     SinusoidReference,
+    SpringLoop,
+    SpringView,
+    TorqueLoop,
     TrackingController,
     TrackingLaw,
     UnilateralRobotPlant,
+    link_side,
     poles,
     with_disturbance,
 )
@@ -82,6 +86,14 @@ def observer_behind_springs():
     return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
 
 
+def torque_loop(kind):
+    model = actuated("two_link", kind).model
+    links = link_side(model).dae
+    dae = with_disturbance(links, [signal.name for signal in links.state_signals[2:]])
+    loop = SpringLoop(60.0, motor_rate=40.0, current_rate=200.0)
+    return TorqueLoop(model, TrackingLaw(dae, poles(-4.0)), loop, 0.01, 0.5)
+
+
 BLOCKS = {
     "RobotPlant": lambda: robot(None),
     "RobotPlant with springs": lambda: robot("flexible"),
@@ -121,6 +133,9 @@ BLOCKS = {
     ),
     "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
     "DisturbanceObserver behind springs": observer_behind_springs,
+    "SpringView": lambda: SpringView(actuated("two_link", "flexible").model),
+    "TorqueLoop": lambda: torque_loop("flexible"),
+    "TorqueLoop before motors": lambda: torque_loop("flexible motor"),
     "UnilateralRobotPlant": lambda: opening(None),
     "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
