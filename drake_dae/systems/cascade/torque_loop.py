@@ -21,7 +21,7 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 _EXCESS = 0.01
-"""The largest torque, in effort limits, by which the motors go ahead of a measured acceleration."""
+"""The largest torque in effort limits by which the motors go ahead of a measured acceleration."""
 
 
 @checked(ModelError)
@@ -34,9 +34,8 @@ class TorqueLoop(ParameterizedSystem):
         v = w^2 (tau_d - tau) + 2 zeta w (tau_d' - K (q_2' - q')),
 
     where a_d is the acceleration of the links that the rigid model has under tau_d, f_o an estimate
-    of f, the friction of the motors and other disturbances, and tau_d' a filtered difference of
-    samples, limited to `slope`. Only the first derivative of a torque is taken, and none of the
-    model. Then e = tau - tau_d obeys, without sampling and with q'' - a_d = M^-1 P e + d, where P
+    of f, the friction of the motors and other disturbances, and tau_d' the difference of samples,
+    limited to `slope` and filtered at 2 w. So no derivative of the model is taken. Then e = tau - tau_d obeys, without sampling and with q'' - a_d = M^-1 P e + d, where P
     is 1 less the reaction of the constraints and d an error of the rigid model,
 
         e'' + 2 zeta w e' + (w^2 + K M^-1 P) e = -tau_d'' - K d + K B^-1 (f_o - f).
@@ -44,12 +43,17 @@ class TorqueLoop(ParameterizedSystem):
     The motors' inertia is shaped to K / w^2 (the gain of the torque is w^2 B / K, one for each
     joint, so that stiff and soft springs have one rate).
 
+    Where friction holds the tool the law wants accelerations that the links do not have: e would
+    grow to K / w^2 a_d, and throw the tool off the surface when it breaks away. So a_d stays within
+    0.01 effort limits, as a torque K / w^2 a, of the measured acceleration, 2 w (v - its lag).
+
     The disturbance f is observed on the side of the motors, by their momentum B q_2':
 
         f_o' = k_m (f_k - f_o),    f_k = mean(tau_m - tau) - B (q_2',k - q_2',k-1) / T.
 
-    Behind `DcMotors` tau_m is the torque of the currents, and the voltage makes them follow at the
-    rate k_i.
+    Behind `DcMotors` tau_m is the torque of the currents, and the voltage makes them follow tau_m +
+    tau_m' / k_i at the rate k_i, where tau_m' follows from tau'' = K (B^-1 (tau_m - tau - f_o) -
+    a_d): so the lag of the currents is compensated.
 
     Input ports:
         estimated_state: x = (q, v, s), shape (n,).
