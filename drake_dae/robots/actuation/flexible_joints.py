@@ -30,8 +30,8 @@ class FlexibleJoints(Stage):
     the model has an acceleration a that the tool does not have, with a'' + K_i4 a' + (K_i3 - kappa)
     a = 0, the gains of (32) and the eigenvalues kappa of P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for
     the Jacobian P of the held directions; so K_i3 = W^2 + 4 W w + w^2 must be above kappa. Model
-    springs that are too stiff for the sample time as rigid joints. A law that needs no derivatives of
-    the model is a `SpringCascade`.
+    springs that are too stiff for the sample time as rigid joints. A `SpringCascade` is a law that
+    needs no derivatives of the model.
 
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
     positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
