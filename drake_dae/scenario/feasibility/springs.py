@@ -14,7 +14,7 @@ from drake_dae.scenario.advice import velocity_noise
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.cascade.torque_loop import stages_of
 
-ROUGH = 0.02
+ROUGH = 0.05
 """The allowed change of a control from sample to sample by noise, in effort limits."""
 
 _USUAL = 30.0
