@@ -243,8 +243,12 @@ def _write(run: _CommandRun) -> bool:
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
         behind = _ways(loop, record, run.context)
+        bound = None
+        if loop.generator is not None:
+            reference, state = loop.generator.reference, record["state"][0]
+            bound = loop.controller.error_bound(reference, record.time, state)
         text = summary(
-            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
+            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind, bound
         )
         run.results = _as_data(run, judge(record, predicted, accuracy), reasons)
         run.results["shortfalls"] = [*shortfalls(record, limits), *map(str, behind)]
@@ -335,6 +339,7 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
+        "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]
 

@@ -39,7 +39,8 @@ def add_observer(
         observing: The rates of the observer.
         state: The measured state.
         sampling: The sampling of the hold after the controller.
-        control: The control at the plant.
+        control: The control at the plant. An observer of a controller with `observed` ports takes
+            these in place of both.
         reference: R(t).
         limits: The limits of the drives.
         encoders: What measures the state; None if it is exact.
@@ -63,17 +64,28 @@ def add_observer(
             "an observer needs the measured force: make the law with measured_force=True, or give "
             "the observer a state_rate and the loop encoders, by which the model's force serves"
         )
-    rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
-    lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
-    timing = period, lag, delay
+    late = 0.0 if sampling is None else sampling.delay + step
+    lag, delay = control_lag(plant, sampling), late + period / 2.0
+    seen = state
+    if controller.observed is not None:
+        seen, control = (controller.GetOutputPort(name) for name in controller.observed)
+        lag = 0.5  # What is measured at both ends of a sample: their mean.
     observer: Observer
-    if estimates:
+    if observing.state_rate is None:
+        observer = builder.AddSystem(
+            DisturbanceObserver(controller.law, observing, period, lag, delay)
+        )
+        builder.Connect(seen, observer.GetInputPort("estimated_state"))
+    elif controller.observed is not None:
+        raise WiringError(
+            f"a state_rate is for robots with rigid joints, and {controller.get_name()} has "
+            "springs; leave it out, and measure the velocities"
+        )
+    else:
+        timing = period, lag, delay
         observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
         builder.Connect(state, observer.GetInputPort("measured_state"))
         state = observer.GetOutputPort("estimated_state")
-    else:
-        observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, *timing))
-        builder.Connect(state, observer.GetInputPort("estimated_state"))
     builder.Connect(state, controller.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
     builder.Connect(reference, observer.GetInputPort("reference"))
@@ -84,6 +96,19 @@ def add_observer(
     if limits is not None:
         builder.Connect(limits.GetOutputPort("is_limited"), observer.GetInputPort("hold"))
     return observer
+
+
+def control_lag(plant: Plant, sampling: Sampling | None) -> float:
+    """The fraction of a sample for which a plant uses the previous control.
+
+    Args:
+        plant: The plant.
+        sampling: The sampling of the hold after the controller.
+    """
+    step = plant.time_step
+    period = step if sampling is None else sampling.period
+    rest = 0.0 if sampling is None else sampling.rest
+    return min((rest + step) / period, 1.0) if period else 0.0
 
 
 def _estimator(

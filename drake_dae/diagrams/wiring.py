@@ -161,6 +161,9 @@ def wire_loop(
         if goal is not None:
             builder.Connect(goal, controller.GetInputPort("reference"))
 
+    if controller.HasInputPort("acting_control"):
+        builder.Connect(control, controller.GetInputPort("acting_control"))
+
     # Exogenous signals go to the plant, and to the law as known there.
     own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
     moving = add_exogenous(builder, plant, plant.dae, own)

@@ -9,29 +9,34 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.observing import control_lag
 from drake_dae.diagrams.parts import hold_before
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.advice import advised
+from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
-from drake_dae.scenario.observed import observed_structure
+from drake_dae.scenario.observed import law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
+from drake_dae.systems.cascade.cascade import SpringCascade
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -96,7 +101,7 @@ def build_loop(
     # The law, and its exogenous signals.
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
-    law = _law(scenario, observed_structure(scenario, model, structure))
+    law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
     references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
@@ -136,12 +141,29 @@ def build_loop(
             return wire_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
+    loop = None if scenario.law is None else scenario.law.loop()
+    if loop is not None:
+        with at("law"):
+            cascade = _cascade(loop, law, model, plant, sampling)
+            generator = ReferenceGenerator(references, law.degrees)
+            return wire_loop(
+                plant, cascade, generator, settings, scene_graph=scene_graph, meshcat=meshcat
+            )
     keys = ["observer"] if scenario.observer is not None else []
     keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
     with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
         )
+
+
+def _cascade(
+    loop: SpringLoop, law: TrackingLaw, model: RobotModel, plant: Plant, sampling: Sampling | None
+) -> SpringCascade:
+    """The controller of a cascade."""
+    assert sampling is not None  # law_robot.
+    lag = control_lag(plant, hold_before(plant, sampling))
+    return SpringCascade(law, model, loop, sampling.period, lag, sampling.delay)
 
 
 def make_plant(

@@ -1,11 +1,52 @@
-"""The system of the law of a scenario with an observer."""
+"""The system of the law of a scenario: of its robot or of the links alone, observed or not."""
 
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.errors import ModelError
+from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.cascade.torque_loop import stages_of
+
+
+def law_robot(
+    scenario: Scenario, model: RobotModel, structure: Structure
+) -> tuple[RobotModel, Structure]:
+    """The robot that the law of a scenario is for, and the structure of its system.
+
+    Args:
+        scenario: The scenario.
+        model: Its robot.
+        structure: The structure of the robot's system.
+
+    Returns:
+        These, or for the law of a cascade the links alone.
+
+    Raises:
+        ScenarioError: The cascade does not fit the scenario; the message names the key.
+    """
+    if not scenario.is_cascade:
+        return model, structure
+    with at("law"):
+        refused = {
+            "task": scenario.task is not None,
+            "compliances": scenario.compliances is not None,
+            "control_weights": bool(scenario.control_weights),
+        }
+        for key, is_given in refused.items():
+            if is_given:
+                raise ModelError(
+                    f"a cascade does not know `{key}`: leave it out, or take !Tracking"
+                )
+        if scenario.sampling is None:
+            raise ModelError(
+                "a cascade is sampled; give the scenario a sampling, for example "
+                "sampling: {period: 0.001, delay: 0.001}"
+            )
+        stages_of(model)
+        links = link_side(model)
+        return links, find_structure(links.dae)
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:

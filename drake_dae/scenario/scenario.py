@@ -27,6 +27,7 @@ from drake_dae.scenario.parts.families import (
     Force,
     ForceOutput,
     Gains,
+    Law,
     Load,
     Observer,
     Output,
@@ -106,10 +107,13 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
+        law: The law: the tracking law (28) of the whole robot, or for springs in the joints a
+            cascade of low degree. If left out it is the tracking law, but for springs in Drake's
+            own contact without `gains` the cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints; with Drake's own contact they are computed by `contact_gains`, together
             with `integral`, `constraint_damping`, `observer` and measured force if these are left
-            out. The scenario as run has them all. This is not available with `actuation`.
+            out. The scenario as run has them all. With `actuation` this needs the cascade.
         integral: Names of outputs whose errors are integrated as well, with one more pole:
             positions, and forces if `force_feedback` is measured; none if left out while `gains`
             are given.
@@ -157,6 +161,7 @@ class Scenario:
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     bounds: dict[str, Interval] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
+    law: Law | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
@@ -187,6 +192,13 @@ class Scenario:
             object.__setattr__(self, "gains", parts.Poles(all=[-4.0]))
         if self.integral is None:
             object.__setattr__(self, "integral", [])
+
+    @property
+    def is_cascade(self) -> bool:
+        """Whether the law is a cascade for springs."""
+        if self.law is not None:
+            return self.law.is_cascade
+        return self.is_advised and any(stage.is_spring for stage in self.actuation)
 
     @property
     def is_advised(self) -> bool:

@@ -20,6 +20,8 @@ from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
 _PROJECTED = "before each step's projection"
 
+_ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
+
 _WIDTH = 100
 """The width of a paragraph, in characters."""
 
@@ -74,6 +76,7 @@ def summary(
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
     behind: Sequence[LinkBehind | Collision] = (),
+    bound: FloatArray | None = None,
 ) -> str:
     """The results of a run in plain text, compared with the prediction.
 
@@ -89,9 +92,15 @@ def summary(
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
         reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
         behind: Links that moved behind a surface, or collided.
+        bound: A bound of what the controller adds to the prediction by design, shape (p,); None if
+            it adds nothing.
     """
     limits = limits or Limits()
-    sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
+    sections = [
+        _errors(record, predicted, bound),
+        _forces(record, limits),
+        _controls(record, limits),
+    ]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     # Of compliant contact the state is not projected.
     kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
@@ -118,15 +127,18 @@ def summary(
     return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 
 
-def _errors(record: Record, predicted: FloatArray) -> list[str]:
+def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> list[str]:
     signals = record.signals["tracking_error"].signals
     if not signals:
         return []
     sizes = unit_sizes(record)
     columns = zip(signals, record["tracking_error"].T, predicted.T, strict=True)
+    added = [[] if bound is None else [f"{number:.2g}"] for number in _numbers(bound, len(signals))]
+    more = [] if bound is None else ["springs add"]
+    about = [] if bound is None else [_ADDED]
     return [
         *Table(
-            ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
+            ["tracking error", "unit", "start", "largest", "final", "off prediction by", *more],
             [
                 [
                     signal.name,
@@ -135,14 +147,20 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
                     _number(np.max(np.abs(error)), sizes[signal.unit], 3),
                     _number(error[-1], sizes[signal.unit], 3),
                     _number(np.max(np.abs(error - theory)), sizes[signal.unit], 2),
+                    *own,
                 ]
-                for signal, error, theory in columns
+                for (signal, error, theory), own in zip(columns, added, strict=True)
             ],
             left=2,
         ).lines(),
         "off prediction by: the largest deviation from the predicted error, which decays",
         "from its initial value by the gains alone",
+        *about,
     ]
+
+
+def _numbers(bound: FloatArray | None, count: int) -> list[float]:
+    return [0.0] * count if bound is None else bound.tolist()
 
 
 def _forces(record: Record, limits: Limits) -> list[str]:

@@ -177,19 +177,33 @@ class Observation:
         return cls(function, friction, directions, wanted, moving, tuple(rows), frictions)
 
 
-def shares(forces: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """The share of each force c in d, in the metric of accelerations, shape (c, 1):
+def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
+    """The share of each friction force c in d, in the metric of accelerations, shape (c, 1):
 
-        (c^T W d) / (c^T W c).
+        (c~^T W d) / (c~^T W c),
+
+    where c~ is c less what a force on the contact across its sliding would explain as well. So a
+    payload that pulls the tool across its motion is no friction, although M^-1 couples both.
 
     Args:
         forces: The forces as columns, shape (k, c).
+        planes: T, the reactions of each contact if it sticks, side by side, shape (k, c k).
+        velocity: The velocities, shape (k, 1).
         metric: W, shape (k, k).
         d: What is shared, shape (k, 1).
     """
-    matched = ca.mtimes(metric, forces)
-    squares = ca.sum1(forces * matched).T
-    return ca.mtimes(matched.T, d) / ca.fmax(squares, _TINY)
+    size, found = forces.shape[0], list[ca.SX]()
+    for j in range(forces.shape[1]):
+        force, plane = forces[:, j], planes[:, j * size : (j + 1) * size]
+        # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
+        power = ca.fmin(ca.mtimes(velocity.T, force), -_TINY)
+        across = plane - ca.mtimes(force, ca.mtimes(velocity.T, plane)) / power
+        sizes = [ca.mmax(ca.sum1(each * ca.mtimes(metric, each))) for each in (across, plane)]
+        across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
+        matched = ca.mtimes(metric, beside(across, metric, force))
+        square = ca.fmax(ca.dot(matched, force), _TINY)
+        found.append(ca.dot(matched, d) / square)
+    return ca.vertcat(ca.SX(0, 1), *found)
 
 
 def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:

@@ -1,16 +1,17 @@
 """Elastic transmissions.                                                   (64)-(65)"""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import full_matrix, matrix_parameter
-from drake_dae.robots.actuation.stage import AttachedStage, Stage
+from drake_dae.robots.actuation.stage import AttachedStage, Spring, Stage
 from drake_dae.robots.links.links import Links
 
 
@@ -29,7 +30,8 @@ class FlexibleJoints(Stage):
     the model has an acceleration a that the tool does not have, with a'' + K_i4 a' + (K_i3 - kappa)
     a = 0, the gains of (32) and the eigenvalues kappa of P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for
     the Jacobian P of the held directions; so K_i3 = W^2 + 4 W w + w^2 must be above kappa. Model
-    springs that are too stiff for the sample time as rigid joints.
+    springs that are too stiff for the sample time as rigid joints. A `SpringCascade` is a law that
+    needs no derivatives of the model.
 
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
     positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
@@ -43,11 +45,20 @@ class FlexibleJoints(Stage):
             the control reaches the outputs at different orders. Use a high stiffness instead.
         inertia: M_2 in kg m^2 (kg), likewise; that of the URDF if None.
         damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
+        friction: Coulomb friction of the motors, F_c in N m (N), not negative, a number or shape
+            (p,): u less F_c s drives the shafts, with s_i = q_2i' / sqrt(q_2i'^2 + v_s^2), which
+            creeps below v_s. None for none and no such parameters; 0 for motors whose friction the
+            law does not know, so that a plant may have other values. The law (28) differentiates s
+            if F_c is not 0 in its model.
+        stiction_tolerance: v_s in rad/s (m/s), positive; only with friction.
     """
 
     stiffness: ArrayLike
     inertia: ArrayLike | None = None
     damping: ArrayLike = 0.0
+    friction: ArrayLike | None = None
+    stiction_tolerance: float = 0.01
+    is_spring: ClassVar[bool] = True
 
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
@@ -77,6 +88,11 @@ class FlexibleJoints(Stage):
                 ) from None
             parameters.append(damping)
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
+        drag = ca.SX(p, 1)
+        if self.friction is not None:
+            coefficients, creep = self._friction(p, rotary)
+            parameters += [coefficients, creep]
+            drag = coefficients.symbol * rate / ca.sqrt(rate**2 + creep.symbol**2)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
             return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
@@ -88,7 +104,9 @@ class FlexibleJoints(Stage):
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),
             mass=ca.diagcat(ca.SX.eye(p), m_2),
-            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),  # (65)
+            drift=lambda position, velocity: ca.vertcat(  # (65)
+                rate, -force(position, velocity) - drag
+            ),
             drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
             drive_signals=tuple(links.actuator_signals),
             force=force,
@@ -96,4 +114,21 @@ class FlexibleJoints(Stage):
             carries_rotors=True,
             ports={"motor_state": slice(0, 2 * p)},
             parameters=tuple(parameters),
+            spring=Spring(k, d, m_2),
+        )
+
+    def _friction(self, p: int, rotary: bool) -> tuple[Parameter, Parameter]:
+        """The parameters of the motors' friction: F_c, shape (p,), and v_s."""
+        assert self.friction is not None
+        given = np.asarray(self.friction, dtype=float)
+        if given.shape not in ((), (p,)) or not (np.isfinite(given).all() and np.all(given >= 0)):
+            raise ModelError(
+                f"flexible_joints.friction must be 0 or more, a number or shape ({p},), got "
+                f"{self.friction!r}"
+            )
+        name, slow = "flexible_joints.friction", "flexible_joints.stiction_tolerance"
+        values = np.broadcast_to(given, (p,)).copy()
+        return (
+            Parameter(name, values, "N m" if rotary else "", nonnegative=True),
+            Parameter(slow, np.array([self.stiction_tolerance]), "", positive=True),
         )

@@ -120,6 +120,10 @@ def _vectors(
             law_parameters,
         ),
     }
+    if is_of_links(law, structure):
+        own = law.system
+        vectors["link_state"] = Vector("(q, v), the state of the links", own.state_signals)
+        vectors["wanted_torque"] = Vector("of the springs, by the law", own.control_signals)
     if not law.measured_force:
         del vectors["measured_force"]
     if law.integral.outputs:
@@ -150,13 +154,24 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
     inputs = {name: own.function.sx_in(i) for i, name in enumerate(own.input_names)}
     moved = ca.SX(system.scale) * own.function(*inputs.values())[0]
     step = TracedFunction("step to the manifold", inputs, {"step": moved}, often=False)
-    names = law.function.input_names
+    named = {"parameters": "law_parameters"}
+    if is_of_links(law, structure):
+        named |= {"state": "link_state", "control": "wanted_torque"}
+    read, shown = (
+        [named.get(name, name) for name in names]
+        for names in (law.function.input_names, law.function.output_names)
+    )
     return {
-        "law": Call(law.function, [*names[:-1], "law_parameters"], law.function.output_names),
+        "law": Call(law.function, read, shown),
         "plant": Call(plant, plant.input_names, plant.output_names),
         "residual": Call(residual, residual.input_names, residual.output_names),
         "newton_step": Call(step, step.input_names, step.output_names),
     }
+
+
+def is_of_links(law: TrackingLaw, structure: ConstraintStructure) -> bool:
+    """Whether a law is that of the links of a robot with springs, by themselves."""
+    return law.system.num_states != structure.system.num_states
 
 
 def _declared(prefix: str, name: str, vector: Vector) -> str:

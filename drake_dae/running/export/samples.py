@@ -51,6 +51,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
         time = context.get_time() + 0.1 * index
         values = {
             "state": state,
+            "link_state": state[: controller.law.system.num_states],
             "other": states[0],
             "reference": reference(time),
             "measured_force": random.normal(size=plant.dae.num_constraints),
@@ -74,7 +75,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
             outputs = dict(zip(call.outputs, results, strict=True))
             inputs = {source: values[source] for source in call.inputs}
             found[name].append(Sample(inputs, outputs, _scales(call, inputs, outputs)))
-            if name == "law":
+            if name == "law" and "control" in outputs:
                 values["control"] = outputs["control"]
         try:
             projected = manifold.project(near, given)

@@ -67,7 +67,7 @@ def _reason(
     compiled = program.compiled
     for call in compiled.calls:
         function = call.computation.traced
-        if function is None:
+        if function is None or len(function.input_names) != len(call.arguments):
             continue
         given = compiled.arguments_of(call)(time, state, held, parameters)
         arguments = [

@@ -10,16 +10,21 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.clearances import LinkBehind, links_behind
+from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
+from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.model import completed_model, scenario_structure
+from drake_dae.scenario.observed import law_robot
+from drake_dae.scenario.parts.parts import Poles, Tracking
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
@@ -61,6 +66,17 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:  # The requirements of a task depend on the times of contact.
         return Feasibility(analyze(model.dae), scenario.duration)
+    laws = None
+    if scenario.actuation and scenario.actuation[0].is_spring:
+        whole, own = model, scenario
+        if scenario.is_cascade:
+            # What the links need, as if they were rigid.
+            model, structure = law_robot(scenario, model, structure)
+            scenario = replace(scenario, law=Tracking(), gains=Poles(all=[-4.0]), integral=[])
+            laws = spring_laws(own, whole, model, structure)
+        elif scenario.sampling is not None:
+            links = link_side(model)
+            laws = spring_laws(own, whole, links, find_structure(links.dae))
     # The law's model alone, without differences of the plant.
     ideal = replace(
         scenario,
@@ -98,6 +114,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         scenario.duration,
         is_resolved=is_resolved,
         behind=behind,
+        laws=laws,
         **_ranges(analysis, model),
     )
 

@@ -11,6 +11,7 @@ from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.clearances import LinkBehind
 from drake_dae.robots.shapes import Collision
+from drake_dae.scenario.feasibility.springs import SpringLaws
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
@@ -80,6 +81,7 @@ class Feasibility:
             known.
         behind: Links that move behind a contact surface, and links that collide; see `links_behind`
             and `collisions`.
+        laws: What two laws for springs ask for; None without springs or samples.
     """
 
     analysis: Analysis
@@ -90,6 +92,7 @@ class Feasibility:
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
     behind: tuple[LinkBehind | Collision, ...] = ()
+    laws: SpringLaws | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -132,6 +135,7 @@ class Feasibility:
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
             "behind": [asdict(one) for one in self.behind],
+            "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "problems": list(self.problems),
         }
 
@@ -152,6 +156,8 @@ class Feasibility:
                     "known. A shorter duration takes them closer together."
                 )
             parts.append([text])
+        if self.laws is not None:
+            parts.append(self.laws.lines)
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
         return parts
 

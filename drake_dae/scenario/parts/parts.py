@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from pydrake.systems.framework import Context
 
+from drake_dae.dae.beyond.spring_loop import DAMPING, SpringLoop
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.scenario.forms.values import Numbers
@@ -62,6 +63,59 @@ class MeasuredForce:
     def begin(self, sensor: ForceSensor, context: Context) -> None:
         """Sets the sensor's errors in its context."""
         sensor.set_errors(context, self.bias, self.noise_deviation)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """The tracking law (28) of the whole robot: four derivatives of the model behind springs."""
+
+    is_cascade: ClassVar = False
+
+    def loop(self) -> SpringLoop | None:
+        """None: there is no loop around springs."""
+        return None
+
+
+@dataclass(frozen=True)
+class SpringCascade:
+    """The tracking law of the links alone, and a loop around the springs of the joints.
+
+    It is a `systems.cascade.SpringCascade`, and needs `sampling`, and FlexibleJoints in
+    `actuation` with DcMotors or nothing behind them. `gains`, `integral` and `observer` are those
+    of the rigid law; where `gains` are left out in compliant contact, all are recommended.
+
+    Attributes:
+        rate: The rate of the loop in rad/s, the same for all joints; recommended if left out.
+        damping: Its damping ratio.
+        motor_rate: The rate in 1/s at which friction and other disturbances of the motors are
+            observed and compensated; the rate of the loop if left out, 0 for none.
+        current_rate: The rate in 1/s of currents behind the springs, if there are any; recommended
+            if left out.
+    """
+
+    rate: float | None = None
+    damping: float = DAMPING
+    motor_rate: float | None = None
+    current_rate: float | None = None
+    is_cascade: ClassVar = True
+
+    def __post_init__(self) -> None:
+        given = [self.rate, self.motor_rate, self.current_rate]
+        rate, *others = [1.0 if number is None else number for number in given]
+        SpringLoop(rate, self.damping, *others)
+
+    def filled(self, numbers: SpringLoop) -> "SpringCascade":
+        """The same with recommended numbers where they are left out."""
+        rate = numbers.rate if self.rate is None else self.rate
+        motor_rate = rate if self.motor_rate is None else self.motor_rate
+        current_rate = numbers.current_rate if self.current_rate is None else self.current_rate
+        return SpringCascade(rate, self.damping, motor_rate, current_rate)
+
+    def loop(self) -> SpringLoop | None:
+        """The numbers of the loop; None if one is left out."""
+        if self.rate is None or self.motor_rate is None or self.current_rate is None:
+            return None
+        return SpringLoop(self.rate, self.damping, self.motor_rate, self.current_rate)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,9 @@ class Contact:
     Attributes:
         friction: C, the friction force per unit of each coefficient, shape (k, c).
         metric, free: W and Q of `Observation.directions`.
-        held: T y of the contacts that stick, as columns; zero for others.
+        planes: T of `Observation.directions`.
+        held: T of the contacts that stick; zero for others.
+        velocity: The velocities, shape (k, 1).
         slides: 1 for each contact that certainly slides, shape (c,).
         valid: Finite if all of these are valid.
     """
@@ -49,7 +51,9 @@ class Contact:
     friction: ca.SX
     metric: ca.SX
     free: ca.SX
+    planes: ca.SX
     held: ca.SX
+    velocity: ca.SX
     slides: ca.SX
     valid: ca.SX
 
@@ -98,12 +102,14 @@ class Observed:
         sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
         held = planes * ca.repmat(ca.vec(ca.repmat(sticks.T, size, 1)).T, size, 1)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
-        return Contact(friction[0], metric, free, held, slides, friction[-1] + directions[-1])
+        velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
+        return Contact(friction[0], metric, free, planes, held, velocity, slides, valid)
 
     def change(self, contact: Contact, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
         """How mu changes at a sample, at which friction takes its share of r."""
         gain = -np.expm1(-self._observing.friction_rate * self._period)
-        found = mu + contact.slides * gain * shares(contact.friction, contact.metric, r)
+        known = contact.friction, contact.planes, contact.velocity, contact.metric
+        found = mu + contact.slides * gain * shares(*known, r)
         found = ca.fmin(ca.fmax(found, 0.0), self._observing.largest_friction)
         return ca.if_else(hold != 0, 0, found - mu)
 

@@ -43,6 +43,7 @@ PURE = {
     ("!Text", "along"),
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),
+    ("!SpringCascade", "damping"),
     ("!MeasuredForce", "gain"),
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from actuated import actuated, at_rest
 from arms import arm, error_controlled, fixed_step, law
 from members import RestingController
 from polishing import laws, polisher, task_loop
@@ -16,12 +17,15 @@ from drake_dae import (
     ReferenceGenerator,
     RobotPlant,
     Sampling,
+    SpringCascade,
+    SpringLoop,
     Task,
     TaskController,
     Tolerances,
     TrackingController,
     TrackingLaw,
     UnilateralRobotPlant,
+    link_side,
     poles,
     simulate,
     wire_loop,
@@ -29,7 +33,7 @@ from drake_dae import (
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 
-GOALS = [0.3, 20.0]
+GOALS, SAMPLE = [0.3, 20.0], 0.01
 
 
 def integrating():
@@ -44,20 +48,37 @@ def task():
     return TaskController(Task([Approach(), Press(20.0)]), *laws())
 
 
+def cascade():
+    model = actuated("two_link", "flexible").model
+    own = TrackingLaw(link_side(model).dae, poles(-4.0))
+    return SpringCascade(own, model, SpringLoop(60.0, motor_rate=60.0), SAMPLE)
+
+
 MEMBERS = {
     "law": lambda: TrackingController(law("two_link")),
     "with integral": integrating,
     "task": task,
     "resting": lambda: RestingController(law("two_link")),
+    "cascade": cascade,
 }
+
+
+def robot(controller):
+    """The plant that a controller is for, and its state at rest at the goals."""
+    if controller.takes_over:
+        return UnilateralRobotPlant(polisher(), {"wall": 0.0}), None
+    q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
+    found, state = arm("two_link"), [*q, 0.0, 0.0]
+    if controller.observed is not None:
+        found = actuated("two_link", "flexible")
+        state = at_rest("two_link", "flexible", q, GOALS[1])[0]
+    return RobotPlant(found.model, structure=found.structure), state
 
 
 def wired(controller, **settings):
     """A loop of a controller, at rest where it begins."""
-    plant, generator = RobotPlant(arm("two_link").model, structure=arm("two_link").structure), None
-    if controller.takes_over:
-        plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
-    elif controller.HasInputPort("reference"):
+    (plant, state), generator = robot(controller), None
+    if controller.HasInputPort("reference"):
         generator = ReferenceGenerator(
             [ConstantReference(goal) for goal in GOALS], controller.law.degrees
         )
@@ -67,8 +88,7 @@ def wired(controller, **settings):
     if controller.takes_over:
         plant.set_state(own, controller.rest_state([0.3, 0.02], plant.dae.nominal_state))
     else:
-        q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
-        plant.set_consistent_state(own, [*q, 0.0, 0.0])
+        plant.set_consistent_state(own, state)
     return loop, context
 
 
@@ -83,7 +103,9 @@ def controller(request):
 
 
 def test_rules_1_and_2_what_it_reads_and_gives(controller):
-    dae, optional = controller.law.system, {"reference", "measured_force", "exogenous", "hold"}
+    dae, optional = robot(controller)[0].dae, {"reference", "measured_force", "exogenous", "hold"}
+    if controller.observed is not None:
+        optional |= {"acting_control"}
     assert controller.GetInputPort("estimated_state").size() == dae.num_states
     names = {controller.get_input_port(i).get_name() for i in range(controller.num_input_ports())}
     assert names - {"estimated_state"} <= optional
@@ -135,9 +157,7 @@ def test_what_takes_references_is_refused_where_there_are_none():
 
 
 def test_references_are_where_the_controller_takes_them(controller):
-    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    if controller.takes_over:
-        plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
+    plant, _ = robot(controller)
     if controller.HasInputPort("reference"):
         with pytest.raises(WiringError, match="ReferenceGenerator"):
             wire_loop(plant, controller)
@@ -156,7 +176,8 @@ def test_a_sensor_that_nothing_reads_is_refused(controller):
 @pytest.mark.slow
 def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     """At rest at its goals a law has no error: round-off, and that of steps of 1 ms."""
-    loop, context = wired(controller)
+    settings = {} if controller.observed is None else {"sampling": Sampling(SAMPLE)}
+    loop, context = wired(controller, **settings)
     config = error_controlled(1e-8) if controller.takes_over else fixed_step()
     simulate(loop.diagram, context, 0.05, config)
     record = loop.record(context)
@@ -179,8 +200,8 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
 @pytest.mark.slow
 def test_a_controller_that_is_sampled_is_logged(controller):
     if controller.takes_over:
-        controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=0.01)
-    loop, context = wired(controller, sampling=Sampling(0.01))
+        controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=SAMPLE)
+    loop, context = wired(controller, sampling=Sampling(SAMPLE))
     simulate(loop.diagram, context, 0.02, fixed_step())
     assert "control" in loop.loggers
     assert np.isfinite(loop.record(context)["control"]).all()
@@ -192,7 +213,17 @@ def test_rule_7_starts(controller):
     assert manifold.is_consistent(manifold.project(manifold.system.nominal_state))
 
 
-def test_rule_8_phases():
+def test_rule_8_what_is_observed(controller):
+    """State and control of the law, on ports of the controller."""
+    if controller.observed is None:
+        assert not controller.HasInputPort("acting_control")
+        return
+    sizes = [controller.GetOutputPort(name).size() for name in controller.observed]
+    assert sizes == [controller.law.system.num_states, controller.law.system.num_controls]
+    assert controller.GetInputPort("acting_control").size() == sizes[1]
+
+
+def test_rule_9_phases():
     """A task tells when it began; a law has no phases."""
     loop = task_loop([Approach(), Press(20.0)])
     assert loop.changes(loop.diagram.CreateDefaultContext()) == ()

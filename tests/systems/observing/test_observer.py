@@ -319,14 +319,39 @@ def test_sharing_is_by_the_accelerations_that_forces_make():
     metric, d = root.T @ root, random.standard_normal(4)
     column = random.standard_normal((4, 1))
     wanted = np.linalg.lstsq(root @ column, root @ d, rcond=None)[0]
-    assert_allclose(evaluated(shares, column, metric, d), wanted, rtol=1e-10)
+    nothing, moves = np.zeros((4, 4)), random.standard_normal((4, 1))
+    assert_allclose(evaluated(shares, column, nothing, moves, metric, d), wanted, rtol=1e-10)
     other = random.standard_normal((4, 1))
     planes = np.hstack([column, other, 2.0 * column])
     left = evaluated(beside, planes, metric, d)
     assert_allclose(planes.T @ metric @ left, 0.0, atol=1e-10)
     assert_allclose(np.cross((d - left)[:3], column[:3, 0]) @ other[:3, 0], 0.0, atol=1e-8)
     assert_allclose(evaluated(beside, 0.0 * planes, metric, d), d)
-    assert_allclose(evaluated(shares, 0.0 * column, metric, d), 0.0)
+    assert_allclose(evaluated(shares, 0.0 * column, nothing, moves, metric, d), 0.0)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_pulls_across_the_sliding_is_no_friction(count):
+    """Of a force in the plane of a contact, and of any other d, by the least squares of d on both.
+
+    With one direction in the plane there is nothing across.
+    """
+    random = np.random.default_rng(1)
+    root, jacobian = random.standard_normal((4, 4)), random.standard_normal((count, 4))
+    metric, moves = root.T @ root, random.standard_normal(4)
+    slides = jacobian @ moves
+    along = slides / np.linalg.norm(slides)
+    friction = -7.0 * jacobian.T @ along
+    columns = [friction]
+    if count == 2:
+        columns.append(jacobian.T @ [-along[1], along[0]])
+    d = random.standard_normal(4)
+    wanted = np.linalg.lstsq(root @ np.transpose(columns), root @ d, rcond=None)[0]
+    planes = -40.0 * jacobian.T @ jacobian
+    given = friction[:, None], planes, moves[:, None], metric
+    assert_allclose(evaluated(shares, *given, d), wanted[0], rtol=1e-8)
+    assert_allclose(evaluated(shares, *given, 0.3 * friction), 0.3, rtol=1e-8)
+    assert_allclose(evaluated(shares, *given, columns[-1]), 2.0 - count, atol=1e-8)
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():

@@ -1,0 +1,78 @@
+"""The links of a robot by themselves: what stands before the springs of its joints."""
+
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.plant_constraints import plant_constraints
+from drake_dae.robots.links.kinematics import Reaction
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.model import RobotModel
+
+
+def link_side(model: RobotModel) -> RobotModel:
+    """The rigid robot that the springs of a robot move,
+
+        (M(q) - B) v' + H(q, v) = J(q)^T lambda + tau,
+
+    whose control is the torque tau of the springs. Rotors B move with the shafts and are no part of
+    it. It has the symbols q and v, the constraints and the outputs of the robot.
+
+    Args:
+        model: A robot with springs in its joints.
+
+    Raises:
+        ModelError: The robot has no stage that carries its rotors.
+    """
+    if not any(stage.carries_rotors for stage in model.stages):
+        raise ModelError(
+            f"{model.name} has no springs in its joints, so that its links are not moved by springs"
+        )
+    links = cast(Links, _WithoutRotors(model.links))
+    own = model.constraints[: len(model.constraints) - len(plant_constraints(model.links))]
+    known = [parameter.name for parameter in model.dae.parameters if parameter.exogenous]
+    found = RobotModel(
+        links,
+        own,
+        model.outputs,
+        model.nominal_positions,
+        model.name,
+        (),
+        model.forces,
+        known,
+        model.known_forces,
+        compiled=model.dae.compiled,
+    )
+    found.control_limits = np.array(model.links.effort_limits)
+    return found
+
+
+class _WithoutRotors:
+    """Links whose M is without the inertia of rotors; all else is that of the given links."""
+
+    def __init__(self, links: Links) -> None:
+        self._links = links
+        B = links.actuation_matrix
+        self._rotors = np.asarray(B * links.reflected_inertia @ B.T)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._links, name)
+
+    @property
+    def mass_matrix(self) -> ca.SX:
+        """M(q) without rotors, shape (nv, nv)."""
+        return self._links.mass_matrix - ca.SX(ca.sparsify(ca.DM(self._rotors)))
+
+    @property
+    def reflected_inertia(self) -> FloatArray:
+        """Zeros, shape (nu,)."""
+        return np.zeros_like(self._links.reflected_inertia)
+
+    def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
+        """M(q) v' + H(q, v) - tau of (37) with that M, shape (nv, 1)."""
+        found = self._links.inverse_dynamics(kinematics, reaction)
+        rotors = ca.SX(ca.sparsify(ca.DM(self._rotors)))
+        return found - ca.mtimes(rotors, kinematics.acceleration)

@@ -1,0 +1,154 @@
+"""Default gains of a scenario with Drake's own contact."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drake_dae.dae.beyond.contact_advice import advised_gains
+from drake_dae.dae.beyond.contact_gains import contact_gains
+from drake_dae.dae.beyond.spring_loop import contact_gains_behind
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.errors import ScenarioError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.advice.sensed import (
+    largest_roughness,
+    moved_points,
+    predicted,
+    sensed_contact,
+)
+from drake_dae.scenario.advice.springs import NOISE, loop_note, rounded, velocity_noise, with_loop
+from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.observed import law_robot
+from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.scenario import Scenario
+
+_FORCE = 10.0
+"""The force in N at which the stiffness of a hydroelastic patch is evaluated."""
+
+
+def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
+    """The scenario with gains by `contact_gains` where they are left out.
+
+    Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
+    and of points, constraint damping, an observer of disturbance and friction, and measured force
+    are set, each if it is left out.
+
+    Args:
+        scenario: The scenario, with all of its outputs.
+        model: Its robot.
+        structure: The structure of the model's system.
+
+    Returns:
+        The scenario, unchanged if nothing is left out, and the choices in words.
+
+    Raises:
+        ScenarioError: There are no default gains with a task, or with stages of actuation, or none
+            are smooth and stable enough; or a roughness is given that nothing uses.
+    """
+    material = scenario.plant.material
+    is_advised = material is not None and scenario.is_advised
+    if scenario.largest_roughness is not None:
+        if not is_advised or scenario.encoders is None or scenario.is_cascade:
+            raise ScenarioError(
+                (
+                    "largest_roughness",
+                    "it limits gains that are computed for rigid joints and the noise of encoders "
+                    "in Drake's contact; leave it out, or leave the gains out and give encoders",
+                )
+            )
+        if not scenario.largest_roughness > 0.0:
+            value = f"must be positive, got {scenario.largest_roughness:g} N m"
+            raise ScenarioError(("largest_roughness", value))
+    if scenario.is_cascade:
+        scenario = with_loop(scenario)
+        model, structure = law_robot(scenario, model, structure)
+    if material is None or not is_advised:
+        return Completed(scenario)
+    if scenario.task is not None:
+        raise ScenarioError(
+            ("gains", ("no gains are recommended for a task in Drake's contact: give some"))
+        )
+    if model.stages:
+        raise ScenarioError(
+            (
+                "gains",
+                "for Drake's own contact no gains are recommended with motors or valves, or with "
+                "the tracking law and springs; give them, with integral and observer, as in the "
+                "scenario wall_flexible_contact, or for springs leave `law` out",
+            )
+        )
+    sampling = scenario.sampling
+    period = material.time_step if sampling is None else sampling.period
+    if not period:
+        raise ScenarioError(
+            (
+                "gains",
+                "for a continuous compliant plant without `sampling` no gains are recommended; "
+                "give some, or a sampling",
+            )
+        )
+    late = 0 if sampling is None else sampling.late_samples
+    mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
+    stiffness = material.stiffness_at(_FORCE)
+    fast, noise = None, velocity_noise(scenario, period)
+    known_by = f"velocities within {noise:.2g} rad/s"
+    loop = None if scenario.law is None else scenario.law.loop()
+    if loop is not None:
+        found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
+    elif scenario.encoders is None:
+        found = contact_gains(stiffness, mobility, period, late, NOISE)
+    else:
+        sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
+        with at("gains"):
+            best = advised_gains(sensed, largest_roughness(scenario, model))
+        found, fast = best.gains, best.state_rate
+        known_by = predicted(best)
+    names = [signal.name for signal in model.dae.output_signals]
+    positions, forces = np.split(np.array(names), [len(model.position_signals)])
+    points = moved_points(model)
+    integral = scenario.integral
+    if integral is None:
+        integral = [name for name in positions if name in points] + forces.tolist()
+    force = scenario.force_feedback
+    if not force.is_measured:
+        force = parts.MeasuredForce(sample_period=period)
+    # A force of degree 0 has a gain only if it is integrated.
+    of_forces = {name: [rounded(found.force_gain)] for name in forces.tolist() if name in integral}
+    of_positions = {
+        name: [rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
+        for name in positions.tolist()
+    }
+    gains = parts.Coefficients(outputs=of_positions | of_forces)
+    damping = scenario.constraint_damping
+    if damping is None and found.constraint_damping:
+        damping = parts.Poles(all=[-rounded(found.constraint_damping)])
+    observer = scenario.observer
+    if observer is None:
+        frictional = [c.name for c in model.constraints if c.friction_parameter]
+        observer = parts.Observer(
+            rate=rounded(found.observer_rate),
+            force_rate=rounded(found.observer_force_rate),
+            friction_rate=rounded(found.friction_rate),
+            identify_friction=frictional,
+            state_rate=None if fast is None else rounded(fast),
+        )
+    chosen = replace(
+        scenario,
+        gains=gains,
+        integral=integral,
+        constraint_damping=damping,
+        observer=observer,
+        force_feedback=force,
+        largest_roughness=None,
+    )
+    known = ", ".join(observer.identify_friction) or "none"
+    note = (
+        f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
+        f"{period:g} s and {known_by}: Butterworth's poles of positions "
+        f"at {rounded(found.position_rate):g} 1/s, and of forces one at "
+        f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
+        f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"{observer.rate:g} 1/s that identifies the friction of: {known}{loop_note(scenario)}"
+    )
+    return Completed(chosen, (note,))
