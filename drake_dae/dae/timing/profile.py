@@ -1,0 +1,226 @@
+"""The time-optimal profile of a path reference."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, check_whole_number, vector
+from drake_dae.dae.references.by_name import references_by_name
+from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.timing.along import AlongCurve
+from drake_dae.dae.timing.curve import Curve, Piece
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.dae.timing.reachable import Fastest, fastest_motion
+from drake_dae.dae.timing.rows import Row, Rows, rows_along
+from drake_dae.dae.timing.timed_reference import TimedReference
+from drake_dae.dae.timing.tool_limits import tool_limits
+from drake_dae.errors import ModelError, ReferenceSignalError
+
+_PAUSE = Row("pause of the reference", "", "")
+
+PASSES = 40
+"""The most passes where signals are not linear in (a, b)."""
+
+SETTLED = 1e-7
+"""Passes end where b changes by less than this share of its largest value."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilePiece:
+    """A motion from rest to rest, or a pause.
+
+    Attributes:
+        piece: The part of the curve.
+        times: The times of the motion at the points, in s after its begin, shape (N + 1,).
+        b: s'^2 at the points, shape (N + 1,); zeros in a pause.
+        a: s'' between the points, shape (N,).
+        highest: The largest b from which the motion can brake, shape (N + 1,).
+        limiting: What limits each interval: an index into `TimeProfile.causes`, shape (N,).
+    """
+
+    piece: Piece
+    times: FloatArray
+    b: FloatArray
+    a: FloatArray
+    highest: FloatArray
+    limiting: np.typing.NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class TimeProfile:
+    """The fastest motion along the curve of a reference.
+
+    Attributes:
+        pieces: Its motions from rest to rest and its pauses, in their order.
+        causes: What limits it: signals, by the indices of `ProfilePiece.limiting`.
+        start_time: When it begins, in s.
+        layout: How R is stacked.
+    """
+
+    pieces: tuple[ProfilePiece, ...]
+    causes: tuple[Row, ...]
+    start_time: float
+    layout: Layout
+
+    @property
+    def duration(self) -> float:
+        """The duration of the motion, in s."""
+        return float(sum(piece.times[-1] for piece in self.pieces))
+
+    @property
+    def reference(self) -> TimedReference:
+        """The reference of all outputs by the time of the motion."""
+        return TimedReference.of(
+            [(one.piece, one.times, one.b, one.a) for one in self.pieces],
+            self.layout,
+            self.start_time,
+        )
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """What limits the motion, with its share of the time, the largest first."""
+        found: dict[str, float] = {}
+        for one in self.pieces:
+            for place, time in zip(one.limiting.tolist(), np.diff(one.times), strict=True):
+                name = self.causes[place].text
+                found[name] = found.get(name, 0.0) + float(time) / self.duration
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+@checked(ReferenceSignalError)
+class PathTiming:
+    """The shortest motions along the curves of references within limits, from rest to rest.
+
+    A reference r(t) is taken as a curve r(s), see `dae.timing.curve`. For any s(t) the reference
+    r(s(t)) is admissible, so that errors obey (30), (31) whatever s does. With b = s'^2 and a = s''
+    the control (28) and the constraint inputs (25) on the curve without error are
+
+        u = m(s) b + n(s) a + c(s),
+
+    with m, n, c from the law itself, and so are accelerations; speeds limit b. The largest b is
+    found by reachable sets, see `dae.timing.reachable`. Friction makes u nonlinear in b: it is then
+    linearized about the profile before, such that it is exact at rest and there, until this does
+    not change.
+
+    Args:
+        structure: The structure of the system, `find_structure`: rigid joints, where positions have
+            degree 2 and forces degree 0, without zero dynamics.
+        limits: The limits of controls, states, their rates, and forces.
+
+    Raises:
+        ReferenceSignalError: There is no such profile for the system.
+        ModelError: A limit names no signal of the system.
+    """
+
+    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+        self.structure, self.limits = structure, limits
+        self._along = AlongCurve(structure, limits)
+
+    def profile(
+        self,
+        references: Sequence[Reference] | Mapping[str, Reference | float],
+        end: float,
+        *,
+        begin: float = 0.0,
+        start: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        largest_rate: float | None = None,
+        points: int = 1000,
+    ) -> TimeProfile:
+        """The shortest motion along the curve of a reference.
+
+        Forces are commanded as the reference has them at s. Where nothing moves the time passes as
+        in the reference; a pause at the end in which no output changes is left out. Limits of paths
+        of speed and acceleration, `PathLimits`, hold as well; their jerk is not limited.
+
+        Args:
+            references: The references of all outputs; or name -> reference, or a number.
+            end: The last time of the reference, in s.
+            begin: Its first time, in s.
+            start: A state near which the motion begins, shape (n,); the nominal one if None.
+            parameters: Values of all parameters; the defaults if None.
+            largest_rate: The largest rate of the reference's time, 1 to be nowhere faster than the
+                reference itself; None for no limit.
+            points: The number of intervals of the grid.
+
+        Raises:
+            ReferenceSignalError: A rest on the curve is not within the limits, which are named with
+                the place; nothing limits the motion; nothing moves; the curve is out of reach.
+            ModelError: A number makes no sense.
+        """
+        check_whole_number("points", points, 20)
+        if not end > begin or (largest_rate is not None and not largest_rate > 0.0):
+            raise ModelError(
+                "end must be after begin and largest_rate positive, got "
+                f"{begin:g} s, {end:g} s and {largest_rate}"
+            )
+        along, system = self._along, self.structure.system
+        names = [signal.name for signal in system.output_signals]
+        if isinstance(references, Mapping):
+            references = references_by_name(references, names, along.layout.degrees)
+        covered = sum(reference.size for reference in references)
+        if covered != len(names):
+            raise ReferenceSignalError(
+                f"the references cover {covered} outputs, the system has {len(names)}"
+            )
+        curve = Curve(references, along.layout, begin, end, points)
+        guess = system.nominal_state if start is None else vector("start", start, system.num_states)
+        numbers = system.parameter_vector(parameters)
+        found, causes = list[ProfilePiece](), tuple[Row, ...]()
+        for piece in _without_last_pause(curve.pieces):
+            if piece.is_pause:
+                found.append(_pause(piece))
+                continue
+            tools = tool_limits(references, piece, along.layout)
+            rows = rows_along(along, piece, guess, numbers, tools)
+            guess, causes = rows.at_rest[-1], rows.names
+            found.append(_fastest(rows, piece, largest_rate))
+        return TimeProfile(tuple(found), (*causes, _PAUSE), begin, along.layout)
+
+
+def _without_last_pause(pieces: Sequence[Piece]) -> Sequence[Piece]:
+    """The pieces without a pause at the end in which no output changes."""
+    last = pieces[-1]
+    is_over = last.is_pause and np.ptp(last.values, axis=0).max() <= 1e-9 * np.abs(last.values).max()
+    return pieces[:-1] if is_over else pieces
+
+
+def _pause(piece: Piece) -> ProfilePiece:
+    count = piece.times.size
+    zero, none = np.zeros(count), np.zeros(count - 1)
+    passed = piece.times - piece.times[0]
+    return ProfilePiece(piece, passed, zero, none, zero, np.full(count - 1, -1, dtype=np.intp))
+
+
+def _fastest(rows: Rows, piece: Piece, largest_rate: float | None) -> ProfilePiece:
+    """The fastest motion along a piece."""
+    largest, which = rows.largest(inf if largest_rate is None else largest_rate)
+    before: FloatArray | None = None
+    found: Fastest | None = None
+    for _ in range(1 if rows.is_linear else PASSES):
+        found = fastest_motion(piece.distances, rows.lines(before), largest)
+        if not np.isfinite(found.b).all():
+            raise ReferenceSignalError(
+                "nothing limits the motion: give limits of controls, joints or forces"
+            )
+        if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
+            break
+        before = found.b if before is None else (found.b + before) / 2.0
+    assert found is not None
+    speed = np.sqrt(found.b)
+    both = speed[1:] + speed[:-1]
+    if not both.all():
+        place = float(piece.times[int(np.argmin(both))])
+        raise ReferenceSignalError(
+            f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses all "
+            "of a limit"
+        )
+    times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(piece.distances) / both)])
+    limiting = np.where(found.active >= 0, found.active, which[1:])
+    return ProfilePiece(piece, times, found.b, found.a, found.highest, limiting)
