@@ -32,6 +32,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
+from drake_dae.scenario.timing import timed
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -68,8 +69,12 @@ def build_completed(
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    completed = Completed(chosen.scenario, (*completed.notes, *chosen.notes))
-    return completed, build_loop(completed.scenario, model, structure, scene_graph, meshcat)
+    in_time, references = timed(chosen.scenario, model, structure)
+    notes = (*completed.notes, *chosen.notes, *in_time.notes)
+    completed = Completed(in_time.scenario, notes)
+    return completed, build_loop(
+        completed.scenario, model, structure, scene_graph, meshcat, references=references
+    )
 
 
 def build_loop(
@@ -79,6 +84,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
+    references: Sequence[Reference] | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -89,6 +95,7 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
+        references: References in place of the scenario's, from `timed`; None for the scenario's.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -97,7 +104,8 @@ def build_loop(
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, model, structure))
-    references = [] if task is not None else _references(scenario.references, law)
+    if references is None:
+        references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)

@@ -10,10 +10,10 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.timing.curve import Piece
+from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.dae.timing.many_points import ManyPoints
 
 CONVERGED = 1e-6
 """A Newton step that is this small relative to the states is the last one."""
@@ -45,8 +45,8 @@ class AlongCurve:
     """The tracking law's own feedforward along a curve, equations (28), (35) without error.
 
     On Z(R), where all outputs are on their references, (28) is u = B^-1 (-a + r^(mu)), and (25) is
-    v = alpha + beta u. With r' = r_s w, r'' = r_ss w^2 + r_s a both are affine in a at a given speed
-    w = s', and affine in (a, b), b = w^2, for a rigid robot without friction:
+    v = alpha + beta u. With r' = r_s w, r'' = r_ss w^2 + r_s a both are affine in a at a given
+    speed w = s', and affine in (a, b), b = w^2, for a rigid robot without friction:
 
         u = m(s) b + n(s) a + c(s).
 
@@ -108,7 +108,9 @@ class AlongCurve:
             high = np.append(high, np.zeros(len(rows)))
         rows_with = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
         self._rows = rows_with.tolist()
-        self.limited = Limited(tuple(signals[i] for i in self._rows), low[rows_with], high[rows_with])
+        self.limited = Limited(
+            tuple(signals[i] for i in self._rows), low[rows_with], high[rows_with]
+        )
         low, high = limits.bounds("states", system.state_signals)
         places = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
         self._states = places

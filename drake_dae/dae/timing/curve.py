@@ -21,8 +21,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.pieces import PiecewiseReference
 from drake_dae.dae.references.reference import Reference
 from drake_dae.dae.system.layout import Indices, Layout
-from drake_dae.errors import ReferenceSignalError
 from drake_dae.dae.timing.many_points import ManyPoints
+from drake_dae.errors import ReferenceSignalError
 
 REST = 1e-9
 """A reference rests where its speed is below this share of its largest."""
@@ -166,7 +166,9 @@ class Curve:
                 found.append((float(times[k]), first, True))
         if first < times[-1]:
             found.append((first, float(times[-1]), False))
-        lengths = np.concatenate([[0.0], np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2)])
+        lengths = np.concatenate(
+            [[0.0], np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2)]
+        )
         return [
             (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), still)
             for a, b, still in found

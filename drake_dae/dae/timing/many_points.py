@@ -26,9 +26,9 @@ class ManyPoints:
         self._given = [np.zeros((BLOCK, function.nnz_in(i))) for i in range(function.n_in())]
         self._found = [np.zeros((BLOCK, rows * columns)) for rows, columns in self._shapes]
         for index, array in enumerate(self._given):
-            self._buffer.set_arg(index, memoryview(array.reshape(-1)))
+            self._buffer.set_arg(index, array.reshape(-1).data)
         for index, array in enumerate(self._found):
-            self._buffer.set_res(index, memoryview(array.reshape(-1)))
+            self._buffer.set_res(index, array.reshape(-1).data)
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
         """The results at all points.

@@ -12,8 +12,8 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 
-Range = tuple[float, float]
-"""The lowest and the highest value of a signal."""
+Range = tuple[float | None, float | None]
+"""The lowest and the highest value of a signal; None without a limit."""
 
 FACETS = 16
 """The number of planes in place of a friction cone with two tangential forces."""
@@ -96,7 +96,7 @@ class MotionLimits:
     def __post_init__(self) -> None:
         for kind in ("controls", "states", "rates", "forces"):
             for name, (low, high) in getattr(self, kind).items():
-                if not low < high:
+                if low is not None and high is not None and not low < high:
                     raise ModelError(
                         f"{kind}: the lowest value of '{name}' must be below its highest, got "
                         f"{low:g} and {high:g}"
@@ -117,7 +117,9 @@ class MotionLimits:
         for name, (least, most) in getattr(self, kind).items():
             if name not in names:
                 raise ModelError(f"{kind}: {unknown_name('signal', name, names)}")
-            low[names.index(name)], high[names.index(name)] = least, most
+            place = names.index(name)
+            low[place] = -inf if least is None else least
+            high[place] = inf if most is None else most
         return low, high
 
     def check(self, system: DaeSystem) -> None:

@@ -1,7 +1,8 @@
 """The time-optimal profile of a path reference."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from math import inf
 
 import numpy as np
@@ -10,15 +11,17 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, vector
 from drake_dae.dae.references.by_name import references_by_name
+from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
 from drake_dae.dae.references.reference import Reference
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.timing.along import AlongCurve
 from drake_dae.dae.timing.curve import Curve, Piece
 from drake_dae.dae.timing.motion_limits import MotionLimits
-from drake_dae.dae.timing.reachable import Fastest, fastest_motion
+from drake_dae.dae.timing.reachable import Fastest, Lines, fastest_motion
 from drake_dae.dae.timing.rows import Row, Rows, rows_along
-from drake_dae.dae.timing.timed_reference import TimedReference
+from drake_dae.dae.timing.smoothing import smoothed
+from drake_dae.dae.timing.time_table import stacked, time_table
 from drake_dae.dae.timing.tool_limits import tool_limits
 from drake_dae.errors import ModelError, ReferenceSignalError
 
@@ -30,6 +33,13 @@ PASSES = 40
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
 
+LOWERINGS = 3
+"""How often limits are lowered where the motion exceeds them."""
+
+EXCESS = 0.02
+"""The excess over a limit at a few points that is left, as a share of it: less than the share of
+the limits that is left to the feedback."""
+
 
 @dataclass(frozen=True, eq=False)
 class ProfilePiece:
@@ -39,7 +49,7 @@ class ProfilePiece:
         piece: The part of the curve.
         times: The times of the motion at the points, in s after its begin, shape (N + 1,).
         b: s'^2 at the points, shape (N + 1,); zeros in a pause.
-        a: s'' between the points, shape (N,).
+        a: s'' at the points, shape (N + 1,).
         highest: The largest b from which the motion can brake, shape (N + 1,).
         limiting: What limits each interval: an index into `TimeProfile.causes`, shape (N,).
     """
@@ -72,15 +82,6 @@ class TimeProfile:
     def duration(self) -> float:
         """The duration of the motion, in s."""
         return float(sum(piece.times[-1] for piece in self.pieces))
-
-    @property
-    def reference(self) -> TimedReference:
-        """The reference of all outputs by the time of the motion."""
-        return TimedReference.of(
-            [(one.piece, one.times, one.b, one.a) for one in self.pieces],
-            self.layout,
-            self.start_time,
-        )
 
     @property
     def shares(self) -> dict[str, float]:
@@ -184,43 +185,110 @@ class PathTiming:
         return TimeProfile(tuple(found), (*causes, _PAUSE), begin, along.layout)
 
 
+@checked(ReferenceSignalError)
+@dataclass(frozen=True, eq=False)
+class TimeOptimalReference(PiecewiseReference):
+    """The reference of a profile, for all outputs, by the time of the motion.
+
+    Before and after, the values are constant. r'' may jump, forces have no derivatives.
+
+    Attributes:
+        profile: The profile.
+    """
+
+    profile: TimeProfile
+    order: int = field(default=2, init=False)
+
+    @property
+    def size(self) -> int:
+        return len(self.profile.layout.degrees)
+
+    @cached_property
+    def table(self) -> Pieces:
+        """The polynomials of r, one row for each output."""
+        parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
+        return time_table(parts, self.profile.layout, self.profile.start_time)
+
+    def pieces(self, degrees: Sequence[int]) -> Pieces:
+        return stacked(self.table, degrees)
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        for i, (needed, own) in enumerate(zip(degrees, self.profile.layout.degrees, strict=True)):
+            if needed > own:
+                raise ReferenceSignalError(
+                    f"row {i} of this TimeOptimalReference has {own} derivatives, the law needs "
+                    f"{needed}; make its profile with the structure of that law"
+                )
+
+
 def _without_last_pause(pieces: Sequence[Piece]) -> Sequence[Piece]:
     """The pieces without a pause at the end in which no output changes."""
     last = pieces[-1]
-    is_over = last.is_pause and np.ptp(last.values, axis=0).max() <= 1e-9 * np.abs(last.values).max()
+    is_over = (
+        last.is_pause and np.ptp(last.values, axis=0).max() <= 1e-9 * np.abs(last.values).max()
+    )
     return pieces[:-1] if is_over else pieces
 
 
 def _pause(piece: Piece) -> ProfilePiece:
     count = piece.times.size
-    zero, none = np.zeros(count), np.zeros(count - 1)
+    zero = np.zeros(count)
     passed = piece.times - piece.times[0]
-    return ProfilePiece(piece, passed, zero, none, zero, np.full(count - 1, -1, dtype=np.intp))
+    return ProfilePiece(piece, passed, zero, zero, zero, np.full(count - 1, -1, dtype=np.intp))
 
 
 def _fastest(rows: Rows, piece: Piece, largest_rate: float | None) -> ProfilePiece:
-    """The fastest motion along a piece."""
+    """The fastest motion along a piece.
+
+    Where the acceleration changes from one interval to the next, as where n of a limit passes
+    through zero, smoothing exceeds the limit a little. It is lowered there if that is too much.
+
+    Raises:
+        ReferenceSignalError: Nothing limits the motion, or it cannot leave a rest.
+    """
     largest, which = rows.largest(inf if largest_rate is None else largest_rate)
+    factor = np.ones(largest.size)
     before: FloatArray | None = None
-    found: Fastest | None = None
+    for _ in range(LOWERINGS + 1):
+        found, before = _settled(rows, piece, largest, factor, before)
+        b, a, times = smoothed(piece.distances, found.b, found.a)
+        lines = rows.lines(b)
+        excess = np.max(lines.alpha * a[:, None] + lines.beta * b[:, None], axis=1, initial=0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            excess = np.maximum(excess, np.where(largest > 0.0, b / largest, 0.0))
+        if excess.max() <= 1.0 + EXCESS:
+            break
+        wide = np.pad(np.maximum(excess / (1.0 + EXCESS / 2.0), 1.0), 1, mode="edge")
+        factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
+    limiting = np.where(found.active >= 0, found.active, which[1:])
+    return ProfilePiece(piece, times, b, a, found.highest, limiting)
+
+
+def _settled(
+    rows: Rows,
+    piece: Piece,
+    largest: FloatArray,
+    factor: FloatArray,
+    before: FloatArray | None,
+) -> tuple[Fastest, FloatArray | None]:
+    """The fastest motion with all limits divided by a factor, and b about which it is exact."""
     for _ in range(1 if rows.is_linear else PASSES):
-        found = fastest_motion(piece.distances, rows.lines(before), largest)
+        lines = rows.lines(before)
+        lowered = Lines(lines.alpha * factor[:, None], lines.beta * factor[:, None])
+        found = fastest_motion(piece.distances, lowered, largest / factor)
         if not np.isfinite(found.b).all():
             raise ReferenceSignalError(
                 "nothing limits the motion: give limits of controls, joints or forces"
             )
+        moves = found.b[1:] + found.b[:-1] > 0.0
+        if not moves.all():
+            place = float(piece.times[int(np.argmin(moves))])
+            raise ReferenceSignalError(
+                f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses "
+                "all of a limit"
+            )
         if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
             break
-        before = found.b if before is None else (found.b + before) / 2.0
-    assert found is not None
-    speed = np.sqrt(found.b)
-    both = speed[1:] + speed[:-1]
-    if not both.all():
-        place = float(piece.times[int(np.argmin(both))])
-        raise ReferenceSignalError(
-            f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses all "
-            "of a limit"
-        )
-    times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(piece.distances) / both)])
-    limiting = np.where(found.active >= 0, found.active, which[1:])
-    return ProfilePiece(piece, times, found.b, found.a, found.highest, limiting)
+        if not rows.is_linear:
+            before = found.b if before is None else (found.b + before) / 2.0
+    return found, before

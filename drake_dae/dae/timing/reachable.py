@@ -3,7 +3,9 @@
 Between points s_i and s_(i+1) of a grid a is constant, so that b_(i+1) = b_i + 2 (s_(i+1) - s_i) a.
 Backward, H_i is the largest b_i from which the motion can be brought to rest at the end:
 
-    H_N = 0,   H_i = max {b : alpha a + beta b <= 1 at s_i and s_(i+1), 0 <= b + 2 ds a <= H_(i+1)}.
+    H_N = 0,   H_i = max {b : alpha a + beta (b + ds a) <= 1, 0 <= b + 2 ds a <= H_(i+1)},
+
+with alpha and beta in the middle of the interval, so that the time is off by (ds)^2.
 
 Forward, a is the largest that stays below H. The result is the largest b at every point, and so
 the shortest time (Pham and Pham, "A new approach to time-optimal path parameterization based on
@@ -58,10 +60,9 @@ def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fas
         largest: The largest b at each point, shape (N + 1,); infinite without one.
     """
     double = 2.0 * np.diff(points)
-    # The limits of an interval: those at its begin, and those at its end by a and b of its begin.
-    beta = np.hstack([lines.beta[:-1], lines.beta[1:]])
-    alpha = np.hstack([lines.alpha[:-1], lines.alpha[1:] + double[:, None] * lines.beta[1:]])
-    count = lines.alpha.shape[1]
+    # The limits in the middle of an interval, by a and b of its begin.
+    beta = (lines.beta[:-1] + lines.beta[1:]) / 2.0
+    alpha = (lines.alpha[:-1] + lines.alpha[1:] + double[:, None] * beta) / 2.0
     with np.errstate(divide="ignore", invalid="ignore"):
         # b + 2 ds a <= H with a line of alpha <= 0, and 0 <= b + 2 ds a with one of alpha >= 0.
         steep = double[:, None] * beta - alpha
@@ -92,7 +93,6 @@ def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fas
         else:
             a[i], active[i], brakes[i] = most, brake[i], True
         b[i + 1] = min(max(b[i] + double[i] * a[i], 0.0), highest[i + 1])
-    active[active >= 0] %= count
     return Fastest(b, a, highest, active, brakes)
 
 

@@ -23,6 +23,7 @@ from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.scenario.timing import timed
 from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
@@ -61,6 +62,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:  # The requirements of a task depend on the times of contact.
         return Feasibility(analyze(model.dae), scenario.duration)
+    in_time, references = timed(scenario, model, structure)
+    scenario = in_time.scenario
     # The law's model alone, without differences of the plant.
     ideal = replace(
         scenario,
@@ -71,7 +74,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         observer=None,
         tolerances=None,
     )
-    loop = build_loop(ideal, model, structure)
+    loop = build_loop(ideal, model, structure, references=references)
     context = start_scenario(ideal, loop)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
