@@ -23,6 +23,7 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
@@ -32,7 +33,6 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
-from drake_dae.scenario.timing import timed
 from drake_dae.systems.plants.contract import Plant
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.pieces import PiecewiseReference
@@ -176,6 +175,8 @@ class Curve:
 
     def _turn(self, times: FloatArray, rates: FloatArray, k: int, after: int) -> float | None:
         """The time between two samples at which the reference rests and turns."""
+        from scipy.optimize import brentq, minimize_scalar  # It takes long to load.
+
         one, other = rates[k], rates[after]
         if one @ other > TURN * np.linalg.norm(one) * np.linalg.norm(other):
             return None

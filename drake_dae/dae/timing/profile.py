@@ -16,6 +16,7 @@ from drake_dae.dae.references.reference import Reference
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.timing.along import AlongCurve
+from drake_dae.dae.timing.coarser import coarser
 from drake_dae.dae.timing.curve import Curve, Piece
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.timing.reachable import Fastest, Lines, fastest_motion
@@ -106,8 +107,7 @@ class PathTiming:
 
     with m, n, c from the law itself, and so are accelerations; speeds limit b. The largest b is
     found by reachable sets, see `dae.timing.reachable`. Friction makes u nonlinear in b: it is then
-    linearized about the profile before, such that it is exact at rest and there, until this does
-    not change.
+    linearized about the profile before, where it is exact, until this does not change.
 
     Args:
         structure: The structure of the system, `find_structure`: rigid joints, where positions have
@@ -174,7 +174,7 @@ class PathTiming:
         guess = system.nominal_state if start is None else vector("start", start, system.num_states)
         numbers = system.parameter_vector(parameters)
         found, causes = list[ProfilePiece](), tuple[Row, ...]()
-        for piece in _without_last_pause(curve.pieces):
+        for piece in _without_last_pause(curve.pieces, along.layout):
             if piece.is_pause:
                 found.append(_pause(piece))
                 continue
@@ -190,7 +190,8 @@ class PathTiming:
 class TimeOptimalReference(PiecewiseReference):
     """The reference of a profile, for all outputs, by the time of the motion.
 
-    Before and after, the values are constant. r'' may jump, forces have no derivatives.
+    Before and after, the values are constant. r'' is continuous except at rests, and accurate to
+    5e-4 of its largest value; forces have no derivatives.
 
     Attributes:
         profile: The profile.
@@ -207,7 +208,8 @@ class TimeOptimalReference(PiecewiseReference):
     def table(self) -> Pieces:
         """The polynomials of r, one row for each output."""
         parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
-        return time_table(parts, self.profile.layout, self.profile.start_time)
+        layout = self.profile.layout
+        return coarser(time_table(parts, layout, self.profile.start_time), layout.dynamic)
 
     def pieces(self, degrees: Sequence[int]) -> Pieces:
         return stacked(self.table, degrees)
@@ -221,13 +223,11 @@ class TimeOptimalReference(PiecewiseReference):
                 )
 
 
-def _without_last_pause(pieces: Sequence[Piece]) -> Sequence[Piece]:
+def _without_last_pause(pieces: Sequence[Piece], layout: Layout) -> Sequence[Piece]:
     """The pieces without a pause at the end in which no output changes."""
-    last = pieces[-1]
-    is_over = (
-        last.is_pause and np.ptp(last.values, axis=0).max() <= 1e-9 * np.abs(last.values).max()
-    )
-    return pieces[:-1] if is_over else pieces
+    values = pieces[-1].values[:, layout.lowest]
+    is_still = np.ptp(values, axis=0).max() <= 1e-9 * np.abs(values).max()
+    return pieces[:-1] if pieces[-1].is_pause and is_still else pieces
 
 
 def _pause(piece: Piece) -> ProfilePiece:
@@ -272,7 +272,7 @@ def _settled(
     before: FloatArray | None,
 ) -> tuple[Fastest, FloatArray | None]:
     """The fastest motion with all limits divided by a factor, and b about which it is exact."""
-    for _ in range(1 if rows.is_linear else PASSES):
+    for number in range(1 if rows.is_linear else PASSES):
         lines = rows.lines(before)
         lowered = Lines(lines.alpha * factor[:, None], lines.beta * factor[:, None])
         found = fastest_motion(piece.distances, lowered, largest / factor)
@@ -290,5 +290,5 @@ def _settled(
         if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
             break
         if not rows.is_linear:
-            before = found.b if before is None else (found.b + before) / 2.0
+            before = found.b if before is None or number < 10 else (found.b + before) / 2.0
     return found, before

@@ -51,6 +51,7 @@ class Fastest:
     brakes: np.typing.NDArray[np.bool_]
 
 
+@np.errstate(all="ignore")  # Without any limit b is infinite.
 def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fastest:
     """The fastest motion from rest to rest.
 
@@ -63,14 +64,13 @@ def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fas
     # The limits in the middle of an interval, by a and b of its begin.
     beta = (lines.beta[:-1] + lines.beta[1:]) / 2.0
     alpha = (lines.alpha[:-1] + lines.alpha[1:] + double[:, None] * beta) / 2.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # b + 2 ds a <= H with a line of alpha <= 0, and 0 <= b + 2 ds a with one of alpha >= 0.
-        steep = double[:, None] * beta - alpha
-        of_two = np.where(steep > 0.0, 1.0 / steep, np.inf)
-        braking = np.where((steep > 0.0) & (alpha < 0.0), -alpha * of_two, 0.0)
-        stopping = double[:, None] * of_two
-        upper = np.where(alpha > 0.0, 1.0 / alpha, np.inf)
-        falls = np.where(alpha > 0.0, beta / alpha, 0.0)
+    # b + 2 ds a <= H with a line of alpha <= 0, and 0 <= b + 2 ds a with one of alpha >= 0.
+    steep = double[:, None] * beta - alpha
+    of_two = np.where(steep > 0.0, 1.0 / steep, np.inf)
+    braking = np.where((steep > 0.0) & (alpha < 0.0), -alpha * of_two, 0.0)
+    stopping = double[:, None] * of_two
+    upper = np.where(alpha > 0.0, 1.0 / alpha, np.inf)
+    falls = np.where(alpha > 0.0, beta / alpha, 0.0)
     own = np.minimum(largest[:-1], np.where(alpha >= 0.0, stopping, np.inf).min(axis=1))
     own = _with_both(alpha, beta, own)
     stopping = np.where(alpha < 0.0, stopping, np.inf)

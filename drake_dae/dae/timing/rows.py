@@ -16,6 +16,9 @@ from drake_dae.errors import ReferenceSignalError
 LINEAR = 1e-7
 """Signals count as linear in (a, b) up to this share of their size."""
 
+SLOW = 0.01
+"""The slowest speed at which friction is evaluated, as a share of the largest."""
+
 CHECKED = 20
 """One point in so many is tested for that."""
 
@@ -88,25 +91,27 @@ class Rows:
         """The lines; where signals are not linear, those about a profile before.
 
         Args:
-            before: b of the profile before, shape (N + 1,); None for the first.
+            before: b of the profile before, shape (N + 1,), at which lines are exact; None for the
+            first.
         """
-        by_a, by_b = self.by_a, self.by_b
-        if before is not None and not self.is_linear:
-            # Exact at rest and at this profile.
-            b = np.maximum(before, 1e-12 * before.max())
-            speed = np.sqrt(b)
-            now = self._values(speed, 0.0 * b)
-            by_b = (now - self.still) / b[:, None]
-            by_a = (self._values(speed, 0.0 * b + self.scale**2) - now) / self.scale**2
+        by_a, by_b, still = self.by_a, self.by_b, self.still
+        if not self.is_linear:
+            # At rest as in slow motion.
+            now = np.full(len(still), self.scale**2) if before is None else before
+            speed = np.maximum(np.sqrt(now), SLOW * np.sqrt(now.max()))
+            zero = np.zeros(len(still))
+            values = self._values(speed, zero)
+            by_a = (self._values(speed, zero + self.scale**2) - values) / self.scale**2
+            still = values - speed[:, None] ** 2 * by_b
         low, high = self.along.limited.low, self.along.limited.high
         up, down = np.isfinite(high), np.isfinite(low)
-        above = high[up] - self.still[:, up]
-        below = self.still[:, down] - low[down]
+        above, below = high[up] - still[:, up], still[:, down] - low[down]
+        _check_friction(self, above, below)
         tools = self.tools
-        return Lines(
-            np.hstack([by_a[:, up] / above, -by_a[:, down] / below, *(t.of_a for t in tools)]),
-            np.hstack([by_b[:, up] / above, -by_b[:, down] / below, *(t.of_b for t in tools)]),
-        )
+        none = np.zeros((len(still), 1))  # A line that limits nothing, after all others.
+        of_a = [by_a[:, up] / above, -by_a[:, down] / below, *(t.of_a for t in tools), none]
+        of_b = [by_b[:, up] / above, -by_b[:, down] / below, *(t.of_b for t in tools), none]
+        return Lines(np.hstack(of_a), np.hstack(of_b))
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
         """The largest b at each point, and what limits it as a place in `names`.
@@ -164,7 +169,8 @@ def rows_along(
     still = values(0.0, 0.0)
     _check_rest(along, piece, at_rest, still)
     by_a = (values(0.0, speed**2) - still) / speed**2
-    by_b = (values(speed, 0.0) - still) / speed**2
+    # Without friction, which does not grow with b.
+    by_b = (values(2.0 * speed, 0.0) - values(speed, 0.0)) / (3.0 * speed**2)
     twice = values(2.0 * speed, speed**2, CHECKED)
     expected = still + speed**2 * (4.0 * by_b + by_a)
     off = np.abs(twice - expected[::CHECKED]).max(axis=0, initial=0.0)
@@ -174,6 +180,24 @@ def rows_along(
     is_linear = bool((off <= LINEAR * size).all())
     return Rows(
         along, piece, parameters, at_rest, moving, still, by_a, by_b, speed, is_linear, tools
+    )
+
+
+def _check_friction(rows: Rows, above: FloatArray, below: FloatArray) -> None:
+    """Refuses friction that needs more than the limits in slow motion.
+
+    Raises:
+        ReferenceSignalError: Which signal, and where.
+    """
+    room = np.hstack([above, below])
+    if not room.size or room.min() > 0.0:
+        return
+    point, column = np.unravel_index(int(room.argmin()), room.shape)
+    row = rows.names[int(column)]
+    raise ReferenceSignalError(
+        f"in slow motion at t = {rows.piece.times[point]:.4g} s of the reference {row.name} is "
+        f"{-room.min():.4g} {row.unit} beyond its limit, with friction: no motion along this path "
+        "is within the limits. Choose another path, posture or force, or larger limits"
     )
 
 
@@ -197,7 +221,9 @@ def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: Flo
         room = np.minimum(limited.high - values, values - limited.low)
         if not room.size or room.min() > 0.0:
             continue
-        point, column = np.unravel_index(int(room.argmin()), room.shape)
+        size = np.minimum(np.abs(limited.high), np.abs(limited.low))
+        share = room / np.where((size > 0.0) & np.isfinite(size), size, 1.0)
+        point, column = np.unravel_index(int(share.argmin()), room.shape)
         value, signal = values[point, column], limited.signals[column]
         is_high = limited.high[column] - value <= 0.0
         bound = limited.high[column] if is_high else limited.low[column]

@@ -20,7 +20,7 @@ from drake_dae.dae.timing.curve import Piece
 
 # A quintic on [0, 1] with given values and first and second derivatives at both ends: the factors
 # of 1, x, ..., x^5 from (p0, v0, a0, p1, v1, a1).
-_QUINTIC = np.array(
+QUINTIC = np.array(
     [
         [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
@@ -91,5 +91,5 @@ def _polynomials(
         ],
         axis=-1,
     )
-    found[:, moving] = given @ _QUINTIC.T
+    found[:, moving] = given @ QUINTIC.T
     return found

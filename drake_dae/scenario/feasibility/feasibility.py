@@ -18,12 +18,12 @@ from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
+from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.scenario.timing import timed
 from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 

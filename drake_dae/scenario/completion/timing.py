@@ -6,7 +6,7 @@ from dataclasses import replace
 from drake_dae.dae.references import Reference, references_by_name
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.timing.profile import PathTiming, TimeOptimalReference
-from drake_dae.errors import ReferenceSignalError
+from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.motion_limits import robot_motion_limits
 from drake_dae.scenario.completion.completion import Completed
@@ -36,14 +36,14 @@ def timed(
     wanted = scenario.time_optimal
     if wanted is None:
         return Completed(scenario), None
+    if scenario.task is not None:
+        raise ScenarioError(("time_optimal", "a task plans its own motion: it has no path to time"))
     with at("references"):
         outputs = [signal.name for signal in model.dae.output_signals]
         references = references_by_name(scenario.references, outputs, structure.output_degrees)
     begin = scenario.integrator.start_time
     until = begin + scenario.duration if wanted.until is None else wanted.until
     with at("time_optimal"):
-        if scenario.task is not None:
-            raise ReferenceSignalError("a task plans its own references: it has no path to time")
         limits = robot_motion_limits(
             model,
             efforts=wanted.efforts,
