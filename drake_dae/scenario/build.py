@@ -23,7 +23,7 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.completion.timing import Timed, timed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
@@ -69,11 +69,11 @@ def build_completed(
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    in_time, references = timed(chosen.scenario, model, structure)
+    in_time, motion = timed(chosen.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *in_time.notes)
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(
-        completed.scenario, model, structure, scene_graph, meshcat, references=references
+        completed.scenario, model, structure, scene_graph, meshcat, motion=motion
     )
 
 
@@ -84,7 +84,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
-    references: Sequence[Reference] | None = None,
+    motion: Timed | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -95,7 +95,7 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
-        references: References in place of the scenario's, from `timed`; None for the scenario's.
+        motion: The time-optimal motion, from `timed`; None for the scenario's references.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -104,8 +104,11 @@ def build_loop(
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, model, structure))
-    if references is None:
-        references = [] if task is not None else _references(scenario.references, law)
+    references: list[Reference] = []
+    if motion is not None:
+        references = [motion.reference]
+    elif task is None:
+        references = _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
@@ -132,6 +135,7 @@ def build_loop(
         observer=scenario.observer,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
+        governed=None if motion is None else motion.governed,
         tolerances=scenario.tolerances,
         start_time=scenario.integrator.start_time,
     )

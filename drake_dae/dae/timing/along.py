@@ -1,15 +1,14 @@
 """What a system needs along a curve, at rest and at any speed and acceleration."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.timing.curve import Piece
+from drake_dae.dae.timing.limited_signals import LimitedSignals
 from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
@@ -27,20 +26,6 @@ COARSE = 16
 """The points of a piece whose states are found one after the other, from the one before."""
 
 
-@dataclass(frozen=True, eq=False)
-class Limited:
-    """The limits of all signals that have any, in the order of their values.
-
-    Attributes:
-        signals: Names and units, k of them.
-        low, high: The lowest and highest values, shape (k,), infinite without a limit.
-    """
-
-    signals: tuple[Signal, ...]
-    low: FloatArray
-    high: FloatArray
-
-
 class AlongCurve:
     """The tracking law's own feedforward along a curve, equations (28), (35) without error.
 
@@ -55,8 +40,7 @@ class AlongCurve:
         limits: The limits.
 
     Attributes:
-        limited: The limited controls, rates and constraint forces.
-        speeds: The limited states.
+        limited: The signals that have limits.
 
     Raises:
         ModelError: A limit names no signal of the system.
@@ -66,7 +50,7 @@ class AlongCurve:
 
     def __init__(self, structure: Structure, limits: MotionLimits) -> None:
         _check(structure)
-        limits.check(structure.system)
+        self.limited = LimitedSignals(structure, limits)
         self._pinned = PinnedOutputs(structure)
         self.system, self.layout = structure.system, structure.layout
         state = self.system.state
@@ -78,44 +62,9 @@ class AlongCurve:
         gradients = ca.densify(ca.jacobian(equations, state))
         newton = ca.Function("newton", given, ca.cse([ca.densify(equations), gradients]))
         self._newton = ManyPoints(newton, self.system.compiled)
-        self._place_limits(limits)
         control, _ = structure.control_for(reference[self.layout.highest.tolist(), :])  # (28)
-        motion = structure.derivatives
-        rate, force = (  # (25), (35)
-            ca.substitute(motion.expand(unknown), motion.control, control)
-            for unknown in (motion.rate, motion.constraint_input)
-        )
-        asked = ca.vertcat(control, rate, force, ca.mtimes(ca.DM(self._cones), force))
-        values = ca.Function("along", given, ca.cse([ca.densify(asked[self._rows, :])]))
+        values = ca.Function("along", given, ca.cse([self.limited.values(control)]))
         self._values = ManyPoints(values, self.system.compiled)
-
-    def _place_limits(self, limits: MotionLimits) -> None:
-        """Finds which rows of (u, x', v, cones) have limits."""
-        system = self.system
-        forces = [signal.name for signal in system.constraint_input_signals]
-        self._cones = np.zeros((0, len(forces)))
-        signals: list[Signal] = [*system.control_signals]
-        signals += [signal.derivative(1) for signal in system.state_signals]
-        signals += system.constraint_input_signals
-        kinds = ("controls", system.control_signals), ("rates", system.state_signals)
-        parts = [limits.bounds(*kind) for kind in (*kinds, ("forces", signals[-len(forces) :]))]
-        low, high = (np.concatenate([part[i] for part in parts]) for i in range(2))
-        for cone in limits.cones:
-            rows = cone.rows(forces)
-            self._cones = np.vstack([self._cones, rows])
-            signals += [Signal(f"friction cone of {cone.normal}", "N")] * len(rows)
-            low = np.append(low, np.full(len(rows), -np.inf))
-            high = np.append(high, np.zeros(len(rows)))
-        rows_with = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
-        self._rows = rows_with.tolist()
-        self.limited = Limited(
-            tuple(signals[i] for i in self._rows), low[rows_with], high[rows_with]
-        )
-        low, high = limits.bounds("states", system.state_signals)
-        places = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
-        self._states = places
-        chosen = tuple(system.state_signals[i] for i in places)
-        self.speeds = Limited(chosen, low[places], high[places])
 
     def reference(self, piece: Piece, w: FloatArray, a: FloatArray) -> FloatArray:
         """R at the points for speeds and accelerations along the curve, (N + 1, sum (mu_i + 1))."""
@@ -188,7 +137,7 @@ class AlongCurve:
 
     def limited_states(self, states: FloatArray) -> FloatArray:
         """The limited states, shape (k, number of them)."""
-        return states[:, self._states]
+        return states[:, self.limited.states]
 
 
 def _interpolated(places: np.ndarray, values: FloatArray, wanted: np.ndarray) -> FloatArray:

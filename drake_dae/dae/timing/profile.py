@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,7 +23,7 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.timing.reachable import Fastest, Lines, fastest_motion
 from drake_dae.dae.timing.rows import Row, Rows, rows_along
 from drake_dae.dae.timing.smoothing import smoothed
-from drake_dae.dae.timing.time_table import stacked, time_table
+from drake_dae.dae.timing.time_table import at_rest_outside, stacked, time_table
 from drake_dae.dae.timing.tool_limits import tool_limits
 from drake_dae.errors import ModelError, ReferenceSignalError
 
@@ -33,6 +34,9 @@ PASSES = 40
 
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
+
+MOST_POLYNOMIALS = 500
+"""The largest number of polynomials of an expression; longer references are tables."""
 
 LOWERINGS = 3
 """How often limits are lowered where the motion exceeds them."""
@@ -209,10 +213,16 @@ class TimeOptimalReference(PiecewiseReference):
         """The polynomials of r, one row for each output."""
         parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
         layout = self.profile.layout
-        return coarser(time_table(parts, layout, self.profile.start_time), layout.dynamic)
+        table = time_table(parts, layout, self.profile.start_time)
+        return at_rest_outside(coarser(table, layout.dynamic))
 
     def pieces(self, degrees: Sequence[int]) -> Pieces:
         return stacked(self.table, degrees)
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        self._check(degrees)
+        pieces = self.pieces(degrees)
+        return pieces.expression(time) if len(pieces.factors) <= MOST_POLYNOMIALS else None
 
     def _check(self, degrees: Sequence[int]) -> None:
         for i, (needed, own) in enumerate(zip(degrees, self.profile.layout.degrees, strict=True)):

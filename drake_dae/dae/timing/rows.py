@@ -76,14 +76,14 @@ class Rows:
     @property
     def names(self) -> tuple[Row, ...]:
         """What may limit: all lines, then what limits b alone."""
-        limited, speeds = self.along.limited, self.along.speeds
+        limited = self.along.limited
         pairs = [*zip(limited.signals, limited.low, limited.high, strict=True)]
         rows = [Row(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
         rows += [Row(s.name, "least", s.unit) for s, low, _ in pairs if np.isfinite(low)]
         rows += [Row("acceleration of a path", "largest", "")] * sum(
             tool.of_a.shape[1] for tool in self.tools
         )
-        rows += [Row(s.name, "largest", s.unit) for s in speeds.signals]
+        rows += [Row(s.name, "largest", s.unit) for s in limited.state_signals]
         rows += [Row("speed of a path", "largest", "")] * len(self.tools)
         return (*rows, Row("rate of the reference's time", "largest", ""))
 
@@ -119,11 +119,12 @@ class Rows:
         Args:
             rate: The largest rate of the reference's time.
         """
-        speeds = self.along.speeds
+        limited = self.along.limited
         rest = self.along.limited_states(self.at_rest)
         slope = self.along.limited_states(self.moving)
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(slope > 0.0, speeds.high - rest, speeds.low - rest) / slope
+            room = np.where(slope > 0.0, limited.state_high - rest, limited.state_low - rest)
+            room = room / slope
         room = np.where(slope == 0.0, np.inf, room)
         own = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
         columns = [room**2, *(tool.largest[:, None] for tool in self.tools), own[:, None] ** 2]
@@ -207,26 +208,32 @@ def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: Flo
     Raises:
         ReferenceSignalError: Which signal, where, and by how much.
     """
+    limited = along.limited
     both = (
-        (along.limited, still),
-        (along.speeds, along.limited_states(at_rest)),
+        (limited.signals, limited.low, limited.high, still),
+        (
+            limited.state_signals,
+            limited.state_low,
+            limited.state_high,
+            along.limited_states(at_rest),
+        ),
     )
-    for limited, values in both:
+    for signals, low, high, values in both:
         if not np.isfinite(values).all():
             place = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
             raise ReferenceSignalError(
                 f"the path has no control at t = {place:.4g} s of the reference: it leads through "
                 "a singular configuration"
             )
-        room = np.minimum(limited.high - values, values - limited.low)
+        room = np.minimum(high - values, values - low)
         if not room.size or room.min() > 0.0:
             continue
-        size = np.minimum(np.abs(limited.high), np.abs(limited.low))
+        size = np.minimum(np.abs(high), np.abs(low))
         share = room / np.where((size > 0.0) & np.isfinite(size), size, 1.0)
         point, column = np.unravel_index(int(share.argmin()), room.shape)
-        value, signal = values[point, column], limited.signals[column]
-        is_high = limited.high[column] - value <= 0.0
-        bound = limited.high[column] if is_high else limited.low[column]
+        value, signal = values[point, column], signals[column]
+        is_high = high[column] - value <= 0.0
+        bound = high[column] if is_high else low[column]
         reached = "may be at most" if is_high else "must be at least"
         raise ReferenceSignalError(
             f"at rest at t = {piece.times[point]:.4g} s of the reference {signal.name} is "

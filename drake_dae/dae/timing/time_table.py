@@ -52,6 +52,17 @@ def time_table(
     return Pieces(np.concatenate(breaks), np.concatenate(factors))
 
 
+def at_rest_outside(table: Pieces) -> Pieces:
+    """The table with a second of rest before and after, so that r'' is 0 there."""
+    breaks, factors = table.breaks, table.factors
+    rests = np.zeros((2, *factors.shape[1:]))
+    rests[0, :, 0], rests[1, :, 0] = factors[0, :, 0], factors[-1].sum(axis=-1)
+    return Pieces(
+        np.concatenate([breaks[:1] - 1.0, breaks, breaks[-1:] + 1.0]),
+        np.concatenate([rests[:1], factors, rests[1:]]),
+    )
+
+
 def stacked(table: Pieces, degrees: Sequence[int]) -> Pieces:
     """Polynomials with their derivatives: r_1, ..., r_1^(mu_1), r_2, ..."""
     widths, rows = np.diff(table.breaks)[:, None], []

@@ -62,7 +62,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:  # The requirements of a task depend on the times of contact.
         return Feasibility(analyze(model.dae), scenario.duration)
-    in_time, references = timed(scenario, model, structure)
+    in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
     # The law's model alone, without differences of the plant.
     ideal = replace(
@@ -74,7 +74,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         observer=None,
         tolerances=None,
     )
-    loop = build_loop(ideal, model, structure, references=references)
+    loop = build_loop(ideal, model, structure, motion=motion_in_time)
     context = start_scenario(ideal, loop)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 

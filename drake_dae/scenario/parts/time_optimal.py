@@ -32,8 +32,11 @@ class TimeOptimal:
         largest_rate: How many times as fast as the references a part of the path may be; 1 for a
             motion that is slowed where limits require it. No limit if left out.
         until: The time of the references at which the path ends, in s; if left out `duration`, and
-            then the run lasts as long as the motion.
+            then the run lasts as long as the motion, with a governor 0.5 s longer.
         points: The number of intervals of the grid along the path.
+        governor: Whether the motion is slowed while it runs where the robot, off its path, would
+            exceed a limit. If left out it is where that is possible: for a law without observer or
+            exogenous signals, on a path that needs no more than 500 polynomials.
     """
 
     efforts: float = 0.95
@@ -44,6 +47,7 @@ class TimeOptimal:
     largest_rate: float | None = None
     until: float | None = None
     points: int = 1000
+    governor: bool | None = None
 
     def __post_init__(self) -> None:
         for name in ("efforts", "joint_speeds", "joint_accelerations"):
