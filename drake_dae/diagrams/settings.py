@@ -38,7 +38,9 @@ class LoopSettings:
         exogenous: The exogenous signals of plant and law, as references for all entries of w in
             their order; constant if none are given.
         plant_exogenous: Those of the plant if they differ from the law's; None if they are equal.
-        governed: The limits within which a `PathGovernor` slows the references; None for none.
+        governed: The limits within which a `PathGovernor` slows the references; None for none. With
+            `control_limits` as well, these and the limits of forces hold by `FeasibleControl`, and
+            the record has its "departure".
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
         start_time: The start of a run, in s: the zero dynamics are judged at the references then.
     """

@@ -18,6 +18,7 @@ from drake_dae.diagrams.parts import (
     add_block,
     add_drives,
     add_exogenous,
+    add_feasible,
     add_hold,
     add_watch,
     check_parts,
@@ -161,7 +162,14 @@ def wire_loop(
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
     held = None if parts.sampling is None else hold_before(plant, parts.sampling)
-    control, limits = add_drives(builder, controller, held, parts.control_limits)
+    feasible = None
+    if parts.governed is not None and parts.control_limits is not None:
+        feasible = add_feasible(builder, controller, parts.governed, parts.control_limits, state)
+        control, limits = add_drives(
+            builder, controller, held, None, feasible.GetOutputPort("control")
+        )
+    else:
+        control, limits = add_drives(builder, controller, held, parts.control_limits)
     if controller.HasOutputPort("feedback"):
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
@@ -182,8 +190,9 @@ def wire_loop(
             builder, plant, controller, parts.observer, state, held, control, goal, limits
         )
         holds.append(observer.GetOutputPort("hold"))
-    elif limits is not None:
-        holds.append(limits.GetOutputPort("is_limited"))
+    for block in (limits if observer is None else None, feasible):
+        if block is not None:
+            holds.append(block.GetOutputPort("is_limited"))
     add_hold(builder, controller, holds)
 
     # The constraint force goes through its sensor to the blocks that measure it.
@@ -201,6 +210,9 @@ def wire_loop(
         **_of_plant(plant, moving, reference, law, control),
         **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
     }
+    if feasible is not None:
+        named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
+        named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
     if reference is not None:
         for name, signals in reference.further_signals.items():
             named[name] = (reference.GetOutputPort(name), signals)

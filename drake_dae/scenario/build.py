@@ -113,6 +113,9 @@ def build_loop(
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
+    if motion is not None and motion.governed is not None and limits is None:
+        # A governed motion keeps the limits of its drives, where all have one.
+        limits = model.control_limits if np.isfinite(model.control_limits).all() else None
 
     # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
