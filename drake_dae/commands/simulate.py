@@ -51,6 +51,7 @@ from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
+    departure_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -258,6 +259,7 @@ def _write(run: _CommandRun) -> bool:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
             text = "\n".join([text, *surface_remarks(model, record), *rolling])
+        text = "\n".join([text, *departure_remarks(record, limits.control)])
         scenario = run.scenario
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         text = "\n".join([text, *reference_remarks(followed)])

@@ -146,7 +146,11 @@ def add_feasible(
         WiringError: They do not fit.
     """
     structure, names = controller.law.structure, controller.law.system.control_signals
-    sizes = np.broadcast_to(np.asarray(control_limits, dtype=float), (len(names),)).tolist()
+    sizes = np.asarray(control_limits, dtype=float).reshape(-1).tolist()
+    if len(sizes) != len(names):
+        raise WiringError(
+            f"control_limits has {len(sizes)} entries, there are {len(names)} controls"
+        )
     controls = {signal.name: (-size, size) for signal, size in zip(names, sizes, strict=True)}
     try:
         limits = MotionLimits(controls, forces=governed.forces, cones=governed.cones)

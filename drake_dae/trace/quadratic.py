@@ -1,12 +1,17 @@
 """Small quadratic programs as expressions: a fixed number of steps, no branches."""
 
 import casadi as ca
-import numpy as np
 
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 STEPS = 13
 """The number of steps; errors of about one fall below 1e-7."""
+
+CLOSEST = 1e-13
+"""The least distance from a bound."""
+
+DONE = 1e-12
+"""The mean of the products of slacks and multipliers at which x does not change any more."""
 
 BOUNDARY = 0.995
 """The share of the way to the nearest bound that a step goes at most."""
@@ -58,7 +63,8 @@ def _step(
     softness: float,
 ) -> list[ca.SX]:
     """x, the slacks s of soft bounds, and the multipliers of x <= 1, x >= -1 and A x <= b."""
-    count, above, below = 2 * x.numel() + s.numel(), 1.0 - x, 1.0 + x
+    count = 2 * x.numel() + s.numel()
+    above, below = ca.fmax(1.0 - x, CLOSEST), ca.fmax(1.0 + x, CLOSEST)
     dual = ca.mtimes(H, x - g) + u - l + ca.mtimes(A.T, z)
     primal = ca.mtimes(A, x) + s - b - softness * z
     weights, to_upper, to_lower = z / (s + softness * z), u / above, l / below
@@ -93,5 +99,8 @@ def _step(
     corrected = (ds * dz, -dx * du, dx * dl)
     step = direction(*(p + c - center for p, c in zip(products, corrected, strict=True)))
     # At round-off products vanish; then nothing changes any more.
-    t = ca.if_else(mean > np.finfo(float).eps, BOUNDARY * length(*step), 0.0)
-    return [one + t * change for one, change in zip((x, s, u, l, z), step, strict=True)]
+    t, goes_on = BOUNDARY * length(*step), mean > DONE
+    return [
+        one + ca.if_else(goes_on, t * change, 0.0)
+        for one, change in zip((x, s, u, l, z), step, strict=True)
+    ]

@@ -66,12 +66,13 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     found = nearest_within(metric, goal, rows, bounds, SOFTNESS)
     over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(rows, goal) - bounds)
     is_limited = ca.mmax(over) > WITHIN
-    kept = ca.fmax(-1.0, ca.fmin(1.0, found)) * scale
-    control = ca.if_else(is_limited, kept, wanted)
+    kept = ca.if_else(is_limited, found * scale, wanted)
+    control = ca.fmax(-scale, ca.fmin(scale, kept))
+    excess = ca.if_else(is_limited, wanted - control, 0.0)
     outputs = {
         "control": control,
-        "excess": wanted - control,
-        "departure": ca.mtimes(matrix, control - wanted),
+        "excess": excess,
+        "departure": -ca.mtimes(matrix, excess),
         "is_limited": is_limited,
     }
     inputs = {"state": system.state, "control": wanted, "parameters": system.parameter_symbol}

@@ -42,12 +42,13 @@ class Governing:
     the control (28) at the present state, with its feedback, is affine in s'', and so are
     accelerations and constraint forces: each limit bounds s''. So
 
-        s'' = max(low, min(high, RATE (1 - s'))),   s'' >= -RATE s',
+        s'' = max(low, min(high, RATE (1 - s'))),   -RATE s' <= s'' <= RATE (1 - s'),
 
-    where s' = 1 is the reference's own rate. A limit is met AHEAD of time: a change of s' by
-    AHEAD s'' counts with its effect on r_ss s'^2. Speeds v are kept below V by
-    v' <= APPROACH (V - v), as far as the other limits allow. Where low > high, s'' is their mean,
-    and some limit is exceeded.
+    where s' = 1 is the reference's own rate, which is not exceeded. A limit is met AHEAD of time: a
+    change of s' by AHEAD s'' counts with its effect on r_ss s'^2, as far as the limits hold now.
+    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. Where
+    low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
+    exceeded.
 
     Args:
         law: The law, without exogenous signals.
@@ -93,9 +94,11 @@ class Governing:
         now, ahead = ca.SX.zeros(len(law.degrees)), ca.SX.zeros(len(law.degrees))
         now[layout.dynamic.tolist()] = first
         ahead[layout.dynamic.tolist()] = first + 2.0 * AHEAD * rate * second
-        (low, high), (slow, fast) = self._intervals(wanted, now, ahead)
-        chosen = _within(RATE * (1.0 - rate), slow, fast)
-        chosen = ca.fmax(_within(chosen, low, high), -RATE * rate)
+        intervals = self._intervals(wanted, now, ahead)
+        chosen = most = RATE * (1.0 - rate)
+        for low, high in intervals:
+            chosen = _within(chosen, low, high)
+        chosen = ca.fmax(ca.fmin(chosen, most), -RATE * rate)
         reference = ca.SX(still)
         reference[(moving + 2).tolist()] += first * chosen
         inputs = {"path": path, "state": law.system.state, "parameters": law.inputs["parameters"]}
@@ -121,10 +124,8 @@ class Governing:
             rows.append(row)
         return ca.vertcat(*rows)
 
-    def _intervals(
-        self, wanted: ca.SX, now: ca.SX, ahead: ca.SX
-    ) -> tuple[tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]:
-        """The least and the largest s'' by the limits of signals, and by those of states.
+    def _intervals(self, wanted: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+        """The least and the largest s'' by speeds, by other limits ahead of time, and now.
 
         Args:
             wanted: ubar of (28) for s'' = 0, shape (p, 1).
@@ -140,14 +141,16 @@ class Governing:
         own, by = limited.by_control()
         values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope)
         sizes = np.minimum(np.abs(limited.low), np.abs(limited.high))
-        others = _interval(values, slopes, ca.SX(limited.low), ca.SX(limited.high), sizes)
+        bounds = ca.SX(limited.low), ca.SX(limited.high)
+        at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
+        later = _interval(values, slopes, *bounds, sizes)
         own, by = limited.rates_of_states()
         speeds = self.law.system.state[limited.states]
         low = APPROACH * (limited.state_low - speeds)
         high = APPROACH * (limited.state_high - speeds)
         sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
         values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope_now)
-        return others, _interval(values, slopes, ca.SX(low), ca.SX(high), sizes)
+        return [_interval(values, slopes, ca.SX(low), ca.SX(high), sizes), later, at_once]
 
 
 def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:

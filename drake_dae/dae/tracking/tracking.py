@@ -154,7 +154,7 @@ class TrackingLaw:
         Args:
             reference: R, an expression of shape (sum (mu_i + 1), 1).
         """
-        given = {"reference": reference}
+        given = {"reference": ca.densify(reference)}
         if self.measured_force is not None:
             force = ca.SX.zeros(self._inputs["measured_force"].numel())
             for output, place in self.measured_force.inputs.items():
