@@ -132,6 +132,8 @@ from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
+from .systems.governing.feasible_control import FeasibleControl as FeasibleControl
+from .systems.governing.governor import PathGovernor as PathGovernor
 from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_material import PointMaterial as PointMaterial

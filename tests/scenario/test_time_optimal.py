@@ -92,8 +92,8 @@ def test_the_command_leaves_a_picture_of_the_profile(tmp_path, capsys, rolled):
     # The tip goes where the reference of the file goes, from rest to rest.
     desired = record["desired_output"][:, 0]
     # A step is not at the turn itself.
-    assert desired.min() == pytest.approx(0.0, abs=1e-4)
-    assert desired.max() == pytest.approx(0.6, abs=1e-4)
+    assert desired.min() == pytest.approx(0.0, abs=2e-3)
+    assert desired.max() == pytest.approx(0.6, abs=2e-3)
     assert np.abs(record["reference"][[0, -1], 1]).max() < 1e-9
     # The start error of 5 cm decays as predicted, to the accuracy of the integrator.
     error = record["tracking_error"][:, 0]

@@ -60,6 +60,7 @@ PAPER = (
     "beyond",
     "zero_dynamics",
     "timing",
+    "governing",
     "extension",
 )
 # One person holds a folder of so many files in mind, and a file of so many lines.

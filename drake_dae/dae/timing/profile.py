@@ -201,6 +201,8 @@ class TimeOptimalReference(PiecewiseReference):
         profile: The profile.
     """
 
+    is_table = True
+
     profile: TimeProfile
     order: int = field(default=2, init=False)
 

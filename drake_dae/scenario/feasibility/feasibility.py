@@ -37,6 +37,9 @@ _STRAIGHT = 0.01
 """The allowed deviation of a reference from a straight line between two times, relative to its
 range."""
 
+_SHORTEST = 1e-6
+"""The shortest interval that is divided, relative to the whole."""
+
 _SLACK = 1e-9
 """The excess over a limit that counts, in its unit: a start may be on the limit."""
 
@@ -131,7 +134,8 @@ def sample_times(
         # A constant varies by round-off.
         allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
         off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
-        new = np.flatnonzero(np.any(off > allowed, axis=1))
+        is_long = np.diff(times) > _SHORTEST * (end - begin)  # The second derivative may jump.
+        new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
         room = MOST_SAMPLES - times.size
         is_resolved = new.size <= room
         if not is_resolved:

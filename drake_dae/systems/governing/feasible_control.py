@@ -4,9 +4,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.governing.feasible import feasible_control
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.timing.feasible import feasible_control
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.failures import simulation_error

@@ -15,9 +15,9 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.governing.governing import Governing
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.timing.governing import Governing
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError

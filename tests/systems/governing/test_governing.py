@@ -20,7 +20,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.dae.timing.feasible import feasible_control
+from drake_dae.dae.governing.feasible import feasible_control
 from drake_dae.errors import ModelError, WiringError
 
 MOTORS = ("joint1_motor", "joint2_motor")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
-from drake_dae.trace.quadratic import nearest_within
+from drake_dae.dae.governing.quadratic import nearest_within
 
 
 @pytest.mark.parametrize(("size", "count"), [(2, 1), (7, 2)])

@@ -3,12 +3,12 @@
 import casadi as ca
 import numpy as np
 
+from drake_dae.dae.governing.quadratic import nearest_within
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.timing.limited_signals import LimitedSignals
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.quadratic import nearest_within
 
 SOFTNESS = 1e-8
 """How far forces give way where drives cannot hold them, for a multiplier of one."""
