@@ -12,7 +12,7 @@ from drake_dae.dae.timing.limited_signals import LimitedSignals
 from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.errors import ReferenceSignalError
+from drake_dae.errors import InconsistentStateError, ReferenceSignalError
 
 CONVERGED = 1e-6
 """A Newton step that is this small relative to the states is the last one."""
@@ -82,15 +82,19 @@ class AlongCurve:
             x, shape (N + 1, n), and dx/dw at w = 0, shape (N + 1, n).
 
         Raises:
-            InconsistentStateError: A point is out of reach; the message says which outputs.
-            ReferenceSignalError: The path leads through a singular configuration.
+            ReferenceSignalError: A point is out of reach, or the path leads through a singular
+                configuration.
         """
         count, still = len(piece.times) - 1, np.zeros(len(piece.times))
         rest = self.reference(piece, still, still)
         places = np.unique(np.linspace(0, count, COARSE + 1).astype(int))
         coarse = []
-        for row in rest[places]:
-            guess = self._pinned.state(row, guess, parameters)
+        for row, time in zip(rest[places], piece.times[places], strict=True):
+            try:
+                guess = self._pinned.state(row, guess, parameters)
+            except InconsistentStateError as error:
+                where = f"at t = {time:.4g} s of the reference the path is out of reach"
+                raise ReferenceSignalError(f"{where}: {error}") from error
             coarse.append(guess)
         found = np.array(coarse)
         # By interpolation, then on finer grids.

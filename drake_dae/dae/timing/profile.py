@@ -67,7 +67,7 @@ class ProfilePiece:
     limiting: np.typing.NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TimeProfile:
     """The fastest motion along the curve of a reference.
 
@@ -82,6 +82,10 @@ class TimeProfile:
     causes: tuple[Row, ...]
     start_time: float
     layout: Layout
+
+    def __repr__(self) -> str:
+        count = sum(not one.piece.is_pause for one in self.pieces)
+        return f"TimeProfile({self.duration:.4g} s, {count} motions from rest to rest)"
 
     @property
     def duration(self) -> float:

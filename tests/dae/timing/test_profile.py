@@ -286,6 +286,9 @@ def test_what_has_no_profile_is_refused_in_a_sentence():
         PathTiming(find_structure(springs.dae), MotionLimits())
     with pytest.raises(ReferenceSignalError, match="no position of the reference moves"):
         two_link_profile(two_link_limits(), (ConstantReference(0.3), PRESS))
+    with pytest.raises(ReferenceSignalError, match=r"at t = .* the path is out of reach"):
+        two_link_profile(two_link_limits(), (SinusoidReference(1.5, 0.9, 1.5), PRESS))
+    assert repr(two_link_profile(two_link_limits())).endswith("3 motions from rest to rest)")
     with pytest.raises(ReferenceSignalError, match="nothing limits the motion"):
         two_link_profile(MotionLimits())
     with pytest.raises(ModelError, match="did you mean 'joint1_motor'"):
