@@ -95,9 +95,9 @@ def _bias_of_height(q, v):
 
 @pytest.fixture(scope="module")
 def motion():
-    """A profile of the two-link arm, and its motion at 3,000 times, by Drake's kinematics."""
+    """A profile of the two-link arm, and its motion at 1,500 times, by Drake's kinematics."""
     profile = two_link_profile(two_link_limits(), end=0.9, begin=-0.9)
-    times = np.linspace(-0.9, -0.9 + profile.duration, 3000)
+    times = np.linspace(-0.9, -0.9 + profile.duration, 1500)
     rows = TimeOptimalReference(profile).pieces((2, 0)).at_all(times)
     q, v, acceleration = along_the_wall(rows[:, 0], rows[:, 1], rows[:, 2])
     torques = [needed(*each, row[3]) for *each, row in zip(q, v, acceleration, rows, strict=True)]
@@ -118,7 +118,7 @@ def test_the_torques_of_the_motion_are_within_their_limits_and_reach_them(motion
 def test_the_time_is_that_of_a_linear_program_on_a_fine_grid(motion):
     profile, *_ = motion
     # The path by its height, where it does not turn: b = z'^2, the force by time of the reference.
-    count = 4000
+    count = 2000
     heights = np.linspace(LINE.derivatives([0])(-0.9)[0], LINE.derivatives([0])(0.9)[0], count + 1)
     q, slope, bend = along_the_wall(heights, np.ones(count + 1), np.zeros(count + 1))
     moments = np.arcsin((heights - 0.3) / 0.3) / 1.5
