@@ -46,6 +46,11 @@ from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter
 from .dae.system.signals import Signal as Signal
 from .dae.system.system import DaeSystem as DaeSystem
+from .dae.timing.motion_limits import FrictionCone as FrictionCone
+from .dae.timing.motion_limits import MotionLimits as MotionLimits
+from .dae.timing.profile import PathTiming as PathTiming
+from .dae.timing.profile import TimeOptimalReference as TimeOptimalReference
+from .dae.timing.profile import TimeProfile as TimeProfile
 from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
@@ -84,6 +89,7 @@ from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
+from .robots.motion_limits import robot_motion_limits as robot_motion_limits
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions
@@ -135,6 +141,8 @@ from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
+from .systems.governing.feasible_control import FeasibleControl as FeasibleControl
+from .systems.governing.governor import PathGovernor as PathGovernor
 from .systems.observing.estimator import StateEstimator as StateEstimator
 from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver
 from .systems.observing.observer_rates import Observing as Observing

@@ -76,6 +76,12 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
     )
     run.add_argument(
+        "--time-optimal",
+        action="store_true",
+        help="follow the references as paths, in the shortest time that the limits of drives and "
+        "joints allow; as the scenario's key `time_optimal`",
+    )
+    run.add_argument(
         "--open", action="store_true", help="open the animation in a browser at the end"
     )
     run.add_argument(

@@ -27,11 +27,13 @@ from drake_dae.commands.run_folder import (
     run_folder,
     stage,
 )
+from drake_dae.dae.timing.profile import TimeOptimalReference
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
+from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
 from drake_dae.pictures.view import start_meshcat
 from drake_dae.robots.clearances import LinkBehind, links_behind
@@ -39,6 +41,7 @@ from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
+from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -48,6 +51,7 @@ from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
+    departure_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -61,6 +65,8 @@ def run_command(options: argparse.Namespace) -> int:
     """Runs the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
+    if options.time_optimal and scenario.time_optimal is None:
+        scenario = replace(scenario, time_optimal=TimeOptimal())
     if options.open and not scenario.write.animation:
         raise ScenarioError(
             ("write.animation", ("--open shows the animation, so write.animation must be true"))
@@ -257,6 +263,7 @@ def _write(run: _CommandRun) -> bool:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
             text = "\n".join([text, *surface_remarks(model, record), *rolling])
+        text = "\n".join([text, *departure_remarks(record, limits.control)])
         scenario = run.scenario
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         text = "\n".join([text, *reference_remarks(followed)])
@@ -280,12 +287,16 @@ def _write(run: _CommandRun) -> bool:
             plots = [name for name in PLOTS if paths or name != PATHS]
             with _collected(problems), stage(folder, *plots) as place, _frozen():
                 save_plots(record, predicted, limits.control, place, paths, accuracy)
+            for one in loop.generator.references if loop.generator is not None else ():
+                if isinstance(one, TimeOptimalReference):
+                    with _collected(problems), stage(folder, PROFILE) as place:
+                        save_profile(one.profile, place)
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as place:
                 page = animate(course, loop.scene_graph, run.title, phase_spans(record))
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
-        files = [name for name in (*FILES, PART) if (folder / name).exists()]
+        files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]
         run.results["files"] = files
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)

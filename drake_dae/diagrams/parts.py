@@ -17,6 +17,7 @@ from pydrake.systems.primitives import (
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
@@ -24,6 +25,7 @@ from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
@@ -124,14 +126,51 @@ def check_parts(
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
 
+def add_feasible(
+    builder: DiagramBuilder,
+    controller: Controller,
+    governed: MotionLimits,
+    control_limits: ArrayLike,
+    state: OutputPort,
+) -> FeasibleControl:
+    """Adds limits of the control by which errors leave their prediction least.
+
+    Args:
+        builder: The builder of the diagram, with the controller in it.
+        controller: The controller.
+        governed: The limits of forces.
+        control_limits: The largest |u|, shape (p,).
+        state: The state that the controller gets.
+
+    Raises:
+        WiringError: They do not fit.
+    """
+    structure, names = controller.law.structure, controller.law.system.control_signals
+    sizes = np.asarray(control_limits, dtype=float).reshape(-1).tolist()
+    if len(sizes) != len(names):
+        raise WiringError(
+            f"control_limits has {len(sizes)} entries, there are {len(names)} controls"
+        )
+    controls = {signal.name: (-size, size) for signal, size in zip(names, sizes, strict=True)}
+    try:
+        limits = MotionLimits(controls, forces=governed.forces, cones=governed.cones)
+        block = builder.AddSystem(FeasibleControl(structure, limits))
+    except ModelError as error:
+        raise WiringError(str(error)) from None
+    builder.Connect(controller.GetOutputPort("control"), block.GetInputPort("control"))
+    builder.Connect(state, block.GetInputPort("estimated_state"))
+    return block
+
+
 def add_drives(
     builder: DiagramBuilder,
     controller: Controller,
     sampling: Sampling | None,
     control_limits: ArrayLike | None,
+    control: OutputPort | None = None,
 ) -> tuple[OutputPort, ControlLimits | None]:
     """Adds hold and limits between controller and plant; returns the control at the plant."""
-    control, limits = controller.GetOutputPort("control"), None
+    control, limits = control or controller.GetOutputPort("control"), None
     if sampling is not None:
         hold = builder.AddSystem(ControlHold(control.size(), sampling))
         builder.Connect(control, hold.get_input_port())

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
+from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
@@ -37,6 +38,9 @@ class LoopSettings:
         exogenous: The exogenous signals of plant and law, as references for all entries of w in
             their order; constant if none are given.
         plant_exogenous: Those of the plant if they differ from the law's; None if they are equal.
+        governed: The limits within which a `PathGovernor` slows the references; None for none. With
+            `control_limits` as well, these and the limits of forces hold by `FeasibleControl`, and
+            the record has its "departure".
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
         start_time: The start of a run, in s: the zero dynamics are judged at the references then.
     """
@@ -48,6 +52,7 @@ class LoopSettings:
     observer: Observing | None = None
     exogenous: Sequence[Reference] = ()
     plant_exogenous: Sequence[Reference] | None = None
+    governed: MotionLimits | None = None
     tolerances: Tolerances | None = None
     start_time: float = 0.0
 

@@ -18,6 +18,7 @@ from drake_dae.diagrams.parts import (
     add_block,
     add_drives,
     add_exogenous,
+    add_feasible,
     add_hold,
     add_watch,
     check_parts,
@@ -34,6 +35,7 @@ from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -88,18 +90,24 @@ def make_closed_loop(
     if isinstance(references, Mapping):
         names = [signal.name for signal in law.system.output_signals]
         references = references_by_name(references, names, law.degrees)
+    period = settings.period(plant.time_step)
     reference = ReferenceGenerator(references, law.degrees)
+    if settings.governed is not None:
+        start = settings.start_time
+        reference = PathGovernor(references, law, settings.governed, start, period)
     try:
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
-    is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(
-        law, settings.sampling, settings.control_limits
+    is_fed_back = (
+        settings.governed is None
+        and plant.HasInputPort("feedback")
+        and can_be_fed_back(law, settings.sampling, settings.control_limits)
     )
     controller = TrackingController(
         law,
         outputs,
-        sample_period=settings.period(plant.time_step),
+        sample_period=period,
         references=reference if is_fed_back else None,
         feedback=is_fed_back,
     )
@@ -149,11 +157,20 @@ def wire_loop(
     observing = parts.observer if goal is not None else None
     if observing is None:
         builder.Connect(state, controller.GetInputPort("estimated_state"))
+    if reference is not None and reference.HasInputPort("estimated_state"):
+        builder.Connect(state, reference.GetInputPort("estimated_state"))
 
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
     held = None if parts.sampling is None else hold_before(plant, parts.sampling)
-    control, limits = add_drives(builder, controller, held, parts.control_limits)
+    feasible = None
+    if parts.governed is not None and parts.control_limits is not None:
+        feasible = add_feasible(builder, controller, parts.governed, parts.control_limits, state)
+        control, limits = add_drives(
+            builder, controller, held, None, feasible.GetOutputPort("control")
+        )
+    else:
+        control, limits = add_drives(builder, controller, held, parts.control_limits)
     if controller.HasOutputPort("feedback"):
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
@@ -176,8 +193,9 @@ def wire_loop(
         wires = state, held, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *wires, parts.encoders)
         holds.append(observer.GetOutputPort("hold"))
-    elif limits is not None:
-        holds.append(limits.GetOutputPort("is_limited"))
+    for block in (limits if observer is None else None, feasible):
+        if block is not None:
+            holds.append(block.GetOutputPort("is_limited"))
     add_hold(builder, controller, holds)
 
     # The constraint force goes through its sensor to the blocks that measure it.
@@ -195,7 +213,14 @@ def wire_loop(
         **_of_plant(plant, moving, reference, law, control),
         **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
     }
-    loggers = _logged(builder, plant, controller, control, named)
+    if feasible is not None:
+        named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
+        named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
+    if reference is not None:
+        for name, signals in reference.further_signals.items():
+            named[name] = (reference.GetOutputPort(name), signals)
+    by_time = reference is None or reference.num_input_ports() == 0
+    loggers = _logged(builder, plant, controller, control, named, by_time)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -240,6 +265,7 @@ def _logged(
     controller: Controller,
     control: OutputPort,
     named: Named,
+    by_time: bool,
 ) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
     """Exports all signals, and logs those that do not follow from what is logged.
 
@@ -248,10 +274,11 @@ def _logged(
         plant, controller: The blocks.
         control: What arrives at the plant.
         named: The signals.
+        by_time: Whether references follow from the time.
     """
     available: set[str] = set()
     if plant.functions:
-        available = {*plant.functions, "reference", "exogenous"}
+        available = {*plant.functions, *(["reference"] if by_time else []), "exogenous"}
         if controller.follows and control.get_system() is controller:
             available.add("control")
     loggers = {}

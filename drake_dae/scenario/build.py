@@ -25,6 +25,7 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion.timing import Timed, timed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
@@ -73,8 +74,12 @@ def build_completed(
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    completed = Completed(chosen.scenario, (*completed.notes, *chosen.notes))
-    return completed, build_loop(completed.scenario, model, structure, scene_graph, meshcat)
+    in_time, motion = timed(chosen.scenario, model, structure)
+    notes = (*completed.notes, *chosen.notes, *in_time.notes)
+    completed = Completed(in_time.scenario, notes)
+    return completed, build_loop(
+        completed.scenario, model, structure, scene_graph, meshcat, motion=motion
+    )
 
 
 def build_loop(
@@ -84,6 +89,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
+    motion: Timed | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -94,6 +100,7 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
+        motion: The time-optimal motion, from `timed`; None for the scenario's references.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -102,11 +109,18 @@ def build_loop(
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
-    references = [] if task is not None else _references(scenario.references, law)
+    references: list[Reference] = []
+    if motion is not None:
+        references = [motion.reference]
+    elif task is None:
+        references = _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
+    if motion is not None and motion.governed is not None and limits is None:
+        # A governed motion keeps the limits of its drives, where all have one.
+        limits = model.control_limits if np.isfinite(model.control_limits).all() else None
 
     # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
@@ -129,6 +143,7 @@ def build_loop(
         observer=scenario.observer,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
+        governed=None if motion is None else motion.governed,
         tolerances=scenario.tolerances,
         start_time=scenario.integrator.start_time,
     )

@@ -37,6 +37,7 @@ from drake_dae.scenario.parts.families import (
     Sampling,
     Stage,
     Task,
+    Timing,
     Tolerances,
 )
 from drake_dae.scenario.robot_file.robot import Robot
@@ -136,6 +137,8 @@ class Scenario:
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
             of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
             Completed outputs without a reference keep their initial value.
+        time_optimal: The references as paths that are followed in the shortest time within the
+            robot's limits; as the references are timed if left out.
         task: A sequence of phases with opening and closing contact, in place of references.
         start: The start; without positions it is computed (not for a task).
         duration: The duration of the run, in s.
@@ -174,6 +177,7 @@ class Scenario:
     tolerances: Tolerances | None = None
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
+    time_optimal: Timing | None = None
     task: Task | None = None
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

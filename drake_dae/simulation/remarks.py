@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
@@ -62,6 +63,38 @@ def ball_remarks(radius: float | None) -> list[str]:
         f"Compliant contact is that of a ball of {1e3 * radius:.3g} mm. Where the robot tilts by "
         "an angle a the ball rolls,\nand touches 2 * radius * sin(a / 2) beside the point of the "
         "constraint; no stiffness changes that, a smaller\nplant.radius does."
+    ]
+
+
+def departure_remarks(record: Record, limits: FloatArray | None) -> list[str]:
+    """When limits made the error leave its prediction, by how much, and which drives.
+
+    Args:
+        record: A record; with "departure" where limits hold by `FeasibleControl`.
+        limits: The largest |u|, shape (p,); None where there is none.
+    """
+    if "departure" not in record.signals:
+        return []
+    values, signals = record["departure"], record.signals["departure"].signals
+    is_off = np.abs(values).max(axis=1, initial=0.0) > 0.0
+    if not is_off.any():
+        return []
+    times = record.time[is_off]
+    share = float(np.sum(np.diff(record.time)[is_off[:-1]]))
+    amounts = ", ".join(
+        f"{signal.name.removeprefix('departure of ')} by up to {size:.2g} {signal.unit}"
+        for signal, size in zip(signals, np.abs(values).max(axis=0), strict=True)
+        if size > 0.0
+    )
+    control = record["control"][is_off]
+    names = [signal.name for signal in record.signals["control"].signals]
+    most = np.full(len(names), np.inf) if limits is None else limits
+    reached = np.any(np.abs(control) >= most * (1.0 - 1e-9), axis=0)
+    cause = ", ".join(name for name, yes in zip(names, reached, strict=True) if yes)
+    return [
+        f"Between {times[0]:.4g} and {times[-1]:.4g} s, for {share:.2g} s in all, no motion along "
+        f"the path was within the limits ({cause or 'a contact force'}): the highest derivatives "
+        f"of the errors left their prediction, of {amounts}."
     ]
 
 

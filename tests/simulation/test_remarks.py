@@ -1,8 +1,15 @@
 """What a run says of what is approximate in it."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from drake_dae import Record
 from drake_dae.cli import main
+from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.records.record import Recorded
+from drake_dae.simulation.remarks import departure_remarks
 
 SHORT = ("--set", "duration=0.02", "--set", "write={plots: false, animation: false}")
 
@@ -21,3 +28,23 @@ def test_a_run_on_drakes_contact_says_that_its_ball_rolls(name, settings, told, 
     words = " ".join(capsys.readouterr().out.split())
     assert ("Where the robot tilts by an angle a the ball rolls" in words) is told
     assert ("contact is that of a ball of 4 mm" in words) is bool(settings)
+
+
+def test_a_run_says_when_limits_made_errors_leave_their_prediction():
+    times = np.array([0.0, 1.0, 2.0, 3.0])
+    control = np.array([[1.0, 0.0], [2.0, 0.0], [2.0, -1.0], [1.0, 0.0]])
+    departure = np.array([[0.0, 0.0], [-0.3, 0.0], [0.1, 0.0], [0.0, 0.0]])
+    of_control = (Signal("left", "N m"), Signal("right", "N m"))
+    of_departure = (Signal("departure of x", "m/s^2"), Signal("departure of f", "N"))
+    record = Record(
+        times,
+        {"control": Recorded(control, of_control), "departure": Recorded(departure, of_departure)},
+    )
+    (text,) = departure_remarks(record, np.array([2.0, 5.0]))
+    assert text.startswith("Between 1 and 2 s, for 2 s in all, no motion along the path")
+    assert "within the limits (left)" in text
+    assert text.endswith("left their prediction, of x by up to 0.3 m/s^2.")
+    still = Recorded(0.0 * departure, of_departure)
+    held = replace(record, signals={**record.signals, "departure": still})
+    assert departure_remarks(held, None) == []
+    assert departure_remarks(Record(times, {"control": Recorded(control, of_control)}), None) == []

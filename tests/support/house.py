@@ -59,6 +59,8 @@ PAPER = (
     "linearization",
     "beyond",
     "zero_dynamics",
+    "timing",
+    "governing",
     "extension",
 )
 # One person holds a folder of so many files in mind, and a file of so many lines.

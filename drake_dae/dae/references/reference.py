@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -34,6 +34,9 @@ class Reference(ABC):
     7. A reference with a file reads it when it is used. `beside` makes its path absolute. `remark`
        describes approximations of the file's data.
     """
+
+    is_table: ClassVar[bool] = False
+    """Whether its function takes less time than its expression, as that of many polynomials."""
 
     @property
     @abstractmethod
@@ -117,10 +120,11 @@ def stack_references(
     """
     ends = np.cumsum([0, *[reference.size for reference in references]])
     parts = list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
-    time = ca.SX.sym("t")
-    rows = [reference.expression(part, time) for reference, part in parts]
-    if all(row is not None for row in rows):
-        return at_time(time, ca.vertcat(*rows))
+    if not any(reference.is_table for reference in references):
+        time = ca.SX.sym("t")
+        rows = [reference.expression(part, time) for reference, part in parts]
+        if all(row is not None for row in rows):
+            return at_time(time, ca.vertcat(*rows))
     functions = [reference.derivatives(part) for reference, part in parts]
 
     def evaluate(time: float) -> FloatArray:

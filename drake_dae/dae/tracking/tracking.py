@@ -141,6 +141,33 @@ class TrackingLaw:
             compiled=self.system.compiled,
         )
 
+    @property
+    def inputs(self) -> dict[str, ca.SX]:
+        """The symbols that `function` takes, by their names."""
+        return dict(self._inputs)
+
+    def wanted(self, reference: ca.SX) -> ca.SX:
+        """ubar of (28) for a reference, in terms of state and parameters, shape (p, 1).
+
+        A measured force is taken as wanted, and integrals as 0.
+
+        Args:
+            reference: R, an expression of shape (sum (mu_i + 1), 1).
+        """
+        given = {"reference": ca.densify(reference)}
+        if self.measured_force is not None:
+            force = ca.SX.zeros(self._inputs["measured_force"].numel())
+            for output, place in self.measured_force.inputs.items():
+                force[place] = reference[int(self.layout.lowest[output])]
+            given["measured_force"] = force
+        if self.integral.outputs:
+            given["integral"] = ca.SX.zeros(len(self.integral.outputs))
+        return ca.substitute(
+            self._wanted,
+            ca.vertcat(*[self._inputs[name] for name in given]),
+            ca.vertcat(*given.values()),
+        )
+
     def trace_motion(self) -> TracedFunction | None:
         """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
 

@@ -20,6 +20,7 @@ from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
+from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -40,6 +41,9 @@ MOST_SAMPLES = 20_000
 _STRAIGHT = 0.01
 """The allowed deviation of a reference from a straight line between two times, relative to its
 range."""
+
+_SHORTEST = 1e-6
+"""The shortest interval that is divided, relative to the whole."""
 
 _SLACK = 1e-9
 """The excess over a limit that counts, in its unit: a start may be on the limit."""
@@ -66,6 +70,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:  # The requirements of a task depend on the times of contact.
         return Feasibility(analyze(model.dae), scenario.duration)
+    in_time, motion_in_time = timed(scenario, model, structure)
+    scenario = in_time.scenario
     laws = None
     if scenario.actuation and scenario.actuation[0].is_spring:
         whole, own = model, scenario
@@ -87,7 +93,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         observer=None,
         tolerances=None,
     )
-    loop = build_loop(ideal, model, structure)
+    loop = build_loop(ideal, model, structure, motion=motion_in_time)
     context = start_scenario(ideal, loop)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
@@ -145,7 +151,8 @@ def sample_times(
         # A constant varies by round-off.
         allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
         off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
-        new = np.flatnonzero(np.any(off > allowed, axis=1))
+        is_long = np.diff(times) > _SHORTEST * (end - begin)  # The second derivative may jump.
+        new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
         room = MOST_SAMPLES - times.size
         is_resolved = new.size <= room
         if not is_resolved:

@@ -15,7 +15,7 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts import written
+from drake_dae.scenario.parts import time_optimal, written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
@@ -102,6 +102,7 @@ Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
+Timing = Annotated[time_optimal.TimeOptimal, Form()]
 _PHASE_DATA = {
     float | references.Reference: Reference,
     Mapping[str, references.Reference | float]: dict[str, Reference],

@@ -66,7 +66,7 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     known = {**values, "parameters": _parameters_along(loop, plant, context, times)}
     if loop.plant_exogenous is not None:
         values["exogenous"] = loop.plant_exogenous.along(times)
-    if loop.generator is not None:
+    if loop.generator is not None and "reference" not in values:
         values["reference"] = loop.generator.along(times)
     if "control" not in known:
         given = {**known, "reference": values["reference"]}

@@ -7,13 +7,14 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, System
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.along import signal_along
 from drake_dae.systems.blocks.block import DifferentiableSystem
@@ -210,8 +211,17 @@ class ReferenceGenerator(DifferentiableSystem):
             "reference",
             sum(degree + 1 for degree in degrees),
             weakly(self._calc_reference),
-            {self.time_ticket()},
+            self._sources(),
         )
+
+    def _sources(self) -> set[DependencyTicket]:
+        """What R depends on."""
+        return {self.time_ticket()}
+
+    @property
+    def further_signals(self) -> dict[str, tuple[Signal, ...]]:
+        """Name of an output port beside `reference` -> names and units, for a record."""
+        return {}
 
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s, shape (sum (mu_i + 1),)."""

@@ -48,6 +48,11 @@ PURE = {
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),
+    ("TimeOptimal", "efforts"),
+    ("TimeOptimal", "joint_speeds"),
+    ("TimeOptimal", "joint_accelerations"),
+    ("TimeOptimal", "largest_rate"),
+    ("FrictionCone", "friction"),
     ("SimulatorConfig", "accuracy"),
     ("SimulatorConfig", "target_realtime_rate"),
 }

@@ -15,6 +15,7 @@ from drake_dae import (
     DaePlant,
     DisturbanceObserver,
     ForceSensor,
+    MotionLimits,
     Observing,
     PointMaterial,
     ReferenceGenerator,
@@ -37,6 +38,8 @@ from drake_dae.compiler.wires import Wires
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.governing.feasible_control import FeasibleControl
+from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 from drake_dae.systems.task.switch import LawSwitch
 
@@ -57,6 +60,17 @@ def measured_law(integral, gain=0.5):
 def references():
     height, force = SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)
     return ReferenceGenerator([height, force], law("two_link").degrees)
+
+
+def narrow():
+    """Limits that the arm needs more than."""
+    controls = {"joint1_motor": (-60.0, 60.0), "joint2_motor": (-30.0, 30.0)}
+    return MotionLimits(controls, forces={"wall.force": (5.0, None)})
+
+
+def governor(period):
+    own = references().references
+    return PathGovernor(own, law("two_link"), narrow(), 0.4, period)
 
 
 def robot(kind):
@@ -164,6 +178,9 @@ BLOCKS = {
     "StateSensor with noise": lambda: StateSensor(
         4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
     ),
+    "PathGovernor": lambda: governor(0.0),
+    "PathGovernor with samples": lambda: governor(0.01),
+    "FeasibleControl": lambda: FeasibleControl(arm("two_link").structure, narrow()),
     "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2]),
 }
 

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from members import subclasses
+from problems import double_integrator
 from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -15,7 +16,9 @@ from drake_dae import (
     CsvReference,
     ExpressionReference,
     LineReference,
+    MotionLimits,
     PathLimits,
+    PathTiming,
     PointToPointReference,
     PolylineReference,
     Reference,
@@ -25,8 +28,10 @@ from drake_dae import (
     SpiralReference,
     SystemReference,
     TextReference,
+    TimeOptimalReference,
     TrajectoryReference,
     WaypointsReference,
+    find_structure,
 )
 from drake_dae.errors import ReferenceSignalError
 
@@ -51,6 +56,14 @@ class Swing(LeafSystem):
         output.SetFromVector([*sine, t**2, 2 * t, 2.0])
 
 
+def moved_mass():
+    """The profile of a mass of 1 kg that moves to and fro with at most 3 N."""
+    system = double_integrator()
+    limits = MotionLimits(controls={system.control_signals[0].name: (-3.0, 3.0)})
+    timing = PathTiming(find_structure(system), limits)
+    return timing.profile([SinusoidReference(0.0, 0.5, 2.0)], 2.0, points=100)
+
+
 MEMBERS = {
     "constant": ConstantReference([0.3, -2.0]),
     "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
@@ -70,6 +83,7 @@ MEMBERS = {
     "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
+    "time-optimal": TimeOptimalReference(moved_mass()),
 }
 
 TIMES = (0.41, 0.93, 1.62)

@@ -85,6 +85,7 @@ static void stop(Controller *c, int fault) {
 static int put(const Controller *c, ${prefix}_controller_outputs *out) {
   const double *row = c->row;
   int i;
+  (void)row; /* Where there are no other outputs. */
 $written  for (i = 0; i < CONTROLS; i++) {
     double share = c->stopping < c->stop_time ? c->stopping / c->stop_time : 1.0;
     double goal = c->stop_control[i];

@@ -1,0 +1,184 @@
+"""The rate of a reference, slowed by what the present state needs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.timing.limited_signals import LimitedSignals
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ReferenceSignalError
+from drake_dae.trace.functions import TracedFunction
+
+RATE = 20.0
+"""How fast the rate of the reference returns to 1, and how fast it may fall to 0, in 1/s."""
+
+APPROACH = 100.0
+"""How fast speeds may approach their limits, in 1/s."""
+
+AHEAD = 0.02
+"""How far ahead limits are met, in s."""
+
+FREE = 1e6
+"""The largest |s''| where nothing limits it, in 1/s."""
+
+SMALL = 1e-9
+"""An effect on a signal, relative to its limits, below which s'' does not change it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Governing:
+    """A law and its references, whose time s goes as fast as limits allow at the present state.
+
+    For any s(t) the reference r(s(t)) is admissible, so that errors obey (30), (31), whatever s
+    does. With
+
+        r' = r_s s',   r'' = r_ss s'^2 + r_s s''
+
+    the control (28) at the present state, with its feedback, is affine in s'', and so are
+    accelerations and constraint forces: each limit bounds s''. So
+
+        s'' = max(low, min(high, RATE (1 - s'))),   -RATE s' <= s'' <= RATE (1 - s'),
+
+    where s' = 1 is the reference's own rate, which is not exceeded. A limit is met AHEAD of time: a
+    change of s' by AHEAD s'' counts with its effect on r_ss s'^2, as far as the limits hold now.
+    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. Where
+    low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
+    exceeded.
+
+    Args:
+        law: The law, without exogenous signals.
+        references: The references, in the order of the outputs; expressions of time.
+        limits: The limits.
+
+    Attributes:
+        function: (path, state, parameters) -> reference, path_rate, room: path is (s, s'),
+            parameters are those of the law; room is high - low, negative where no s'' is within all
+            limits.
+
+    Raises:
+        ReferenceSignalError: The law has outputs of other degrees than 0 and 2 or exogenous
+            signals, or a reference is no expression of time.
+        ModelError: A limit names no signal of the system.
+    """
+
+    law: TrackingLaw
+    references: Sequence[Reference]
+    limits: MotionLimits
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "function", self._traced())
+
+    function: TracedFunction = None  # type: ignore[assignment]
+
+    def _traced(self) -> TracedFunction:
+        law, layout = self.law, self.law.layout
+        if any(degree not in (0, 2) for degree in law.degrees) or law.exogenous_degrees:
+            raise ReferenceSignalError(
+                "the time of references is governed for rigid joints and laws without exogenous "
+                "signals or observer"
+            )
+        path = ca.SX.sym("path", 2)
+        s, rate = path[0], path[1]
+        rows = self._reference(s)
+        moving = layout.lowest[layout.dynamic]
+        first, second = rows[(moving + 1).tolist()], rows[(moving + 2).tolist()]
+        still = ca.SX(rows)
+        still[(moving + 1).tolist()] = first * rate
+        still[(moving + 2).tolist()] = second * rate**2
+        wanted = law.wanted(still)
+        now, ahead = ca.SX.zeros(len(law.degrees)), ca.SX.zeros(len(law.degrees))
+        now[layout.dynamic.tolist()] = first
+        ahead[layout.dynamic.tolist()] = first + 2.0 * AHEAD * rate * second
+        intervals = self._intervals(wanted, now, ahead)
+        chosen = most = RATE * (1.0 - rate)
+        for low, high in intervals:
+            chosen = _within(chosen, low, high)
+        chosen = ca.fmax(ca.fmin(chosen, most), -RATE * rate)
+        reference = ca.SX(still)
+        reference[(moving + 2).tolist()] += first * chosen
+        inputs = {"path": path, "state": law.system.state, "parameters": law.inputs["parameters"]}
+        outputs = {
+            "reference": reference,
+            "path_rate": ca.vertcat(rate, chosen),
+            "room": high - low,
+        }
+        name = f"{law.system.name} governed reference"
+        return TracedFunction(name, inputs, outputs, compiled=law.system.compiled)
+
+    def _reference(self, time: ca.SX) -> ca.SX:
+        """R at a symbolic time of the reference."""
+        rows, left = [ca.SX(0, 1)], list(self.law.degrees)
+        for reference in self.references:
+            own, left = left[: reference.size], left[reference.size :]
+            row = reference.expression(own, time)
+            if row is None:
+                raise ReferenceSignalError(
+                    f"a {type(reference).__name__} of so many pieces is no expression of time, "
+                    "which a governor needs: give a shorter path, or fewer points"
+                )
+            rows.append(row)
+        return ca.vertcat(*rows)
+
+    def _intervals(self, wanted: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+        """The least and the largest s'' by speeds, by other limits ahead of time, and now.
+
+        Args:
+            wanted: ubar of (28) for s'' = 0, shape (p, 1).
+            now: d ubar / d s'', shape (p, 1).
+            ahead: The same with its effect AHEAD of time.
+        """
+        structure = self.law.structure
+        limited = LimitedSignals(structure, self.limits)
+        control, _ = structure.control_for(wanted)
+        slope_now, slope = (
+            structure.control_for(wanted + effect)[0] - control for effect in (now, ahead)
+        )
+        own, by = limited.by_control()
+        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope)
+        sizes = np.minimum(np.abs(limited.low), np.abs(limited.high))
+        bounds = ca.SX(limited.low), ca.SX(limited.high)
+        at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
+        later = _interval(values, slopes, *bounds, sizes)
+        own, by = limited.rates_of_states()
+        speeds = self.law.system.state[limited.states]
+        low = APPROACH * (limited.state_low - speeds)
+        high = APPROACH * (limited.state_high - speeds)
+        sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
+        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope_now)
+        return [_interval(values, slopes, ca.SX(low), ca.SX(high), sizes), later, at_once]
+
+
+def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
+    """A value within an interval; the middle of an empty one."""
+    inside = ca.fmax(low, ca.fmin(high, value))
+    return ca.if_else(low <= high, inside, (low + high) / 2.0)
+
+
+def _interval(
+    values: ca.SX, slopes: ca.SX, low: ca.SX, high: ca.SX, sizes: FloatArray
+) -> tuple[ca.SX, ca.SX]:
+    """The least and the largest a with low <= values + slopes a <= high.
+
+    Args:
+        values, slopes, low, high: Expressions, shape (k, 1).
+        sizes: The sizes of the limits, shape (k,).
+    """
+    least, most = ca.SX(-FREE), ca.SX(FREE)
+    for i, known in enumerate(sizes.tolist()):
+        size = known if np.isfinite(known) and known > 0.0 else 1.0
+        acts = ca.fabs(slopes[i]) > SMALL * size
+        inverse = ca.if_else(acts, 1.0 / slopes[i], 0.0)
+        for bound, is_upper in ((low[i], False), (high[i], True)):
+            if bound.is_constant() and not np.isfinite(float(bound)):
+                continue
+            reached = (bound - values[i]) * inverse
+            is_most = slopes[i] > 0.0 if is_upper else slopes[i] < 0.0
+            most = ca.fmin(most, ca.if_else(ca.logic_and(acts, is_most), reached, FREE))
+            is_least = ca.logic_and(acts, ca.logic_not(is_most))
+            least = ca.fmax(least, ca.if_else(is_least, reached, -FREE))
+    return least, most

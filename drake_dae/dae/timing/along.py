@@ -1,0 +1,175 @@
+"""What a system needs along a curve, at rest and at any speed and acceleration."""
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.timing.curve import Piece
+from drake_dae.dae.timing.limited_signals import LimitedSignals
+from drake_dae.dae.timing.many_points import ManyPoints
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.errors import InconsistentStateError, ReferenceSignalError
+
+CONVERGED = 1e-6
+"""A Newton step that is this small relative to the states is the last one."""
+
+_SINGULAR = (
+    "{}: no states are found along the path: it leads through, or close to, a singular "
+    "configuration, or out of reach"
+)
+
+COARSE = 16
+"""The points of a piece whose states are found one after the other, from the one before."""
+
+
+class AlongCurve:
+    """The tracking law's own feedforward along a curve, equations (28), (35) without error.
+
+    On Z(R), where all outputs are on their references, (28) is u = B^-1 (-a + r^(mu)), and (25) is
+    v = alpha + beta u. With r' = r_s w, r'' = r_ss w^2 + r_s a both are affine in a at a given
+    speed w = s', and affine in (a, b), b = w^2, for a rigid robot without friction:
+
+        u = m(s) b + n(s) a + c(s).
+
+    Args:
+        structure: The structure of the system: degrees 0 and 2, no zero dynamics.
+        limits: The limits.
+
+    Attributes:
+        limited: The signals that have limits.
+
+    Raises:
+        ModelError: A limit names no signal of the system.
+        ReferenceSignalError: The system has outputs of other degrees, zero dynamics, or moving
+            exogenous signals.
+    """
+
+    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+        _check(structure)
+        self.limited = LimitedSignals(structure, limits)
+        self._pinned = PinnedOutputs(structure)
+        self.system, self.layout = structure.system, structure.layout
+        state = self.system.state
+        residual = structure.manifold.residual_expression
+        reference = ca.SX.sym("R", self.layout.reference_size)
+        goal = reference[self.layout.chained.tolist(), :]
+        equations = ca.vertcat(residual, structure.chain - goal)
+        given = [state, reference, self.system.parameter_symbol]
+        gradients = ca.densify(ca.jacobian(equations, state))
+        newton = ca.Function("newton", given, ca.cse([ca.densify(equations), gradients]))
+        self._newton = ManyPoints(newton, self.system.compiled)
+        control, _ = structure.control_for(reference[self.layout.highest.tolist(), :])  # (28)
+        values = ca.Function("along", given, ca.cse([self.limited.values(control)]))
+        self._values = ManyPoints(values, self.system.compiled)
+
+    def reference(self, piece: Piece, w: FloatArray, a: FloatArray) -> FloatArray:
+        """R at the points for speeds and accelerations along the curve, (N + 1, sum (mu_i + 1))."""
+        rows, first = piece.values.copy(), self.layout.lowest[self.layout.dynamic]
+        rows[:, first + 1] = piece.tangents * w[:, None]
+        rows[:, first + 2] = piece.curvatures * w[:, None] ** 2 + piece.tangents * a[:, None]
+        return rows
+
+    def states_at_rest(
+        self, piece: Piece, guess: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The states on Z(R) at rest at the points, and their derivatives by the speed w there.
+
+        Returns:
+            x, shape (N + 1, n), and dx/dw at w = 0, shape (N + 1, n).
+
+        Raises:
+            ReferenceSignalError: A point is out of reach, or the path leads through a singular
+                configuration.
+        """
+        count, still = len(piece.times) - 1, np.zeros(len(piece.times))
+        rest = self.reference(piece, still, still)
+        places = np.unique(np.linspace(0, count, COARSE + 1).astype(int))
+        coarse = []
+        for row, time in zip(rest[places], piece.times[places], strict=True):
+            try:
+                guess = self._pinned.state(row, guess, parameters)
+            except InconsistentStateError as error:
+                where = f"at t = {time:.4g} s of the reference the path is out of reach"
+                raise ReferenceSignalError(f"{where}: {error}") from error
+            coarse.append(guess)
+        found = np.array(coarse)
+        # By interpolation, then on finer grids.
+        for number in (4 * COARSE, count):
+            finer = np.unique(np.linspace(0, count, number + 1).astype(int))
+            start = _interpolated(places, found, finer)
+            found, places = self.states(rest[finer], start, parameters), finer
+        moving = self.reference(piece, still + 1.0, still) - rest
+        moving[:, self.layout.lowest[self.layout.dynamic] + 2] = 0.0
+        _, gradients = self._newton(found, rest, parameters)
+        goals = np.zeros(found.shape)
+        goals[:, -self.layout.chain_size :] = moving[:, self.layout.chained]
+        return found, self._solved(gradients, goals)
+
+    def states(self, rows: FloatArray, start: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The states on Z(R) of rows of R near given ones, by Newton's method, shape (k, n).
+
+        Raises:
+            ReferenceSignalError: It does not converge.
+        """
+        scale, x = self.system.scale, start.copy()
+        for _ in range(12):
+            residual, gradients = self._newton(x, rows, parameters)
+            step = self._solved(gradients, residual)
+            x -= step
+            if not np.isfinite(x).all():
+                break
+            # The error after a step is of the order of its square.
+            if (np.abs(step) <= CONVERGED * np.maximum(scale, np.abs(x))).all():
+                return x
+        raise ReferenceSignalError(_SINGULAR.format(self.system.name))
+
+    def _solved(self, gradients: FloatArray, values: FloatArray) -> FloatArray:
+        """Solutions of gradients * x = values at all points, in units of the states' scale."""
+        scale = self.system.scale
+        try:
+            return np.asarray(scale * np.linalg.solve(gradients * scale, values[..., None])[..., 0])
+        except np.linalg.LinAlgError:
+            raise ReferenceSignalError(_SINGULAR.format(self.system.name)) from None
+
+    def values(self, states: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The limited signals for states on Z(R) and rows of R, shape (k, number of them)."""
+        return self._values(states, rows, parameters)[0]
+
+    def limited_states(self, states: FloatArray) -> FloatArray:
+        """The limited states, shape (k, number of them)."""
+        return states[:, self.limited.states]
+
+
+def _interpolated(places: np.ndarray, values: FloatArray, wanted: np.ndarray) -> FloatArray:
+    """Values between places by a cubic spline."""
+    from scipy.interpolate import CubicSpline  # It takes long to load.
+
+    return np.asarray(CubicSpline(places, values)(wanted))
+
+
+def _check(structure: Structure) -> None:
+    system = structure.system
+    others: Sequence[str] = [
+        f"'{signal.name}' has degree {degree}"
+        for signal, degree in zip(system.output_signals, structure.output_degrees, strict=True)
+        if degree not in (0, 2)
+    ]
+    if others:
+        raise ReferenceSignalError(
+            f"{system.name}: time-optimal motion is for rigid joints, where positions have degree "
+            f"2 and forces degree 0; here {others[0]}, as behind springs or motors"
+        )
+    if structure.zero_dynamics_dimension:
+        raise ReferenceSignalError(
+            f"{system.name}: the outputs leave {structure.zero_dynamics_dimension} states free "
+            "(zero dynamics), so that the path does not determine the motion"
+        )
+    if system.exogenous.moving:
+        names = ", ".join(parameter.name for parameter in system.exogenous.moving)
+        raise ReferenceSignalError(
+            f"{system.name}: {names} moves with the time, which a path cannot stretch"
+        )

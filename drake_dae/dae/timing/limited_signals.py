@@ -1,0 +1,89 @@
+"""The signals of a system that have limits, as expressions of state and control."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.timing.motion_limits import MotionLimits
+
+
+class LimitedSignals:
+    """Controls, rates of states, constraint forces and friction cones that have limits.
+
+    On N* they are y = y_0(x) + Y(x) u: x' = f* + h* u by (9), (10), and v = alpha + beta u by (25).
+
+    Args:
+        structure: The structure of the system.
+        limits: The limits.
+
+    Attributes:
+        signals: Names and units, k of them: controls, rates, forces, cones.
+        low, high: The lowest and highest values, shape (k,), infinite without a limit.
+        states: The places of the limited states among all.
+        state_signals: Their names and units.
+        state_low, state_high: Their lowest and highest values.
+
+    Raises:
+        ModelError: A limit names no signal of the system.
+    """
+
+    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+        limits.check(structure.system)
+        self._structure = structure
+        system = structure.system
+        inputs = system.constraint_input_signals
+        forces = [signal.name for signal in inputs]
+        rates = [signal.derivative(1) for signal in system.state_signals]
+        signals = [*system.control_signals, *rates, *inputs]
+        bounds = [
+            limits.bounds("controls", system.control_signals),
+            limits.bounds("rates", system.state_signals),
+            limits.bounds("forces", inputs),
+        ]
+        rows = [np.zeros((0, len(forces)))]
+        for cone in limits.cones:
+            rows.append(cone.rows(forces))
+            count = len(rows[-1])
+            signals += [Signal(f"friction cone of {cone.normal}", "N")] * count
+            bounds.append((np.full(count, -np.inf), np.zeros(count)))
+        self._cones = np.vstack(rows)
+        low, high = (np.concatenate([bound[i] for bound in bounds]) for i in range(2))
+        self._rows: list[int] = np.flatnonzero(np.isfinite(low) | np.isfinite(high)).tolist()
+        self.signals = tuple(signals[i] for i in self._rows)
+        self.low, self.high = low[self._rows], high[self._rows]
+        low, high = limits.bounds("states", system.state_signals)
+        self.states: list[int] = np.flatnonzero(np.isfinite(low) | np.isfinite(high)).tolist()
+        self.state_signals = tuple(system.state_signals[i] for i in self.states)
+        self.state_low, self.state_high = low[self.states], high[self.states]
+
+    def values(self, control: ca.SX) -> ca.SX:
+        """The signals for a control, shape (k, 1)."""
+        motion = self._structure.derivatives
+        rate, force = (  # (25), (35)
+            ca.substitute(motion.expand(unknown), motion.control, control)
+            for unknown in (motion.rate, motion.constraint_input)
+        )
+        asked = ca.vertcat(control, rate, force, ca.mtimes(ca.DM(self._cones), force))
+        return ca.densify(asked[self._rows, :])
+
+    def by_control(self) -> tuple[ca.SX, ca.SX]:
+        """y_0(x), shape (k, 1), and Y(x), shape (k, p)."""
+        motion = self._structure.derivatives
+        own, by = motion.by_control(ca.vertcat(motion.rate, motion.constraint_input))
+        free, slope = self._chosen(own, by)
+        return free, slope
+
+    def rates_of_states(self) -> tuple[ca.SX, ca.SX]:
+        """x' of the limited states as a + B u, shapes (k, 1) and (k, p)."""
+        motion = self._structure.derivatives
+        own, by = motion.by_control(motion.rate)
+        return ca.densify(own[self.states, :]), ca.densify(by[self.states, :])
+
+    def _chosen(self, own: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
+        system, cones = self._structure.system, ca.DM(self._cones)
+        size = system.num_states
+        count = system.num_controls
+        every = ca.vertcat(ca.SX.zeros(count), own, ca.mtimes(cones, own[size:, :]))
+        slopes = ca.vertcat(ca.SX.eye(count), by, ca.mtimes(cones, by[size:, :]))
+        return ca.densify(every[self._rows, :]), ca.densify(slopes[self._rows, :])

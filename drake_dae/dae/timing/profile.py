@@ -1,0 +1,310 @@
+"""The time-optimal profile of a path reference."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, check_whole_number, vector
+from drake_dae.dae.references.by_name import references_by_name
+from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
+from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.timing.along import AlongCurve
+from drake_dae.dae.timing.coarser import coarser
+from drake_dae.dae.timing.curve import Curve, Piece
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.dae.timing.reachable import Fastest, Lines, fastest_motion
+from drake_dae.dae.timing.rows import Row, Rows, rows_along
+from drake_dae.dae.timing.smoothing import smoothed
+from drake_dae.dae.timing.time_table import at_rest_outside, stacked, time_table
+from drake_dae.dae.timing.tool_limits import tool_limits
+from drake_dae.errors import ModelError, ReferenceSignalError
+
+_PAUSE = Row("pause of the reference", "", "")
+
+PASSES = 40
+"""The most passes where signals are not linear in (a, b)."""
+
+SETTLED = 1e-7
+"""Passes end where b changes by less than this share of its largest value."""
+
+MOST_POLYNOMIALS = 500
+"""The largest number of polynomials of an expression; longer references are tables."""
+
+LOWERINGS = 3
+"""How often limits are lowered where the motion exceeds them."""
+
+EXCESS = 0.02
+"""The excess over a limit at a few points that is left, as a share of it: less than the share of
+the limits that is left to the feedback."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilePiece:
+    """A motion from rest to rest, or a pause.
+
+    Attributes:
+        piece: The part of the curve.
+        times: The times of the motion at the points, in s after its begin, shape (N + 1,).
+        b: s'^2 at the points, shape (N + 1,); zeros in a pause.
+        a: s'' at the points, shape (N + 1,).
+        highest: The largest b from which the motion can brake, shape (N + 1,).
+        limiting: What limits each interval: an index into `TimeProfile.causes`, shape (N,).
+    """
+
+    piece: Piece
+    times: FloatArray
+    b: FloatArray
+    a: FloatArray
+    highest: FloatArray
+    limiting: np.typing.NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TimeProfile:
+    """The fastest motion along the curve of a reference.
+
+    Attributes:
+        pieces: Its motions from rest to rest and its pauses, in their order.
+        causes: What limits it: signals, by the indices of `ProfilePiece.limiting`.
+        start_time: When it begins, in s.
+        layout: How R is stacked.
+    """
+
+    pieces: tuple[ProfilePiece, ...]
+    causes: tuple[Row, ...]
+    start_time: float
+    layout: Layout
+
+    def __repr__(self) -> str:
+        count = sum(not one.piece.is_pause for one in self.pieces)
+        return f"TimeProfile({self.duration:.4g} s, {count} motions from rest to rest)"
+
+    @property
+    def duration(self) -> float:
+        """The duration of the motion, in s."""
+        return float(sum(piece.times[-1] for piece in self.pieces))
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """What limits the motion, with its share of the time, the largest first."""
+        found: dict[str, float] = {}
+        for one in self.pieces:
+            for place, time in zip(one.limiting.tolist(), np.diff(one.times), strict=True):
+                name = self.causes[place].text
+                found[name] = found.get(name, 0.0) + float(time) / self.duration
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+@checked(ReferenceSignalError)
+class PathTiming:
+    """The shortest motions along the curves of references within limits, from rest to rest.
+
+    A reference r(t) is taken as a curve r(s), see `dae.timing.curve`. For any s(t) the reference
+    r(s(t)) is admissible, so that errors obey (30), (31) whatever s does. With b = s'^2 and a = s''
+    the control (28) and the constraint inputs (25) on the curve without error are
+
+        u = m(s) b + n(s) a + c(s),
+
+    with m, n, c from the law itself, and so are accelerations; speeds limit b. The largest b is
+    found by reachable sets, see `dae.timing.reachable`. Friction makes u nonlinear in b: it is then
+    linearized about the profile before, where it is exact, until this does not change.
+
+    Args:
+        structure: The structure of the system, `find_structure`: rigid joints, where positions have
+            degree 2 and forces degree 0, without zero dynamics.
+        limits: The limits of controls, states, their rates, and forces.
+
+    Raises:
+        ReferenceSignalError: There is no such profile for the system.
+        ModelError: A limit names no signal of the system.
+    """
+
+    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+        self.structure, self.limits = structure, limits
+        self._along = AlongCurve(structure, limits)
+
+    def profile(
+        self,
+        references: Sequence[Reference] | Mapping[str, Reference | float],
+        end: float,
+        *,
+        begin: float = 0.0,
+        start: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        largest_rate: float | None = None,
+        points: int = 1000,
+    ) -> TimeProfile:
+        """The shortest motion along the curve of a reference.
+
+        Forces are commanded as the reference has them at s. Where nothing moves the time passes as
+        in the reference; a pause at the end in which no output changes is left out. Limits of paths
+        of speed and acceleration, `PathLimits`, hold as well; their jerk is not limited.
+
+        Args:
+            references: The references of all outputs; or name -> reference, or a number.
+            end: The last time of the reference, in s.
+            begin: Its first time, in s.
+            start: A state near which the motion begins, shape (n,); the nominal one if None.
+            parameters: Values of all parameters; the defaults if None.
+            largest_rate: The largest rate of the reference's time, 1 to be nowhere faster than the
+                reference itself; None for no limit.
+            points: The number of intervals of the grid.
+
+        Raises:
+            ReferenceSignalError: A rest on the curve is not within the limits, which are named with
+                the place; nothing limits the motion; nothing moves; the curve is out of reach.
+            ModelError: A number makes no sense.
+        """
+        check_whole_number("points", points, 20)
+        if not end > begin or (largest_rate is not None and not largest_rate > 0.0):
+            raise ModelError(
+                "end must be after begin and largest_rate positive, got "
+                f"{begin:g} s, {end:g} s and {largest_rate}"
+            )
+        along, system = self._along, self.structure.system
+        names = [signal.name for signal in system.output_signals]
+        if isinstance(references, Mapping):
+            references = references_by_name(references, names, along.layout.degrees)
+        covered = sum(reference.size for reference in references)
+        if covered != len(names):
+            raise ReferenceSignalError(
+                f"the references cover {covered} outputs, the system has {len(names)}"
+            )
+        curve = Curve(references, along.layout, begin, end, points)
+        guess = system.nominal_state if start is None else vector("start", start, system.num_states)
+        numbers = system.parameter_vector(parameters)
+        found, causes = list[ProfilePiece](), tuple[Row, ...]()
+        for piece in _without_last_pause(curve.pieces, along.layout):
+            if piece.is_pause:
+                found.append(_pause(piece))
+                continue
+            tools = tool_limits(references, piece, along.layout)
+            rows = rows_along(along, piece, guess, numbers, tools)
+            guess, causes = rows.at_rest[-1], rows.names
+            found.append(_fastest(rows, piece, largest_rate))
+        return TimeProfile(tuple(found), (*causes, _PAUSE), begin, along.layout)
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True, eq=False)
+class TimeOptimalReference(PiecewiseReference):
+    """The reference of a profile, for all outputs, by the time of the motion.
+
+    Before and after, the values are constant. r'' is continuous except at rests, and accurate to
+    5e-4 of its largest value; forces have no derivatives.
+
+    Attributes:
+        profile: The profile.
+    """
+
+    is_table = True
+
+    profile: TimeProfile
+    order: int = field(default=2, init=False)
+
+    @property
+    def size(self) -> int:
+        return len(self.profile.layout.degrees)
+
+    @cached_property
+    def table(self) -> Pieces:
+        """The polynomials of r, one row for each output."""
+        parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
+        layout = self.profile.layout
+        table = time_table(parts, layout, self.profile.start_time)
+        return at_rest_outside(coarser(table, layout.dynamic))
+
+    def pieces(self, degrees: Sequence[int]) -> Pieces:
+        return stacked(self.table, degrees)
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        self._check(degrees)
+        pieces = self.pieces(degrees)
+        return pieces.expression(time) if len(pieces.factors) <= MOST_POLYNOMIALS else None
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        for i, (needed, own) in enumerate(zip(degrees, self.profile.layout.degrees, strict=True)):
+            if needed > own:
+                raise ReferenceSignalError(
+                    f"row {i} of this TimeOptimalReference has {own} derivatives, the law needs "
+                    f"{needed}; make its profile with the structure of that law"
+                )
+
+
+def _without_last_pause(pieces: Sequence[Piece], layout: Layout) -> Sequence[Piece]:
+    """The pieces without a pause at the end in which no output changes."""
+    values = pieces[-1].values[:, layout.lowest]
+    is_still = np.ptp(values, axis=0).max() <= 1e-9 * np.abs(values).max()
+    return pieces[:-1] if pieces[-1].is_pause and is_still else pieces
+
+
+def _pause(piece: Piece) -> ProfilePiece:
+    count = piece.times.size
+    zero = np.zeros(count)
+    passed = piece.times - piece.times[0]
+    return ProfilePiece(piece, passed, zero, zero, zero, np.full(count - 1, -1, dtype=np.intp))
+
+
+def _fastest(rows: Rows, piece: Piece, largest_rate: float | None) -> ProfilePiece:
+    """The fastest motion along a piece.
+
+    Where the acceleration changes from one interval to the next, as where n of a limit passes
+    through zero, smoothing exceeds the limit a little. It is lowered there if that is too much.
+
+    Raises:
+        ReferenceSignalError: Nothing limits the motion, or it cannot leave a rest.
+    """
+    largest, which = rows.largest(inf if largest_rate is None else largest_rate)
+    factor = np.ones(largest.size)
+    before: FloatArray | None = None
+    for _ in range(LOWERINGS + 1):
+        found, before = _settled(rows, piece, largest, factor, before)
+        b, a, times = smoothed(piece.distances, found.b, found.a)
+        lines = rows.lines(b)
+        excess = np.max(lines.alpha * a[:, None] + lines.beta * b[:, None], axis=1, initial=0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            excess = np.maximum(excess, np.where(largest > 0.0, b / largest, 0.0))
+        if excess.max() <= 1.0 + EXCESS:
+            break
+        wide = np.pad(np.maximum(excess / (1.0 + EXCESS / 2.0), 1.0), 1, mode="edge")
+        factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
+    limiting = np.where(found.active >= 0, found.active, which[1:])
+    return ProfilePiece(piece, times, b, a, found.highest, limiting)
+
+
+def _settled(
+    rows: Rows,
+    piece: Piece,
+    largest: FloatArray,
+    factor: FloatArray,
+    before: FloatArray | None,
+) -> tuple[Fastest, FloatArray | None]:
+    """The fastest motion with all limits divided by a factor, and b about which it is exact."""
+    for number in range(1 if rows.is_linear else PASSES):
+        lines = rows.lines(before)
+        lowered = Lines(lines.alpha * factor[:, None], lines.beta * factor[:, None])
+        found = fastest_motion(piece.distances, lowered, largest / factor)
+        if not np.isfinite(found.b).all():
+            raise ReferenceSignalError(
+                "nothing limits the motion: give limits of controls, joints or forces"
+            )
+        moves = found.b[1:] + found.b[:-1] > 0.0
+        if not moves.all():
+            place = float(piece.times[int(np.argmin(moves))])
+            raise ReferenceSignalError(
+                f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses "
+                "all of a limit"
+            )
+        if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
+            break
+        if not rows.is_linear:
+            before = found.b if before is None or number < 10 else (found.b + before) / 2.0
+    return found, before

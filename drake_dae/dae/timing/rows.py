@@ -1,0 +1,243 @@
+"""Limits along a curve as lines alpha a + beta b <= 1, with what each of them limits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.layout import Indices
+from drake_dae.dae.timing.along import AlongCurve
+from drake_dae.dae.timing.curve import Piece
+from drake_dae.dae.timing.reachable import Lines
+from drake_dae.dae.timing.tool_limits import ToolLimits
+from drake_dae.errors import ReferenceSignalError
+
+LINEAR = 1e-7
+"""Signals count as linear in (a, b) up to this share of their size."""
+
+SLOW = 0.01
+"""The slowest speed at which friction is evaluated, as a share of the largest."""
+
+CHECKED = 20
+"""One point in so many is tested for that."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a line limits.
+
+    Attributes:
+        name: The signal.
+        side: "least" or "largest".
+        unit: The signal's unit.
+    """
+
+    name: str
+    side: str
+    unit: str
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return f"{self.side} {self.name}".strip()
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The limited signals along a piece.
+
+    Attributes:
+        along: What the system needs along curves.
+        piece: The piece.
+        parameters: Values of all parameters.
+        at_rest: x at rest, shape (N + 1, n).
+        moving: dx/dw at rest, shape (N + 1, n).
+        still: c, the limited signals at rest, shape (N + 1, k).
+        by_a: n, shape (N + 1, k).
+        by_b: m if they are linear, shape (N + 1, k).
+        scale: The speed s' at which signals are compared, and the square root of a.
+        is_linear: Whether signals are m b + n a + c.
+        tools: The limits of paths.
+    """
+
+    along: AlongCurve
+    piece: Piece
+    parameters: FloatArray
+    at_rest: FloatArray
+    moving: FloatArray
+    still: FloatArray
+    by_a: FloatArray
+    by_b: FloatArray
+    scale: float
+    is_linear: bool
+    tools: Sequence[ToolLimits]
+
+    @property
+    def names(self) -> tuple[Row, ...]:
+        """What may limit: all lines, then what limits b alone."""
+        limited = self.along.limited
+        pairs = [*zip(limited.signals, limited.low, limited.high, strict=True)]
+        rows = [Row(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
+        rows += [Row(s.name, "least", s.unit) for s, low, _ in pairs if np.isfinite(low)]
+        rows += [Row("acceleration of a path", "largest", "")] * sum(
+            tool.of_a.shape[1] for tool in self.tools
+        )
+        rows += [Row(s.name, "largest", s.unit) for s in limited.state_signals]
+        rows += [Row("speed of a path", "largest", "")] * len(self.tools)
+        return (*rows, Row("rate of the reference's time", "largest", ""))
+
+    def lines(self, before: FloatArray | None) -> Lines:
+        """The lines; where signals are not linear, those about a profile before.
+
+        Args:
+            before: b of the profile before, shape (N + 1,), at which lines are exact; None for the
+            first.
+        """
+        by_a, by_b, still = self.by_a, self.by_b, self.still
+        if not self.is_linear:
+            # At rest as in slow motion.
+            now = np.full(len(still), self.scale**2) if before is None else before
+            speed = np.maximum(np.sqrt(now), SLOW * np.sqrt(now.max()))
+            zero = np.zeros(len(still))
+            values = self._values(speed, zero)
+            by_a = (self._values(speed, zero + self.scale**2) - values) / self.scale**2
+            still = values - speed[:, None] ** 2 * by_b
+        low, high = self.along.limited.low, self.along.limited.high
+        up, down = np.isfinite(high), np.isfinite(low)
+        above, below = high[up] - still[:, up], still[:, down] - low[down]
+        _check_friction(self, above, below)
+        tools = self.tools
+        none = np.zeros((len(still), 1))  # A line that limits nothing, after all others.
+        of_a = [by_a[:, up] / above, -by_a[:, down] / below, *(t.of_a for t in tools), none]
+        of_b = [by_b[:, up] / above, -by_b[:, down] / below, *(t.of_b for t in tools), none]
+        return Lines(np.hstack(of_a), np.hstack(of_b))
+
+    def largest(self, rate: float) -> tuple[FloatArray, Indices]:
+        """The largest b at each point, and what limits it as a place in `names`.
+
+        Args:
+            rate: The largest rate of the reference's time.
+        """
+        limited = self.along.limited
+        rest = self.along.limited_states(self.at_rest)
+        slope = self.along.limited_states(self.moving)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(slope > 0.0, limited.state_high - rest, limited.state_low - rest)
+            room = room / slope
+        room = np.where(slope == 0.0, np.inf, room)
+        own = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
+        columns = [room**2, *(tool.largest[:, None] for tool in self.tools), own[:, None] ** 2]
+        together = np.hstack(columns)
+        least = together.argmin(axis=1)
+        first = len(self.names) - together.shape[1]
+        return together[np.arange(len(rest)), least], least + first
+
+    def _values(self, speed: FloatArray, a: FloatArray) -> FloatArray:
+        """The limited signals at given speeds and accelerations, shape (N + 1, k)."""
+        rows = self.along.reference(self.piece, speed, a)
+        return self.along.values(self.at_rest + speed[:, None] * self.moving, rows, self.parameters)
+
+
+def rows_along(
+    along: AlongCurve,
+    piece: Piece,
+    guess: FloatArray,
+    parameters: FloatArray,
+    tools: Sequence[ToolLimits],
+) -> Rows:
+    """The limited signals along a piece.
+
+    Args:
+        along: What the system needs along curves.
+        piece: The piece; no pause.
+        guess: A state near its begin, shape (n,).
+        parameters: Values of all parameters.
+        tools: The limits of paths.
+
+    Raises:
+        ReferenceSignalError: A rest on the piece is not within the limits, or a state has no
+            value there.
+    """
+    at_rest, moving = along.states_at_rest(piece, guess, parameters)
+    speed = piece.distances[-1] / (piece.times[-1] - piece.times[0])
+    zero = np.zeros(piece.times.size)
+
+    def values(w: float, a: float, every: int = 1) -> FloatArray:
+        rows = along.reference(piece, zero + w, zero + a)[::every]
+        return along.values((at_rest + w * moving)[::every], rows, parameters)
+
+    still = values(0.0, 0.0)
+    _check_rest(along, piece, at_rest, still)
+    by_a = (values(0.0, speed**2) - still) / speed**2
+    # Without friction, which does not grow with b.
+    by_b = (values(2.0 * speed, 0.0) - values(speed, 0.0)) / (3.0 * speed**2)
+    twice = values(2.0 * speed, speed**2, CHECKED)
+    expected = still + speed**2 * (4.0 * by_b + by_a)
+    off = np.abs(twice - expected[::CHECKED]).max(axis=0, initial=0.0)
+    bounds = np.abs([along.limited.low, along.limited.high])
+    bounds[~np.isfinite(bounds)] = 0.0
+    size = np.maximum(np.abs(twice).max(axis=0, initial=0.0), bounds.max(axis=0, initial=0.0))
+    is_linear = bool((off <= LINEAR * size).all())
+    return Rows(
+        along, piece, parameters, at_rest, moving, still, by_a, by_b, speed, is_linear, tools
+    )
+
+
+def _check_friction(rows: Rows, above: FloatArray, below: FloatArray) -> None:
+    """Refuses friction that needs more than the limits in slow motion.
+
+    Raises:
+        ReferenceSignalError: Which signal, and where.
+    """
+    room = np.hstack([above, below])
+    if not room.size or room.min() > 0.0:
+        return
+    point, column = np.unravel_index(int(room.argmin()), room.shape)
+    row = rows.names[int(column)]
+    raise ReferenceSignalError(
+        f"in slow motion at t = {rows.piece.times[point]:.4g} s of the reference {row.name} is "
+        f"{-room.min():.4g} {row.unit} beyond its limit, with friction: no motion along this path "
+        "is within the limits. Choose another path, posture or force, or larger limits"
+    )
+
+
+def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: FloatArray) -> None:
+    """Refuses a piece on which a rest is not within the limits.
+
+    Raises:
+        ReferenceSignalError: Which signal, where, and by how much.
+    """
+    limited = along.limited
+    both = (
+        (limited.signals, limited.low, limited.high, still),
+        (
+            limited.state_signals,
+            limited.state_low,
+            limited.state_high,
+            along.limited_states(at_rest),
+        ),
+    )
+    for signals, low, high, values in both:
+        if not np.isfinite(values).all():
+            place = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
+            raise ReferenceSignalError(
+                f"the path has no control at t = {place:.4g} s of the reference: it leads through "
+                "a singular configuration"
+            )
+        room = np.minimum(high - values, values - low)
+        if not room.size or room.min() > 0.0:
+            continue
+        size = np.minimum(np.abs(high), np.abs(low))
+        share = room / np.where((size > 0.0) & np.isfinite(size), size, 1.0)
+        point, column = np.unravel_index(int(share.argmin()), room.shape)
+        value, signal = values[point, column], signals[column]
+        is_high = high[column] - value <= 0.0
+        bound = high[column] if is_high else low[column]
+        reached = "may be at most" if is_high else "must be at least"
+        raise ReferenceSignalError(
+            f"at rest at t = {piece.times[point]:.4g} s of the reference {signal.name} is "
+            f"{value:.4g} {signal.unit}, and {reached} {bound:.4g} {signal.unit}: no motion along "
+            "this path is within the limits. Choose another path, posture or force, or larger "
+            "limits"
+        )

@@ -1,0 +1,110 @@
+"""The references of a scenario as a path in the shortest time: the key `time_optimal`."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+
+from drake_dae.dae.references import references_by_name
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.dae.timing.profile import MOST_POLYNOMIALS, PathTiming, TimeOptimalReference
+from drake_dae.errors import ScenarioError
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.motion_limits import robot_motion_limits
+from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.scenario import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """The time-optimal motion of a scenario.
+
+    Attributes:
+        reference: Its reference, for all outputs.
+        governed: The robot's own limits, within which a governor slows it; None without one.
+    """
+
+    reference: TimeOptimalReference
+    governed: MotionLimits | None
+
+
+LATE = 0.5
+"""How much longer a run with a governor lasts than the motion, in s."""
+
+MOST_CAUSES = 3
+"""The number of limits that a note names."""
+
+
+def timed(
+    scenario: Scenario, model: RobotModel, structure: Structure
+) -> tuple[Completed, Timed | None]:
+    """A scenario with the duration of its time-optimal motion, and this.
+
+    Args:
+        scenario: A completed scenario.
+        model: Its robot.
+        structure: The structure of the model's system.
+
+    Returns:
+        The scenario as it is, and None, without the key `time_optimal`.
+
+    Raises:
+        ScenarioError: There is no such motion; the message says why.
+    """
+    wanted = scenario.time_optimal
+    if wanted is None:
+        return Completed(scenario), None
+    if scenario.task is not None:
+        raise ScenarioError(("time_optimal", "a task plans its own motion: it has no path to time"))
+    with at("references"):
+        outputs = [signal.name for signal in model.dae.output_signals]
+        references = references_by_name(scenario.references, outputs, structure.output_degrees)
+    begin = scenario.integrator.start_time
+    until = begin + scenario.duration if wanted.until is None else wanted.until
+    with at("time_optimal"):
+        contacts: dict[str, Any] = {"forces": wanted.forces, "cones": wanted.cones}
+        limits = robot_motion_limits(
+            model,
+            efforts=wanted.efforts,
+            joint_speeds=wanted.joint_speeds,
+            joint_accelerations=wanted.joint_accelerations,
+            **contacts,
+        )
+        profile = PathTiming(structure, limits).profile(
+            references,
+            until,
+            begin=begin,
+            largest_rate=wanted.largest_rate,
+            points=wanted.points,
+        )
+    reference = TimeOptimalReference(profile)
+    why_not = _why_not_governed(scenario, reference)
+    if wanted.governor and why_not:
+        raise ScenarioError(("time_optimal.governor", why_not))
+    is_governed = not why_not and wanted.governor is not False
+    if wanted.until is None:
+        own = replace(wanted, until=until)
+        duration = profile.duration + (LATE if is_governed else 0.0)
+        scenario = replace(scenario, time_optimal=own, duration=duration)
+    causes = [f"{name} {share:.0%}" for name, share in profile.shares.items() if share >= 0.005]
+    note = (
+        f"time-optimal: {profile.duration:.4g} s for the references up to {until:.4g} s; limited "
+        f"by {', '.join(causes[:MOST_CAUSES])}" + (", ..." if len(causes) > MOST_CAUSES else "")
+    )
+    notes = [note]
+    if why_not and wanted.governor is None:
+        notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
+    governed = robot_motion_limits(model, **contacts) if is_governed else None
+    return Completed(scenario, tuple(notes)), Timed(reference, governed)
+
+
+def _why_not_governed(scenario: Scenario, reference: TimeOptimalReference) -> str:
+    """Why there can be no governor; empty if there can be one."""
+    if scenario.observer is not None:
+        return "the law has an observer, whose estimates it does not know"
+    if reference.expression(reference.profile.layout.degrees, ca.SX.sym("t")) is None:
+        count = len(reference.table.factors)
+        return f"the path needs {count} polynomials, and it takes at most {MOST_POLYNOMIALS}"
+    return ""

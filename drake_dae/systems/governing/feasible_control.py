@@ -1,0 +1,95 @@
+"""Drives with limits, by which the error leaves its prediction least, as a LeafSystem."""
+
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.governing.feasible import feasible_control
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.timing.motion_limits import MotionLimits
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation
+from drake_dae.systems.blocks.trials import StepWatch
+
+OUTPUTS = ("control", "excess", "departure", "is_limited")
+"""The output ports, in the order of the function's results."""
+
+
+@checked(ModelError)
+class FeasibleControl(LeafSystem):
+    """The control within limits that is nearest to a wanted one in the outputs' derivatives.
+
+    See `feasible_control` for the law. Within all limits it is the wanted control.
+
+    Input ports:
+        estimated_state: x, shape (n,).
+        control: The wanted control, shape (p,).
+
+    Output ports:
+        control: u, shape (p,).
+        excess: Wanted minus given control, shape (p,): 0 within the limits.
+        departure: ubar - ubar_d, by how much the highest derivatives of the outputs are off those
+            of (28), shape (p,): 0 while errors follow their prediction (30).
+        is_limited: 1 while the control is not the wanted one, else 0, shape (1,).
+
+    Numeric parameter 0 holds the model's parameters.
+
+    Args:
+        structure: The structure of the law's system.
+        limits: Limits of all controls, and of forces and cones.
+
+    Raises:
+        ModelError: As of `feasible_control`.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+        super().__init__()
+        self.set_name("feasible_control")
+        system = structure.system
+        self._degrees = structure.output_degrees
+        self.dae, self.function = system, feasible_control(structure, limits)
+        self._steps = StepWatch(self)
+        self.DeclareNumericParameter(BasicVector(system.parameter_values))
+        self._state = self.DeclareVectorInputPort("estimated_state", system.num_states)
+        self._wanted = self.DeclareVectorInputPort("control", system.num_controls)
+        sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        for index, name in enumerate(OUTPUTS):
+            size = self.function.outputs[index].size
+            self.DeclareVectorOutputPort(name, size, weakly(self._calc, index), sources)
+
+    @property
+    def departure_signals(self) -> tuple[Signal, ...]:
+        """Names and units of the departure."""
+        return tuple(
+            Signal(f"departure of {signal.name}", signal.derivative(degree).unit)
+            for signal, degree in zip(self.dae.output_signals, self._degrees, strict=True)
+        )
+
+    def _values(self, context: Context) -> tuple[FloatArray, ...]:
+        state, wanted = self._state.Eval(context), self._wanted.Eval(context)
+        parameters = context.get_numeric_parameter(0).value()
+        values = self.function.evaluate(state, wanted, parameters)
+        if self.function.is_finite:
+            return values
+        names = {"state": self.dae.state_signals, "control": self.dae.control_signals}
+        error = simulation_error(self.function.failure(), context.get_time(), state, names)
+        self._steps.tolerate(context, error)
+        return self.function.nowhere()
+
+    def _calc(self, index: int, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._values(context)[index].reshape(-1))
+
+    def traced(self) -> Block:
+        sources = ("estimated_state", "control", PARAMETERS)
+        return Block(
+            self,
+            (Computation.of(self.function, sources, OUTPUTS),),
+            model=self.dae,
+            signals={"state": self.dae.state_signals, "control": self.dae.control_signals},
+            ports={"control": tuple(self.dae.control_signals)},
+        )

@@ -1,0 +1,207 @@
+"""Motions that are slowed, and controls that are limited, while they run."""
+
+import numpy as np
+import pytest
+from arms import arm, consistent_states, error_controlled, fixed_step, law
+
+from drake_dae import (
+    ConstantReference,
+    LoopSettings,
+    MotionLimits,
+    PathTiming,
+    PointToPointReference,
+    RobotPlant,
+    SinusoidReference,
+    TimeOptimalReference,
+    make_closed_loop,
+    poles,
+    robot_motion_limits,
+    rollout,
+    simulate,
+    start_values,
+)
+from drake_dae.dae.governing.feasible import feasible_control
+from drake_dae.errors import ModelError, WiringError
+
+MOTORS = ("joint1_motor", "joint2_motor")
+PRESS = ConstantReference(20.0)
+
+
+def limits_of(efforts, share=1.0, **more):
+    controls = {
+        name: (-share * one, share * one) for name, one in zip(MOTORS, efforts, strict=True)
+    }
+    return MotionLimits(controls, **more)
+
+
+def governed_loop(efforts, references, end, largest_rate=None, **settings):
+    """The two-link arm in its time-optimal motion with 95 % of the efforts, governed at all."""
+    found, own = arm("two_link"), law("two_link")
+    timing = PathTiming(found.structure, limits_of(efforts, 0.95))
+    profile = timing.profile(references, end, largest_rate=largest_rate, points=300)
+    plant = RobotPlant(found.model, structure=found.structure)
+    given = LoopSettings(governed=limits_of(efforts), **settings)
+    loop = make_closed_loop(plant, own, [TimeOptimalReference(profile)], given)
+    return profile, loop
+
+
+def started(loop, error):
+    """A context at rest with the tip off its reference."""
+    model, plant = arm("two_link").model, loop.plant
+    context = loop.diagram.CreateDefaultContext()
+    wanted = loop.reference.reference(0.0)[[0, 3]] + [error, 0.0]
+    parameters = plant.dae.parameter_values
+    q = model.configuration(wanted[:1], model.nominal_positions, parameters)
+    state = model.rest_state(q, wanted[1:], parameters)
+    plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), state)
+    return context
+
+
+def run(loop, error, duration):
+    context = started(loop, error)
+    simulate(loop.diagram, context, duration, error_controlled(1e-8))
+    return loop.record(context)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("efforts", [(300.0, 120.0), (110.0, 60.0), (95.0, 45.0)])
+def test_limits_hold_and_errors_follow_their_prediction(efforts):
+    """A start 3 cm off the path; with less effort the motion takes longer."""
+    references = [SinusoidReference(0.3, 0.3, 1.5), PRESS]
+    profile, loop = governed_loop(efforts, references, 4.0, 1.0)
+    record = run(loop, 0.03, profile.duration + 1.0)
+    assert np.all(np.abs(record["control"]) <= efforts)
+    s, rate, bend, _ = record["path"].T
+    assert rate[0] == 0.0
+    assert rate.min() >= 0.0
+    assert rate.max() <= 1.0 + 1e-12
+    assert s[-1] > profile.duration
+    np.testing.assert_allclose(
+        np.diff(rate), np.diff(record.time) * (bend[1:] + bend[:-1]) / 2.0, atol=1e-3
+    )
+    # Steps over the jumps of r'' at the turns are less accurate than 1e-8.
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record))
+    assert off.max() < 2e-6
+    assert np.abs(record["tracking_error"][-1]).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_without_a_governor_the_same_start_exceeds_the_limits():
+    """15 cm below the path even rest needs 11 % too much; then the governor waits."""
+    references = [PointToPointReference(0.0, 0.6, 0.0, 2.0, order=3), PRESS]
+    efforts = (110.0, 55.0)
+    profile, loop = governed_loop(efforts, references, 2.0)
+    governed = run(loop, -0.15, profile.duration + 1.0)
+    found, own = arm("two_link"), law("two_link")
+    plant = RobotPlant(found.model, structure=found.structure)
+    plain = make_closed_loop(plant, own, [TimeOptimalReference(profile)])
+    free = run(plain, -0.15, profile.duration)
+    assert np.max(np.abs(free["control"]) / efforts) > 1.25
+    needed = np.max(np.abs(governed["control"]) / efforts, axis=1)
+    assert needed[0] == needed.max() == pytest.approx(1.109, abs=1e-3)
+    # Hardly, once the error is small enough.
+    assert needed[governed.time > 0.15].max() <= 1.0 + 2e-3
+    assert governed["path"][:, 1].min() >= 0.0
+    assert governed["path"][-1, 0] > profile.duration
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("period", [0.0, 0.01])
+def test_a_rollout_has_the_record_of_simulate(period):
+    references = [SinusoidReference(0.3, 0.3, 1.5), PRESS]
+    settings = {"control_limits": [140.0, 70.0]}
+    if period:
+        from drake_dae import Sampling
+
+        settings["sampling"] = Sampling(period)
+    _, loop = governed_loop((140.0, 70.0), references, 1.5, **settings)
+    context = started(loop, 0.05)
+    simulate(loop.diagram, context, 0.4, fixed_step(2e-3))
+    wanted = loop.record(context)
+    start, parameters = start_values(loop, started(loop, 0.05))
+    (found,) = rollout(
+        loop, start, parameters, wanted.time, config=fixed_step(2e-3), compiled=False
+    )
+    assert list(found.record.signals) == list(wanted.signals)
+    for name in ("state", "control", "path", "reference", "departure", "excess"):
+        scale = max(1.0, np.abs(wanted[name]).max())
+        np.testing.assert_allclose(
+            found.record[name][:-1], wanted[name][:-1], rtol=0.0, atol=1e-9 * scale
+        )
+
+
+def test_within_all_limits_the_control_is_the_wanted_one():
+    found = arm("two_link")
+    function = feasible_control(found.structure, limits_of((300.0, 120.0)))
+    parameters = found.model.dae.parameter_values
+    random = np.random.default_rng(0)
+    for state in consistent_states("two_link", 5):
+        wanted = random.uniform(-1.0, 1.0, 2) * (300.0, 120.0)
+        control, excess, departure, is_limited = function(state, wanted, parameters)
+        np.testing.assert_array_equal(control, wanted)
+        assert not excess.any()
+        assert not departure.any()
+        assert not is_limited.any()
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_limits_hold_in_the_stated_order(name):
+    """Drives always, then the force; the departure is what the control misses of the law."""
+    found = arm(name)
+    dae = found.model.dae
+    limits = robot_motion_limits(found.model, forces={"wall.force": (5.0, 60.0)})
+    function = feasible_control(found.structure, limits)
+    most = np.array([limits.controls[signal.name][1] for signal in dae.control_signals])
+    own = law(name, poles(-4.0))
+    structure, parameters = own.structure, dae.parameter_values
+    elimination = structure.elimination
+    import casadi as ca
+
+    given = [dae.state, dae.parameter_symbol]
+    force = ca.Function("force", given, [elimination.alpha, elimination.beta])
+    matrix = ca.Function("B", given, [structure.control_matrix])
+    random = np.random.default_rng(1)
+    held = 0
+    for state in consistent_states(name, 20):
+        wanted = 2.0 * random.uniform(-1.0, 1.0, most.size) * most
+        wanted[0] = 1.5 * most[0]
+        control, excess, departure, is_limited = function(state, wanted, parameters)
+        assert np.all(np.abs(control) <= most)
+        alpha, beta = (part.full() for part in force(state, parameters))
+        value = float(alpha[0, 0] + beta[0] @ control)
+        # By the corners of the box: the range of forces that the drives can make.
+        middle, room = alpha[0, 0], np.abs(beta[0]) @ most
+        can = middle - room < 60.0 and middle + room > 5.0
+        if can:
+            held += 1
+            assert 5.0 - 1e-3 <= value <= 60.0 + 1e-3
+        np.testing.assert_allclose(excess, wanted - control)
+        missed = matrix(state, parameters).full() @ (control - wanted)
+        np.testing.assert_allclose(departure, missed, atol=1e-9 * np.abs(missed).max())
+        assert is_limited
+    assert held > 3
+
+
+@pytest.mark.slow
+def test_a_model_error_leaves_drives_at_their_limits_and_shows_its_departure():
+    references = [PointToPointReference(0.0, 0.6, 0.0, 2.0, order=3), PRESS]
+    efforts = (140.0, 70.0)
+    profile, loop = governed_loop(efforts, references, 2.0, control_limits=efforts)
+    context = started(loop, 0.0)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_parameter(own, "link2.mass", 14.0)
+    simulate(loop.diagram, context, profile.duration, fixed_step())
+    record = loop.record(context)
+    assert np.abs(record["control"]).max(axis=0)[0] <= 140.0
+    is_off = np.abs(record["departure"]).max(axis=1) > 0.0
+    np.testing.assert_array_equal(is_off, np.abs(record["excess"]).max(axis=1) > 0.0)
+
+
+def test_what_cannot_be_governed_is_refused_in_a_sentence():
+    found = arm("two_link")
+    with pytest.raises(ModelError, match="each control needs a limit of its magnitude"):
+        feasible_control(found.structure, MotionLimits())
+    plant = RobotPlant(found.model, structure=found.structure)
+    settings = LoopSettings(governed=limits_of((1.0, 1.0)), control_limits=[1.0])
+    with pytest.raises(WiringError, match="control_limits has 1 entries, there are 2"):
+        make_closed_loop(plant, law("two_link"), [ConstantReference(0.3), PRESS], settings)
