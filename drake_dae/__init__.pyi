@@ -13,7 +13,6 @@ from .dae.beyond.disturbance import with_disturbance as with_disturbance
 from .dae.beyond.one_direction import SensorNoise as SensorNoise
 from .dae.beyond.sampled import sampled_poles as sampled_poles
 from .dae.beyond.sampled import sampling_error as sampling_error
-from .dae.beyond.spring_bound import spring_error_bound as spring_error_bound
 from .dae.beyond.spring_loop import SpringLoop as SpringLoop
 from .dae.beyond.spring_loop import spring_loop as spring_loop
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
@@ -50,7 +49,6 @@ from .dae.timing.motion_limits import FrictionCone as FrictionCone
 from .dae.timing.motion_limits import MotionLimits as MotionLimits
 from .dae.timing.profile import PathTiming as PathTiming
 from .dae.timing.profile import TimeOptimalReference as TimeOptimalReference
-from .dae.timing.profile import TimeProfile as TimeProfile
 from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
@@ -130,8 +128,6 @@ from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
 from .systems.cascade.cascade import SpringCascade as SpringCascade
-from .systems.cascade.spring_view import SpringView as SpringView
-from .systems.cascade.torque_loop import TorqueLoop as TorqueLoop
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.limits import ControlLimits as ControlLimits
@@ -141,8 +137,6 @@ from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
-from .systems.governing.feasible_control import FeasibleControl as FeasibleControl
-from .systems.governing.governor import PathGovernor as PathGovernor
 from .systems.observing.estimator import StateEstimator as StateEstimator
 from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver
 from .systems.observing.observer_rates import Observing as Observing

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 import casadi as ca
 import numpy as np
 import pytest
+from actuated import actuated
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -41,6 +42,7 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.run_motion import ShownLoop
@@ -87,6 +89,26 @@ def contact_plant() -> dd.ContactPlant:
 def observed_law() -> dd.TrackingLaw:
     dae = dd.with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
+
+
+@cache
+def springy() -> dd.RobotModel:
+    return actuated("two_link", "flexible").model
+
+
+@cache
+def links_law() -> dd.TrackingLaw:
+    return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
+
+
+def motion_limits() -> dd.MotionLimits:
+    return dd.robot_motion_limits(arm("two_link").model)
+
+
+@cache
+def time_profile() -> TimeProfile:
+    line, press = dd.SinusoidReference(0.3, 0.1, 1.5), dd.ConstantReference(20.0)
+    return dd.PathTiming(arm("two_link").structure, motion_limits()).profile([line, press], 0.5)
 
 
 def sensed() -> dd.SensedContact:
@@ -190,6 +212,22 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
         observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01
     ),
     dd.SensedContact: sensed,
+    dd.MotionLimits: motion_limits,
+    dd.PathTiming: lambda: dd.PathTiming(arm("two_link").structure, motion_limits()),
+    TimeProfile: time_profile,
+    dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
+    dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
+    dd.SpringCascade: lambda: dd.SpringCascade(
+        links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01
+    ),
+    "law of SpringCascade": links_law,
+    "model of SpringCascade": springy,
+    "model of link_side": springy,
+    "references of PathTiming.profile": lambda: [
+        dd.SinusoidReference(0.3, 0.1, 1.5),
+        dd.ConstantReference(20.0),
+    ],
+    "end": lambda: 0.5,
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),
     dd.LinkExpressions: textbook,

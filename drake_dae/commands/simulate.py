@@ -36,8 +36,8 @@ from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
 from drake_dae.pictures.view import start_meshcat
-from drake_dae.robots.clearances import LinkBehind, links_behind
-from drake_dae.robots.shapes import Collision, LinkShapes, collisions
+from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
+from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario

@@ -5,6 +5,7 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
@@ -13,6 +14,7 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
 
 
+@checked(ModelError)
 def link_side(model: RobotModel) -> RobotModel:
     """The rigid robot that the springs of a robot move,
 

@@ -10,9 +10,9 @@ import numpy as np
 from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.clearances import LinkBehind
+from drake_dae.robots.geometry.clearances import LinkBehind
+from drake_dae.robots.geometry.shapes import Collision
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.shapes import Collision
 from drake_dae.simulation.open_contacts import contact_notes
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_dae.cli import main
-from drake_dae.robots.clearances import links_behind
+from drake_dae.robots.geometry.clearances import links_behind
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from tests.support.runs import scenario

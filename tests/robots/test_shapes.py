@@ -16,8 +16,8 @@ from drake_dae import (
     Sphere,
     shipped_model,
 )
-from drake_dae.robots.clearances import LinkBehind, links_behind
-from drake_dae.robots.shapes import LinkShapes, collisions
+from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
+from drake_dae.robots.geometry.shapes import LinkShapes, collisions
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 BASE, LENGTH, RADIUS = 0.3, 0.5, 0.06

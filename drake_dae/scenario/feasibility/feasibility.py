@@ -15,10 +15,10 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
-from drake_dae.robots.clearances import LinkBehind, links_behind
+from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
+from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange

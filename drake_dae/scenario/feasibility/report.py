@@ -9,8 +9,8 @@ import numpy as np
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.clearances import LinkBehind
-from drake_dae.robots.shapes import Collision
+from drake_dae.robots.geometry.clearances import LinkBehind
+from drake_dae.robots.geometry.shapes import Collision
 from drake_dae.scenario.feasibility.springs import SpringLaws
 
 WRONG_SIDE = (

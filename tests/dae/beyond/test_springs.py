@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drake_dae import DaeSystem, SpringLoop, TrackingLaw, poles, spring_error_bound, spring_loop
-from drake_dae.dae.beyond.spring_bound import spring_loop_radius, stable_scales
+from drake_dae import DaeSystem, SpringLoop, TrackingLaw, poles, spring_loop
+from drake_dae.dae.beyond.spring_bound import spring_error_bound, spring_loop_radius, stable_scales
 from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.errors import ModelError
 

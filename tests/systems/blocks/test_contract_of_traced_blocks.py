@@ -23,9 +23,7 @@ from drake_dae import (
     RobotPlant,
     SinusoidReference,
     SpringLoop,
-    SpringView,
     StateEstimator,
-    TorqueLoop,
     TrackingController,
     TrackingLaw,
     UnilateralRobotPlant,
@@ -36,6 +34,8 @@ from drake_dae import (
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
+from drake_dae.systems.cascade.spring_view import SpringView
+from drake_dae.systems.cascade.torque_loop import TorqueLoop
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl

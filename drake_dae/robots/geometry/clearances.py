@@ -9,8 +9,8 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots.geometry.shapes import TOUCHING, LinkShapes, moments
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.shapes import TOUCHING, LinkShapes, moments
 from drake_dae.trace.functions import TracedFunction
 
 SHARE = 0.05
