@@ -145,6 +145,7 @@ def test_a_robot_follows_the_reference_of_a_file(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_writing_arm_writes_a_letter_with_the_given_force():
     """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
 

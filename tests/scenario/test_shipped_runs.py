@@ -3,7 +3,7 @@
 import jsonschema
 import numpy as np
 import pytest
-from runs import scenario_validator
+from runs import DEAR, scenario_validator
 from scenario_texts import run
 
 from drake_dae import (
@@ -76,7 +76,10 @@ IDEAL = [name for name in shipped_scenarios() if not name.startswith("wall_")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", IDEAL)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.thorough] * (name in DEAR)) for name in IDEAL],
+)
 def test_shipped_scenario_runs_from_its_start_errors(name):
     scenario = load_scenario(find_scenario(name), ["duration=0.3"])
     assert scenario.description

@@ -101,6 +101,7 @@ def test_rollouts_diverge_as_simulations_do(fixed, compiled):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_tasks_diverge_by_their_own_outputs():
     """By simulate; rollouts, which are looked at before they have a row, end at least."""
     settings = ("wall_polish", "gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004))

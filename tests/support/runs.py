@@ -15,6 +15,10 @@ from drake_dae.scenario.scenario import Scenario, scenario_schema
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 
 DEAR = (
+    "three_fingers",
+    "seven_joint_flexible_motors",
+    "planar_4rrr",
+    "biped",
     "planar_3rrr",
     "seven_joint_dome",
     "seven_joint_flexible",

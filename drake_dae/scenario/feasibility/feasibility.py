@@ -78,7 +78,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         if scenario.is_cascade:
             # What the links need, as if they were rigid.
             model, structure = law_robot(scenario, model, structure)
-            scenario = replace(scenario, law=Tracking(), gains=Poles(all=[-4.0]), integral=[])
+            rigid = replace(scenario, law=Tracking(), gains=Poles(all=[-4.0]), integral=[])
+            scenario = replace(rigid, plant_parameters={})  # Their names may be those of springs.
             laws = spring_laws(own, whole, model, structure)
         elif scenario.sampling is not None:
             links = link_side(model)

@@ -32,8 +32,8 @@ pytestmark = [
 ]
 
 
-DEAR = ("tiago",)
-"""A minute and more."""
+DEAR = ("tiago", "so100", "ur10")
+"""They take long, or show what others do."""
 
 
 @pytest.mark.parametrize(

@@ -154,6 +154,7 @@ def test_force_tends_to_that_of_the_ideal_constraint():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_flexible_joints_are_tracked_by_a_law_that_does_not_know_the_friction():
     """The same circle and force behind springs: measured 0.001 mm and 0.01 N rms from 2 to 3 s.
 
