@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-import casadi as ca
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.errors import ModelError, WiringError
+from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
@@ -61,8 +61,7 @@ def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
             "encoders measure the positions of a robot: a RobotPlant or a ContactPlant"
         )
     links = plant.model.links
-    slope = links.velocity_map - ca.SX.eye(links.velocity_map.shape[0])
-    if encoders.velocity_bandwidth is not None and not ca.simplify(slope).is_zero():
+    if encoders.velocity_bandwidth is not None and not velocities_are_rates(links):
         raise WiringError(
             "velocities from differences need q' = v, and this robot has a body with q' = N(q) v; "
             "leave velocity_bandwidth out"

@@ -109,10 +109,10 @@ class Scenario:
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
         law: The law: the tracking law (28) of the whole robot, or for springs in the joints a
-            cascade of low degree. If left out it is the tracking law, but for springs in Drake's
-            own contact without `gains` the cascade.
+            cascade of low degree. If left out it is the tracking law; with springs in Drake's
+            own contact and without `gains` it is the cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
-            constraints; with Drake's own contact they are computed by `contact_gains`, together
+            constraints; with Drake's own contact they are computed, see `advised`, together
             with `integral`, `constraint_damping`, `observer` and measured force if these are left
             out. The scenario as run has them all. With `actuation` this needs the cascade.
         integral: Names of outputs whose errors are integrated as well, with one more pole:

@@ -192,20 +192,20 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     free, contact, fast = min(found, key=lambda each: each[0].error * each[1].error)
     w, of_contact = free.rate, contact.rates
     return AdvisedGains(
-        ContactGains(
-            1.5 * w,
-            of_contact.force_gain,
-            of_contact.gains[2],
-            2.0 * w,
-            of_contact.observer_rate,
-            w / 2.0,
+        gains=ContactGains(
+            position_rate=1.5 * w,
+            force_gain=of_contact.force_gain,
+            constraint_damping=of_contact.gains[2],
+            observer_rate=2.0 * w,
+            observer_force_rate=of_contact.observer_rate,
+            friction_rate=w / 2.0,
         ),
-        fast,
-        free.error,
-        contact.error,
-        free.by_noise,
-        contact.by_noise,
-        float(np.hypot(free.roughness, contact.roughness)),
+        state_rate=fast,
+        position_error=free.error,
+        force_error=contact.error,
+        noise_error=free.by_noise,
+        noise_force=contact.by_noise,
+        roughness=float(np.hypot(free.roughness, contact.roughness)),
     )
 
 

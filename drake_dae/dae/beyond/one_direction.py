@@ -123,7 +123,7 @@ class SampledLoop:
 
 
 def sampled_loop(direction: Direction, rates: Rates, noise: SensorNoise) -> SampledLoop:
-    """The loop of a law whose model is right but for what `direction` says.
+    """The loop of a law whose model is right, except for what `direction` says.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
     asks for, held for a sample after its delay, and m the mass_error. In a contact the depth moves
@@ -214,7 +214,7 @@ def _step(
 _filter = lru_cache(maxsize=256)(ChainFilter.of)
 """The same filter serves all masses and stiffnesses."""
 
-Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]]
 Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 
 
@@ -229,7 +229,7 @@ def _observed(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tup
         d = (velocity - now["before"]) / period - now["acted"]
         return {"r": now["r"] + gain * (d - now["r"]), "before": velocity, "acted": acted}
 
-    return known, update  # type: ignore[return-value]
+    return known, update
 
 
 def _estimated(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tuple[Known, Update]:
@@ -251,4 +251,4 @@ def _estimated(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tu
         q, w, a = transition(period) @ corrected(position, velocity)
         return {"q": q + period**2 / 2.0 * acted, "w": w + period * acted, "a": a}
 
-    return known, update  # type: ignore[return-value]
+    return known, update

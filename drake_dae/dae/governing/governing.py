@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.reference import Reference, with_degrees
 from drake_dae.dae.timing.limited_signals import LimitedSignals
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -70,10 +71,10 @@ class Governing:
     references: Sequence[Reference]
     limits: MotionLimits
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "function", self._traced())
-
-    function: TracedFunction = None  # type: ignore[assignment]
+    @cached_property
+    def function(self) -> TracedFunction:
+        """The function of the class."""
+        return self._traced()
 
     def _traced(self) -> TracedFunction:
         law, layout = self.law, self.law.layout
@@ -112,9 +113,8 @@ class Governing:
 
     def _reference(self, time: ca.SX) -> ca.SX:
         """R at a symbolic time of the reference."""
-        rows, left = [ca.SX(0, 1)], list(self.law.degrees)
-        for reference in self.references:
-            own, left = left[: reference.size], left[reference.size :]
+        rows = [ca.SX(0, 1)]
+        for reference, own in with_degrees(self.references, self.law.degrees):
             row = reference.expression(own, time)
             if row is None:
                 raise ReferenceSignalError(

@@ -106,6 +106,19 @@ class FormulaReference(Reference):
         return at_time(time, self.expression(degrees, time))
 
 
+def with_degrees(
+    references: Sequence[Reference], degrees: Sequence[int]
+) -> list[tuple[Reference, Sequence[int]]]:
+    """Each reference with the degrees of its outputs.
+
+    Args:
+        references: The references, in the order of the outputs.
+        degrees: The degrees mu_1, ..., mu_p of all outputs.
+    """
+    ends = np.cumsum([0, *[reference.size for reference in references]])
+    return list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
+
+
 def stack_references(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> Callable[[float], FloatArray]:
@@ -118,8 +131,7 @@ def stack_references(
     Raises:
         ReferenceSignalError: A reference is not smooth enough.
     """
-    ends = np.cumsum([0, *[reference.size for reference in references]])
-    parts = list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
+    parts = with_degrees(references, degrees)
     if not any(reference.is_table for reference in references):
         time = ca.SX.sym("t")
         rows = [reference.expression(part, time) for reference, part in parts]

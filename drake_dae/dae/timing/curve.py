@@ -18,7 +18,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.pieces import PiecewiseReference
-from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.reference import Reference, with_degrees
 from drake_dae.dae.system.layout import Indices, Layout
 from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.errors import ReferenceSignalError
@@ -36,11 +36,7 @@ Times = Callable[[FloatArray], FloatArray]
 
 def at_times(references: Sequence[Reference], layout: Layout) -> Times:
     """References as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
-    parts: list[Times] = []
-    left = list(layout.degrees)
-    for reference in references:
-        degrees, left = left[: reference.size], left[reference.size :]
-        parts.append(_one_at_times(reference, degrees))
+    parts = [_one_at_times(*each) for each in with_degrees(references, layout.degrees)]
     return lambda times: np.hstack([part(times) for part in parts])
 
 

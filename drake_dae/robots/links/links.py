@@ -127,3 +127,9 @@ class Links(Frames, Protocol):
             kinematics: The kinematics of the reaction, made by these links.
             reaction: Forces that act on the links, one column.
         """
+
+
+def velocities_are_rates(links: Links) -> bool:
+    """Whether q' = v: no body has q' = N(q) v."""
+    slope = links.velocity_map - ca.SX.eye(links.velocity_map.shape[0])
+    return bool(ca.simplify(slope).is_zero())

@@ -28,7 +28,10 @@ _FORCE = 10.0
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """The scenario with gains by `contact_gains` where they are left out.
+    """The scenario with gains by `advised_gains`, or `contact_gains`, where they are left out.
+
+    With encoders and rigid joints the gains are those for their noise, with an estimate of the
+    state; otherwise those of `contact_gains`, and of `contact_gains_behind` for a cascade.
 
     Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
     and of points, constraint damping, an observer of disturbance and friction, and measured force
@@ -92,7 +95,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_at(_FORCE)
     fast, noise = None, velocity_noise(scenario, period)
-    known_by = f"velocities within {noise:.2g} rad/s"
+    known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
     loop = None if scenario.law is None else scenario.law.loop()
     if loop is not None:
         found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
@@ -103,7 +106,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         with at("gains"):
             best = advised_gains(sensed, largest_roughness(scenario, model))
         found, fast = best.gains, best.state_rate
-        known_by = predicted(best)
+        known_by, outlook = "these encoders", f". {predicted(best)}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = moved_points(model)
@@ -143,12 +146,14 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         largest_roughness=None,
     )
     known = ", ".join(observer.identify_friction) or "none"
+    estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and {known_by}: Butterworth's poles of positions "
         f"at {rounded(found.position_rate):g} 1/s, and of forces one at "
         f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
-        f"{observer.rate:g} 1/s that identifies the friction of: {known}{loop_note(scenario)}"
+        f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
+        f"{loop_note(scenario)}{outlook}"
     )
     return Completed(chosen, (note,))

@@ -6,6 +6,7 @@ import numpy as np
 from drake_dae.dae.beyond.contact_advice import EVERY, MODEL_ERROR, AdvisedGains, SensedContact
 from drake_dae.dae.beyond.one_direction import SensorNoise
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.scenario import Scenario
 
@@ -42,39 +43,35 @@ def sensed_contact(
     moves = np.einsum("ij,ji->i", jacobian, np.linalg.solve(inertia, jacobian.T))
     levers = np.linalg.norm(jacobian, axis=1)
     free, contact = slice(len(points)), slice(len(points), None)
-    forces = scenario.force_feedback
-    deviation = float(np.max(getattr(forces, "noise_deviation", 0.0)))
     given = scenario.observer is None or scenario.observer.state_rate is not None
-    estimates = given and encoders.velocity_bandwidth is None
-    position, velocity = np.max(encoders.position_deviation), np.max(encoders.velocity_noise)
+    plain = encoders.velocity_bandwidth is None and velocities_are_rates(model.links)
+    period, delay = timing
     return SensedContact(
-        *timing,
-        stiffness,
-        float(np.max(moves[contact])),
-        float(np.max(moves[free], initial=np.max(moves[contact]))),
-        float(np.max(levers[free], initial=np.max(levers[contact]))),
-        float(np.max(levers[contact])),
-        float(np.linalg.norm(inertia)),
-        SensorNoise(
-            float(position), float(velocity), deviation, encoders.velocity_bandwidth or 0.0
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        mobility=float(np.max(moves[contact])),
+        free_mobility=float(np.max(moves[free], initial=np.max(moves[contact]))),
+        lever=float(np.max(levers[free], initial=np.max(levers[contact]))),
+        contact_lever=float(np.max(levers[contact])),
+        inertia=float(np.linalg.norm(inertia)),
+        noise=SensorNoise(
+            position=float(np.max(encoders.position_deviation)),
+            velocity=float(np.max(encoders.velocity_noise)),
+            force=float(np.max(getattr(scenario.force_feedback, "noise_deviation", 0.0))),
+            velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
         ),
-        estimates,
+        estimates=given and plain,
     )
 
 
 def predicted(best: AdvisedGains) -> str:
-    """What gains are predicted to come to, in words."""
-    fast = (
-        ""
-        if best.state_rate is None
-        else f" of an estimate of the state at {best.state_rate:.3g} 1/s"
-    )
+    """What gains are predicted to come to, as a sentence."""
     by_noise = f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N"
     return (
-        f"these sensors, for which the law{fast} is predicted to be "
-        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N off in rms, {by_noise} "
-        f"by noise alone and the rest by an unknown force of {MODEL_ERROR:g} N that appears every "
-        f"{EVERY:g} s, with controls that change by {best.roughness:.2g} N m from sample to sample"
+        f"Predicted rms errors: {1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N "
+        f"if an unknown force of {MODEL_ERROR:g} N appears every {EVERY:g} s; {by_noise} of it by "
+        f"noise. The controls change by {best.roughness:.2g} N m from sample to sample"
     )
 
 

@@ -13,6 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.references import Reference, stack_references
+from drake_dae.dae.references.reference import with_degrees
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
@@ -253,9 +254,8 @@ def traced_references(
     Raises:
         ModelError: One is no expression of time.
     """
-    rows, left = [ca.SX(0, 1)], list(degrees)
-    for reference in references:
-        own, left = left[: reference.size], left[reference.size :]
+    rows = [ca.SX(0, 1)]
+    for reference, own in with_degrees(references, degrees):
         row = reference.expression(own, time)
         if row is None:
             raise ModelError(

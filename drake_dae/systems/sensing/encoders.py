@@ -35,6 +35,9 @@ class Encoders:
     samples, its rounding errors are like white noise, uniform over (-delta/2, delta/2): see
     `position_deviation` and `velocity_deviation`.
 
+    An observer with a `state_rate` estimates velocities from positions: it takes measured ones only
+    if their noise is given, and no differences.
+
     Attributes:
         resolution: delta in rad or m, one number for all positions or one each; 0 for none.
         velocity_bandwidth: w in rad/s; None for directly measured velocities.

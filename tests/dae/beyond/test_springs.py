@@ -103,7 +103,7 @@ def sample(memory: np.ndarray, loop: SpringLoop, period: float, scale: float) ->
     [(60.0, 1, 1.0), (300.0, 1, 1.0), (420.0, 1, 1.0), (90.0, 2, 2.0), (90.0, 0, 0.5)],
 )
 def test_the_poles_are_those_of_a_stepped_loop(rate, delay, scale):
-    """Those of its map over a sample, but for the two of free motion, which are 1.
+    """Those of its map over a sample, except for the two of free motion, which are 1.
 
     The parts of steps leave 1e-5. The observer sees a sample where the loop uses it at once here:
     as in the block, the control of a sample has the estimate of the one before.

@@ -110,7 +110,7 @@ def test_the_torques_of_the_motion_are_within_their_limits_and_reach_them(motion
     shares = np.abs(torques) / EFFORTS
     # Between the points of the grid the excess is of second order in its width.
     assert shares.max() <= 1.0 + 1e-3
-    # At each time one of them is at its limit, but for the jumps.
+    # At each time one of them is at its limit, except at the jumps.
     assert np.mean(shares.max(axis=1) > 0.995) > 0.97
 
 

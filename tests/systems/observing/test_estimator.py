@@ -177,7 +177,7 @@ def test_encoders_alone_track_as_promised_and_innovations_are_consistent():
 
 @pytest.mark.slow
 def test_without_a_force_sensor_the_force_is_that_of_the_model():
-    """Below 0.1 mm and 0.5 N on a plant without model errors but for its friction."""
+    """Below 0.1 mm and 0.5 N on a plant without model errors except its friction."""
     points = ", ".join(f"tool.{axis}: [15625.0, 1250.0, 50.0]" for axis in "yz")
     names = ("tool.z_axis.y", "tool.z_axis.z", "joint3", "joint7")
     others = ", ".join(f"{name}: [625.0, 35.4]" for name in names)
