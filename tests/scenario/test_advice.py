@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import numbers
 from pydrake.systems.analysis import Simulator
 from runs import scenario
 
@@ -20,6 +21,7 @@ from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import plants
 from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sensed import sensed_contact
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model, scenario_structure
@@ -212,3 +214,21 @@ def parameters(loop, wall):
 def test_observer_that_does_not_fit_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
         build_scenario(two_link(*settings))
+
+
+def test_levers_and_mobilities_are_those_of_multibody_plant():
+    """Of the point and of the wall; the matrices of MultibodyPlant alone, to round-off."""
+    found = two_link("encoders={resolution: 1.0e-4}")
+    model = scenario_model(found)
+    structure = scenario_structure(model)
+    sensed = sensed_contact(found, model, structure, (1e-3, 1), 1e5)
+    known = numbers("two_link", *np.split(structure.states[0], 2))
+    inverse, rows = np.linalg.inv(known.mass), (known.output_jacobian, known.constraint_jacobian)
+    levers, mobilities = zip(
+        *((np.linalg.norm(J), (J @ inverse @ J.T).item()) for J in rows), strict=True
+    )
+    assert (sensed.lever, sensed.contact_lever) == pytest.approx(levers)
+    assert (sensed.free_mobility, sensed.mobility) == pytest.approx(mobilities)
+    assert sensed.inertia == pytest.approx(np.linalg.norm(known.mass))
+    assert sensed.noise.position == pytest.approx(1e-4 / 12.0**0.5)
+    assert sensed.estimates

@@ -1,0 +1,85 @@
+"""Gains as an optimum: what they have to bear, and what is refused."""
+
+import pytest
+
+from drake_dae import SensedContact, SensorNoise, advised_gains
+from drake_dae.dae.beyond.one_direction import Direction, Rates, sampled_loop
+from drake_dae.errors import GainError, ModelError
+
+T, ROUGHNESS = 1e-3, 1.0
+
+
+def situation(resolution, stiffness, mobility, delay, bandwidth=0.0):
+    """An arm whose noise is that of angles, filtered as differences or by an estimator."""
+    noise = SensorNoise(resolution, force=0.3, velocity_bandwidth=bandwidth)
+    return SensedContact(
+        T, delay, stiffness, mobility, 0.3, 0.7, 0.7, 5.0, noise, estimates=not bandwidth
+    )
+
+
+# In each of them faster gains were smooth enough; margins of masses or stiffness forbid them.
+SITUATIONS = [
+    (1e-4, 1e5, 0.03, 1),
+    (5e-4, 1e5, 0.3, 2),
+    (3e-6, 1e6, 0.03, 1, 300.0),
+    (1e-4, 1e5, 0.3, 1, 300.0),
+]
+
+
+@pytest.mark.parametrize("numbers", SITUATIONS)
+def test_gains_bear_other_masses_and_stiffnesses(numbers):
+    found = advised_gains(given := situation(*numbers), ROUGHNESS)
+    own, fast = found.gains, found.state_rate
+    quiet = SensorNoise(velocity_bandwidth=given.noise.velocity_bandwidth)
+    lowest, middle, highest = own.position_gains(3)
+    free = Rates((lowest, middle, highest), 0.0, own.observer_rate, fast)
+    for mass in (0.5, 1.0, 2.0):
+        loop = sampled_loop(Direction(T, given.delay, mass_error=mass), free, quiet)
+        assert loop.radius < 1.0 - 0.05 * T * own.position_rate / 1.5
+    contact = Rates(
+        (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
+    )
+    for mass in (2.0 / 3.0, 1.0, 1.5):
+        for share in (0.1, 0.5, 1.0, 2.0):
+            stiffness = share * given.stiffness
+            direction = Direction(T, given.delay, given.mobility, stiffness, mass)
+            assert sampled_loop(direction, contact, quiet).radius < 1.0
+    assert found.roughness <= ROUGHNESS
+
+
+@pytest.mark.parametrize("numbers", SITUATIONS)
+def test_errors_and_roughness_are_those_of_the_gains(numbers):
+    """Of the two directions, by loops that other tests compare with runs."""
+    found = advised_gains(given := situation(*numbers), ROUGHNESS)
+    own, fast = found.gains, found.state_rate
+    free = Rates(tuple(own.position_gains(3)), 0.0, own.observer_rate, fast)
+    direction = Direction(T, given.delay)
+    error, _ = sampled_loop(direction, free, given.seen(0.7)).deviations()
+    _, jump = sampled_loop(direction, free, given.seen(1.0)).deviations()
+    contact = Rates(
+        (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
+    )
+    pressing = Direction(T, given.delay, given.mobility, given.stiffness)
+    force, push = sampled_loop(pressing, contact, given.seen(0.7)).deviations()
+    assert found.noise_error == pytest.approx(error)
+    assert found.noise_force == pytest.approx(force)
+    parts = (5.0 * jump) ** 2 + (0.7 / given.mobility * push) ** 2
+    assert found.roughness == pytest.approx(parts**0.5)
+    assert found.position_error > error
+    assert found.force_error > force
+
+
+def test_less_roughness_leaves_more_error():
+    given = situation(1e-4, 1e5, 0.03, 1)
+    rough, smooth = advised_gains(given, 1.0), advised_gains(given, 0.2)
+    assert smooth.roughness <= 0.2 < rough.roughness
+    assert smooth.position_error * smooth.force_error > rough.position_error * rough.force_error
+
+
+def test_what_no_gains_can_is_refused_with_its_reason():
+    with pytest.raises(GainError, match="noise of the position changes the controls by"):
+        advised_gains(situation(1e-3, 1e5, 0.03, 1), 1e-4)
+    with pytest.raises(GainError, match="no gains are stable along the contact"):
+        advised_gains(situation(1e-5, 1e7, 0.3, 3), 1.0)
+    with pytest.raises(ModelError, match="roughness must be positive"):
+        advised_gains(situation(1e-5, 1e5, 0.03, 1), 0.0)

@@ -1,0 +1,121 @@
+"""One sample of an estimator, against its equations with matrices of MultibodyPlant alone."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from arms import arm, numbers
+from numpy.testing import assert_allclose
+
+from drake_dae import Observing, RobotModel, TrackingLaw, poles, with_disturbance
+from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
+
+T = 1e-3
+RATES = Observing(20.0, force_rate=5.0, state_rate=100.0)
+Q, V = np.array([1.1, -1.5]), np.array([0.2, -0.3])
+
+
+@cache
+def law(friction: float = 0.0):
+    found = arm("two_link")
+    wall = replace(found.model.constraints[0], friction=friction, stiction_tolerance=1e-3)
+    model = RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
+    names = [signal.name for signal in model.links.velocity_signals]
+    system = with_disturbance(model.dae, names, ["wall.friction"])
+    return TrackingLaw(system, poles(-4.0), measured_force=True)
+
+
+def filters():
+    return state_filters(RATES, T, np.full(2, 1e-4), np.zeros(2))
+
+
+def sample(measured, v, forces, controls, step=0.0, lag=0.0, r=(0.0, 0.0), mu=0.0, friction=0.0):
+    """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new."""
+    function = EstimatorFunctions(law(friction), RATES, T, lag, 0.0, step, filters()).now
+    held = np.concatenate([[0.0], Q, v, r, [mu], controls[0], [forces[0]]])
+    system = law(friction).system
+    given = [] if lag == 1.0 else [controls[1]]
+    found = function(
+        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [T],
+        system.parameter_values,
+    )[0]  # fmt: skip
+    return found[1:5], found[5:7], found[7]
+
+
+def predicted(v, force, control, step):
+    """q and v a sample later by M v' + H = u + J^T lambda, from the middle or the start."""
+    known = numbers("two_link", Q + (T - step) / 2.0 * v, v)
+    total = control - known.bias + known.constraint_jacobian[0] * force
+    after = v + T * np.linalg.solve(known.mass, total)
+    return Q + T * v + (T + step) / 2.0 * (after - v), after
+
+
+@pytest.mark.parametrize(("step", "lag"), [(0.0, 0.0), (T, 1.0), (T / 2.0, 0.5)])
+def test_prediction_is_the_motion_between_samples(step, lag):
+    """Where the measured angles are the predicted ones, nothing is corrected; to round-off.
+
+    A discrete plant's position is that of its new velocity, and its force that of its step; a
+    continuous plant has the mean of both.
+    """
+    controls, forces = (np.array([3.0, -1.0]), np.array([-2.0, 4.0])), (10.0, 30.0)
+    share = (1.0 + step / T) / 2.0
+    force = share * forces[1] + (1.0 - share) * forces[0]
+    control = lag * controls[0] + (1.0 - lag) * controls[1]
+    q, v = predicted(V, force, control, step)
+    state, r, mu = sample(q, V, forces, controls, step, lag)
+    assert_allclose(state, [*q, *v], atol=1e-12)
+    assert_allclose(r, 0.0, atol=1e-9)
+    assert mu == 0.0
+
+
+def test_an_error_is_corrected_by_the_gains_of_its_direction():
+    """e = M^-1 J^T a has the gains of k_n, and an error along the wall those of k_o."""
+    push, control = 0.0, np.zeros(2)
+    q, v = predicted(V, push, control, 0.0)
+    known = numbers("two_link", Q + T / 2.0 * V, V)
+    J = known.constraint_jacobian[0]
+    along = np.array([-J[1], J[0]])  # J e = 0.
+    across = np.linalg.solve(known.mass, J)
+    for error, (own,) in (
+        (1e-3 * along, filters()[0][:1]), (1e-3 * across, filters()[1][:1])
+    ):  # fmt: skip
+        state, r, _ = sample(q + error, V, (push, push), (control, control))
+        gain = own.gain[:, 0]
+        assert_allclose(state, [*(q + gain[0] * error), *(v + gain[1] * error)], atol=1e-9)
+        assert_allclose(r, gain[2] * known.mass @ error, rtol=1e-6)
+
+
+def test_what_a_contact_that_sticks_may_hold_is_not_believed():
+    """At rest an error along the wall may be friction: what moves the arm along it is left out.
+
+    A force r moves it along t, J t = 0, by t^T r / (t^T M t); to round-off.
+    """
+    push, control, still = 20.0, np.zeros(2), np.zeros(2)
+    q, _ = predicted(still, push, control, 0.0)
+    known = numbers("two_link", Q, still)
+    J = known.constraint_jacobian[0]
+    along = np.array([-J[1], J[0]])
+    _, r, mu = sample(q + 1e-4 * along, still, (push, push), (control, control))
+    believed = filters()[0][0].gain[2, 0] * known.mass @ (1e-4 * along)
+    assert abs(along @ believed) > 1e-3
+    assert abs(along @ r) < 1e-9
+    assert mu == 0.0
+
+
+def test_friction_that_is_known_is_predicted():
+    """mu J_t^T lambda against the sliding, at full strength.
+
+    The smoothing of friction leaves 1e-5 rad/s of the 5e-3 rad/s that friction makes in a sample.
+    """
+    push, control, mu = 20.0, np.zeros(2), 0.4
+    known = numbers("two_link", Q + T / 2.0 * V, V)
+    slides = known.output_jacobian[0]
+    total = -known.bias + known.constraint_jacobian[0] * push
+    total -= mu * push * slides * np.sign(slides @ V)
+    after = V + T * np.linalg.solve(known.mass, total)
+    q = Q + T * (V + after) / 2.0
+    state, r, found = sample(q, V, (push, push), (control, control), mu=mu)
+    assert_allclose(state, [*q, *after], atol=2e-5)
+    assert_allclose(r, 0.0, atol=1e-3)
+    assert found == pytest.approx(mu, abs=1e-6)
