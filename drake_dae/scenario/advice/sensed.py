@@ -2,6 +2,7 @@
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_dae.dae.beyond.contact_advice import EVERY, MODEL_ERROR, AdvisedGains, SensedContact
 from drake_dae.dae.beyond.one_direction import SensorNoise
@@ -12,6 +13,10 @@ from drake_dae.scenario.scenario import Scenario
 
 _SHARE = 0.003
 """The default of the largest roughness, as a share of the largest effort limit."""
+
+
+def _largest(deviation: ArrayLike) -> float:
+    return float(np.max(np.asarray(deviation)))
 
 
 def sensed_contact(
@@ -56,9 +61,9 @@ def sensed_contact(
         contact_lever=float(np.max(levers[contact])),
         inertia=float(np.linalg.norm(inertia)),
         noise=SensorNoise(
-            position=float(np.max(encoders.position_deviation)),
-            velocity=float(np.max(encoders.velocity_noise)),
-            force=float(np.max(getattr(scenario.force_feedback, "noise_deviation", 0.0))),
+            position=_largest(encoders.position_deviation),
+            velocity=_largest(encoders.velocity_noise),
+            force=_largest(getattr(scenario.force_feedback, "noise_deviation", 0.0)),
             velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
         ),
         estimates=given and plain,
