@@ -156,7 +156,8 @@ class ClosedLoop:
             own, at_plant = (
                 block.GetMyContextFromRoot(context) for block in (self.controller, self.plant)
             )
-            values["parameters"] = self.plant.parameters_along(at_plant, record.time)
+            along = self.plant.parameters_along(at_plant, record.time)
+            values["parameters"] = self.controller.law.system.parameters_of(self.plant.dae, along)
         derived = {
             name: recorded_values(found, tuple(signals))
             for name, (found, signals) in self.controller.derived(own, record.time, values).items()

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
-from pydrake.systems.framework import Context, DiagramBuilder, System
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.observing import Observer
@@ -51,8 +51,10 @@ def add_force_feedback(
             noise = builder.AddSystem(source)
             noise.set_name("force_noise")
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    takers: list[System] = [controller, *others]
-    for taker in takers:
+    builder.Connect(force, controller.GetInputPort("measured_force"))
+    if controller.HasOutputPort("tared_force"):
+        force = controller.GetOutputPort("tared_force")
+    for taker in others:
         builder.Connect(force, taker.GetInputPort("measured_force"))
     return noise
 

@@ -77,6 +77,7 @@ def add_exogenous(
 _NEEDS = dict.fromkeys(
     ("observer", "tolerances"), "it needs the references of a generator, and there is none"
 )
+"""What a controller without a generator cannot be wired with; a task has references of its own."""
 
 
 def check_parts(
@@ -102,7 +103,11 @@ def check_parts(
         if reference is None:
             needs = "needs a ReferenceGenerator(references, controller.law.degrees)"
         raise WiringError(f"{controller.get_name()} {needs}")
-    refused = controller.refused if reference is not None else {**_NEEDS, **controller.refused}
+    refused = dict(controller.refused)
+    if reference is None:
+        refused = {**_NEEDS, **refused}
+        if controller.HasOutputPort("contact_reference"):
+            del refused["observer"]
     given = {name: getattr(parts, name) for name in refused}
     found = [
         f"{name}: {refused[name]}"

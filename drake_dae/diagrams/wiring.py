@@ -147,7 +147,8 @@ def wire_loop(
     for block in (plant, reference, controller):
         if block is not None:
             add_block(builder, block)
-    goal = None if reference is None else reference.GetOutputPort("reference")
+    planned = (controller, "contact_reference") if reference is None else (reference, "reference")
+    goal = planned[0].GetOutputPort(planned[1]) if planned[0].HasOutputPort(planned[1]) else None
 
     # The state goes to the controller, through encoders.
     state, measured = plant.GetOutputPort("state"), None
@@ -175,8 +176,9 @@ def wire_loop(
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
         builder.Connect(control, plant.GetInputPort("control"))
-        if goal is not None:
-            builder.Connect(goal, controller.GetInputPort("reference"))
+        if reference is not None:
+            goes = reference.GetOutputPort("reference")
+            builder.Connect(goes, controller.GetInputPort("reference"))
 
     if controller.HasInputPort("acting_control"):
         builder.Connect(control, controller.GetInputPort("acting_control"))

@@ -127,7 +127,8 @@ def build_loop(
     own = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
     if own is not None:
-        plant, scene_graph = make_plant(scenario, own.model, own.structure), own.scene_graph
+        plant = make_plant(scenario, own.model, own.structure, opens=opens)
+        scene_graph = own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
     plant = plant or make_plant(scenario, model, structure, feedback, opens)

@@ -78,7 +78,9 @@ def _standing(scenario: Scenario, loop: ClosedLoop, parameters: FloatArray) -> F
     guess = start_guess(scenario.start.positions, model.links)
     forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
     near = model.rest_state(guess, forces, parameters)
-    q = loop.controller.start_structure.manifold.settle(near, parameters)[: guess.size]
+    structure = loop.controller.start_structure
+    known = structure.system.parameters_of(loop.plant.dae, parameters)
+    q = structure.manifold.settle(near, known)[: guess.size]
     _check_limits(model, q, "Give")
     return model.rest_state(q, forces, parameters)
 

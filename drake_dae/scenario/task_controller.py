@@ -1,5 +1,7 @@
 """The controller of a scenario with a task, and the keys that it excludes."""
 
+import numpy as np
+
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
@@ -11,12 +13,7 @@ from drake_dae.systems.task.open_contact import open_contact
 
 _SETTINGS = {
     "exogenous": "exogenous",
-    "saturation": "control_limits",
-    "observer": "observer",
-    "encoders": "encoders",
     "tolerances": "tolerances",
-    "plant_payloads": "plant_exogenous",
-    "plant_disturbances": "plant_exogenous",
 }
 """Key of a scenario -> the setting of the loop."""
 
@@ -57,11 +54,13 @@ def task_controller(
     assert scenario.gains is not None  # advised.
     (force,) = [signal.name for signal in opening_contact(scenario, model).force_signals]
     with at("task"):
-        free_system = open_contact(model.dae, force)
+        free_system = open_contact(law.system, force)
     with at("task.gains" if task.gains else "gains"):
         free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
     with at("task"):
-        return TaskController(task.made(), law, free_law, sample_period=period)
+        noise = getattr(scenario.force_feedback, "noise_deviation", 0.0)
+        made = task.made(float(np.max(np.asarray(noise))) if period else 0.0)
+        return TaskController(made, law, free_law, sample_period=period)
 
 
 def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:

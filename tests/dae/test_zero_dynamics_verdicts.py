@@ -116,7 +116,9 @@ def test_a_drift_along_a_periodic_reference_is_not_bounded(rates, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("force", "count"), [(0.28, 2), (0.65, 2)])
+@pytest.mark.parametrize(
+    ("force", "count"), [(0.28, 2), pytest.param(0.65, 2, marks=pytest.mark.thorough)]
+)
 def test_a_motion_that_repeats_itself_after_several_periods_is_found(force, count):
     """Duffing's oscillator with two wells, s'' = -0.3 s' + s - s^3 + force cos 1.2 t.
 

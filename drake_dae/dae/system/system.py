@@ -380,6 +380,20 @@ class DaeSystem:
             return parameters
         return vector(f"{self.name}: parameters", parameters, self._defaults.size)
 
+    def parameters_of(self, other: "DaeSystem", values: FloatArray) -> FloatArray:
+        """The parameters of this system as another one has them, by name; else the defaults.
+
+        Args:
+            other: A system of the same robot, as that of a plant with a payload.
+            values: Its parameters, shape (k,) or (samples, k).
+        """
+        found = np.empty((*values.shape[:-1], self._defaults.size))
+        found[...] = self._defaults
+        names = {p.name for p in other.parameters}
+        for name in [p.name for p in self.parameters if p.name in names]:
+            found[..., self.parameter_slice(name)] = values[..., other.parameter_slice(name)]
+        return found
+
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """A state as a new array of shape (n,).
 

@@ -21,10 +21,23 @@ from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import opening_contact
+
+_SOFTER = 5.0
+"""A free robot's poles of positions are so many times as fast as those of the distance."""
 
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
+
+
+def _touches(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
+    """What the fastest touch of a task does, v (sqrt(k / A) + k t) with the time t to react."""
+    speeds = [] if task is None else [phase.speed_of_approach for phase in task.phases]
+    speed = max(speeds, default=0.0)
+    peak = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
+    return f". A touch at {speed:g} m/s peaks at {peak:.3g} N or less" if speed else ""
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
@@ -35,7 +48,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
 
     Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
     and of points, constraint damping, an observer of disturbance and friction, and measured force
-    are set, each if it is left out.
+    are set, each if it is left out. A task also gets gains of its free robot, soft along the
+    distance.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -68,10 +82,6 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         model, structure = law_robot(scenario, model, structure)
     if material is None or not is_advised:
         return Completed(scenario)
-    if scenario.task is not None:
-        raise ScenarioError(
-            ("gains", ("no gains are recommended for a task in Drake's contact: give some"))
-        )
     if model.stages:
         raise ScenarioError(
             (
@@ -136,8 +146,20 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             identify_friction=frictional,
             state_rate=None if fast is None else rounded(fast),
         )
+    task = scenario.task
+    if task is not None and task.gains is None:
+        # Soft along the distance, where it touches: see `TaskController`.
+        distance = rounded(found.position_rate / _SOFTER)
+        force_name = opening_contact(scenario, model).force_signals[0].name
+        inputs = [signal.name for signal in model.dae.constraint_input_signals]
+        opens = model.dae.constraint_output_signals[inputs.index(force_name)].name
+        free = {name: found.position_gains(2) for name in positions.tolist()}
+        free[opens] = [distance**2, 2.0 * distance]
+        of_free = {name: [rounded(gain) for gain in each] for name, each in free.items()}
+        task = replace(task, gains=parts.Coefficients(outputs=of_free))
     chosen = replace(
         scenario,
+        task=task,
         gains=gains,
         integral=integral,
         constraint_damping=damping,
@@ -154,6 +176,6 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
-        f"{loop_note(scenario)}{outlook}"
+        f"{loop_note(scenario)}{outlook}{_touches(task, stiffness, mobility, period * (1 + late))}"
     )
     return Completed(chosen, (note,))

@@ -24,6 +24,8 @@ class ScenarioTask:
         contact: The name of the constraint that opens and closes; not needed if there is only one.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
+        tare_time: The time in s for which a task that begins free measures the bias of the force
+            sensor, before any phase ends; it is subtracted from then on. 0 for no taring.
         gains: The gains of the law of the free robot, with the distance among its outputs; those of
             `gains` if left out.
     """
@@ -32,15 +34,19 @@ class ScenarioTask:
     contact: str = ""
     contact_force: float = 0.5
     patience: float = 0.25
+    tare_time: float = 0.0
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
         self.made()
 
-    def made(self) -> Task:
+    def made(self, force_noise: float = 0.0) -> Task:
         """The task.
+
+        Args:
+            force_noise: The standard deviation of the force sensor's noise in N.
 
         Raises:
             ModelError: The phases are not consistent.
         """
-        return Task(self.phases, self.contact_force, self.patience)
+        return Task(self.phases, self.contact_force, self.patience, force_noise, self.tare_time)

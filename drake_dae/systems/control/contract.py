@@ -41,7 +41,8 @@ class Controller(System):
     1. Inputs. The input port `estimated_state` is x, shape (n,). Further input ports, if needed:
        `reference` (R of its `law`), `measured_force` (all constraint forces), `exogenous` (as of a
        `Plant`), and `hold` (one entry for each integral of `law`, which is not updated while it is
-       not 0).
+       not 0). One that plans its references itself has the output port `contact_reference` for an
+       observer, and `tared_force` where it corrects the measured force.
     2. Outputs. The output port `control` is u, shape (p,). `further_signals` are the other output
        ports in a record, with names and units; `shown` are those that a loop exports without
        recording them.
@@ -131,8 +132,8 @@ class Controller(System):
         Args:
             context: The context of this system after the run, or None.
             times: The times of the record, in s, shape (k,).
-            values: The other signals of the record and the plant's "parameters", one row for each
-                time.
+            values: The other signals of the record, and "parameters": those of the law's system as
+                the plant has them; one row for each time.
         """
         return {}
 

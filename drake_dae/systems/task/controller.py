@@ -32,11 +32,7 @@ from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {
     "exogenous": "nothing may move in a task; leave it out",
-    "plant_exogenous": "a task does not know it; leave it out",
-    "control_limits": "the drives of a task have no limits; leave it out",
-    "observer": "a task does not know it; leave it out",
-    "encoders": "a task does not know it; leave it out",
-    "tolerances": "a task does not know it; leave it out",
+    "tolerances": "the phases of a task have their own, and times to end within; leave it out",
 }
 """What a task cannot be wired with, and why."""
 
@@ -62,7 +58,9 @@ class TaskController(Diagram, Controller):
     Where it lets go, lambda is the task's `contact_force` at most, and the jump is J^T lambda. A
     touch that is slow, and a free law that is soft along the distance, keep the first one small.
 
-    It needs of a plant the state x and the constraint forces, as measured; no more. Guards are
+    It needs of a plant the state x and the constraint forces, as measured; no more. Where the laws
+    are for a system with a disturbance, an observer feeds both: with the measured force it needs
+    not know whether the contact is closed. Guards are
     found by Drake's Simulator as zeros of a witness function, which needs a context with an
     accuracy as `simulate` sets it, or are looked at in samples. All that a run has done stands in
     its context.
@@ -71,12 +69,17 @@ class TaskController(Diagram, Controller):
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,). The control does not depend on it in the
             same instant, unless a law takes a measured force.
+        exogenous: Of an observer: the disturbance, and coefficients of friction; if the laws have
+            them.
+        hold: Where it is not 0, no integral is updated, shape (1,); may be without a wire.
 
     Output ports:
         control: u, shape (p,).
         phase: The place of the phase in the task, shape (1,); the number of phases after the last.
         desired_output: The positions, the force and the distance that are wanted, shape (p + 1,).
             In contact the distance is zero, and else the force.
+        contact_reference: R of the law in contact while that acts, and else 0: for an observer.
+        tared_force: The measured forces less the bias that was found; with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They stand still while
             the other law acts, and those in contact also while no force is felt, and while the
             first references after a touch fade in: the force of an impact is no error.
@@ -114,6 +117,12 @@ class TaskController(Diagram, Controller):
         super().__init__()
         if not (np.isfinite(sample_period) and sample_period >= 0.0):
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
+        for name in ("force_noise", "tare_time"):
+            if getattr(task, name) and not sample_period:
+                raise ModelError(
+                    f"{name}: noise and bias of a force are found in samples, and this task acts "
+                    "continuously; leave it out, or give a sample_period (in a scenario: sampling)"
+                )
         self.task, self.law, self.free_law = task, law, free_law
         self.sample_period = sample_period
         self.place, self.force = opened_contact(law, free_law)
@@ -127,8 +136,9 @@ class TaskController(Diagram, Controller):
         )
         builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
         builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
+        builder.ExportInput(self.supervisor.GetInputPort("hold"), "hold")
         switch = builder.AddSystem(LawSwitch(law.system.num_controls))
-        in_contact = self.supervisor.GetOutputPort("free_hold")
+        in_contact = self.supervisor.GetOutputPort("in_contact")
         builder.Connect(in_contact, switch.GetInputPort("in_contact"))
         added = []
         for which, name, own in ((FREE, "free", free_law), (CONTACT, "contact", law)):
@@ -138,7 +148,17 @@ class TaskController(Diagram, Controller):
             reference = self.supervisor.GetOutputPort(f"{name}_reference")
             builder.Connect(reference, controller.GetInputPort("reference"))
             if own.measured_force:
-                builder.ConnectInput("measured_force", controller.GetInputPort("measured_force"))
+                measured = controller.GetInputPort("measured_force")
+                if task.tare_time:
+                    builder.Connect(self.supervisor.GetOutputPort("tared_force"), measured)
+                else:
+                    builder.ConnectInput("measured_force", measured)
+            if own.exogenous_degrees:
+                port = controller.GetInputPort("exogenous")
+                if which == FREE:
+                    builder.ExportInput(port, "exogenous")
+                else:
+                    builder.ConnectInput("exogenous", port)
             if count := len(own.integral.outputs):
                 hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
                 hold.set_name(f"{name}_hold")
@@ -152,7 +172,8 @@ class TaskController(Diagram, Controller):
             added.append(controller)
         self.free_controller, self.controller = added
         builder.ExportOutput(switch.GetOutputPort("control"), "control")
-        for name in ("phase", "desired_output"):
+        names = ["phase", "desired_output", "contact_reference"]
+        for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
         self.set_name("task_controller")
@@ -272,11 +293,11 @@ class TaskController(Diagram, Controller):
         1 for the phase that goes on and 0 for all others, "predicted_error" what theory says, see
         `predicted_errors`.
         """
-        count, signals = self.law.system.parameter_values.size, self.output_signals
+        signals = self.output_signals
         given = {
             "state": values["state"],
             "force": values["constraint_force"],
-            "parameters": values["parameters"][:, :count],
+            "parameters": values["parameters"],
         }
         found = function_along(self.outputs, given)
         outputs = found[:, :-1]

@@ -6,6 +6,7 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed, unknown_name
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.structure.redundancy import with_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -102,11 +103,18 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
             f"the free law must have the output '{distance}' where the law has '{gone[0]}'; make "
             "its system by open_contact"
         )
-    for system, one in ((own, law), (free, free_law)):
-        if one.exogenous_degrees:
-            raise ModelError(
-                f"{system.name}: the laws of a task take no exogenous signals; nothing may move"
-            )
+    moving = [p.name for p in own.exogenous.moving]
+    if moving and DISTURBANCE not in moving:
+        raise ModelError(
+            f"{own.name}: the laws of a task take no exogenous signals but those of an observer; "
+            f"'{moving[0]}' may not move"
+        )
+    if law.exogenous_degrees != free_law.exogenous_degrees:
+        raise ModelError(
+            f"{own.name}: the law in contact needs {law.exogenous_degrees} derivatives of what an "
+            f"observer estimates, and that without {free_law.exogenous_degrees}; leave the "
+            "observer out"
+        )
     kept = [i for i in range(own.num_outputs) if i != place]
     for i in kept:
         if law.degrees[i] != free_law.degrees[i]:

@@ -53,8 +53,9 @@ class Phase(ABC):
        are, within `over`; the distance alone falls in the end with `speed_of_approach`.
     3. A phase takes over without a bump: its references are those of the phase before, with all
        derivatives that the law has, and lead to the goals within `over`.
-    4. `margin` is positive until the phase is over. Where it is not over `within` that time,
-       `if_late` follows; where it is in contact and that is lost, `if_lost`, unless it is None.
+    4. `margin` is positive until the phase is over. Where it is not over `within` that time, or
+       `remaining` says that it will not be, `if_late` follows; where it is in contact and that is
+       lost, `if_lost`, unless it is None.
 
     Attributes:
         over: How long the references before take to become those of this phase, in s.
@@ -101,6 +102,14 @@ class Phase(ABC):
             contact_force: A force that is less than this, in N, is none.
         """
 
+    def remaining(self, now: Moment) -> float:
+        """A number that is positive until the phase is late, or an expression, as `now` has."""
+        return self.within - now.time if self.within < inf else inf
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        """Why it is late, for messages."""
+        return f"{self.name} has waited {self.within:g} s for {self.awaited(contact_force)}"
+
     @abstractmethod
     def awaited(self, contact_force: float) -> str:
         """What ends it, for messages: "a force of 0.5 N"."""
@@ -114,12 +123,15 @@ class Approach(Phase):
     Attributes:
         speed: With which it touches, in m/s; less where it touches before the references of this
             phase are reached, as where it starts from rest nearer than speed * over / 2.
+        behind: How far behind the surface of the model, in m, it seeks the contact; then it is
+            late.
         over: How long the references before take to become those of this phase, in s.
         within: How long the phase may last, in s.
         if_late: What follows where it lasts longer: "hold", "stop" or "fail".
     """
 
     speed: float = 0.05
+    behind: float = 0.05
     within: float = field(default=60.0, kw_only=True)
     if_late: Reaction = field(default="fail", kw_only=True)
     begins_in_contact, ends_in_contact = False, True
@@ -127,6 +139,7 @@ class Approach(Phase):
     def __post_init__(self) -> None:
         super().__post_init__()
         positive("Approach: speed", self.speed)
+        positive("Approach: behind", self.behind)
         if self.if_late == "approach":
             raise ModelError(
                 "Approach: if_late: 'approach' would go on as before; hold, stop or fail is left"
@@ -135,6 +148,18 @@ class Approach(Phase):
     @property
     def speed_of_approach(self) -> float:
         return self.speed
+
+    def remaining(self, now: Moment) -> float:
+        found: float = ca.fmin(super().remaining(now), now.distance + self.behind)
+        return found
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        if now.time >= self.within:
+            return super().lateness(now, contact_force)
+        return (
+            f"Approach is {-now.distance:.3g} m behind the surface of the model without "
+            f"{self.awaited(contact_force)}"
+        )
 
     def margin(self, now: Moment, contact_force: float) -> float:
         return contact_force - now.force

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -21,12 +22,12 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, Guard, Update
+from drake_dae.systems.blocks.traced import Block, Computation, Guard, Update
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, TracedTask
+from drake_dae.systems.task.traced import EARLY, SEEN, TracedTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -35,14 +36,17 @@ class TaskSupervisor(LeafSystem):
     Input ports:
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,).
+        hold: Where it is not 0, the law's integrals stand still, shape (1,); 0 without a wire.
 
     Output ports:
         contact_reference, free_reference: R of the law that acts, zero for the other one.
         phase: The place of the phase, shape (1,); the number of phases when done or held.
         desired_output: The positions, the force and the distance that are wanted, shape (p + 1,);
             zero for the one of the last two that is none now.
+        in_contact: 1 where the law in contact acts, shape (1,).
         contact_hold, free_hold: Where it is 1, the law's integrals stand still, shape (1,): while
-            the other law acts, no force is felt, or the robot has just touched.
+            the other law acts, no force is felt, the robot has just touched, or `hold` says so.
+        tared_force: The measured forces less the bias that was found, shape (m,); with a tare_time.
 
     Args:
         task: The phases.
@@ -68,14 +72,16 @@ class TaskSupervisor(LeafSystem):
         self._sample_period = sample_period
         self.task, self._laws, self._place, self._force = task, laws, place, force
         self._plan = plan = Planner(task, laws, place)
-        self._traced = TracedTask(task, laws, place, force, plan, num_forces)
+        tares = round(task.tare_time / sample_period) if sample_period else 0
+        self._traced = TracedTask(task, laws, place, force, plan, num_forces, tares)
         self._state_port = self.DeclareVectorInputPort(
             "estimated_state", laws[FREE].system.num_states
         )
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
+        self._hold_port = self.DeclareVectorInputPort("hold", 1)
         self.DeclareNumericParameter(BasicVector(laws[FREE].system.parameter_values))
         self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
-        self.DeclareDiscreteState(self._traced.size)
+        self._held = self.DeclareDiscreteState(self._traced.size)
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
         self._witnesses: list[WitnessFunction] = []
         if sample_period > 0.0:
@@ -100,7 +106,10 @@ class TaskSupervisor(LeafSystem):
             self.all_parameters_ticket(),
         }
         by_time = by_state | {self.time_ticket()}
-        felt = by_state | {self.input_port_ticket(self._force_port.get_index())}
+        seen = {
+            self.input_port_ticket(self._force_port.get_index()),
+            self.discrete_state_ticket(self._held),
+        }
         names = {FREE: "free_reference", CONTACT: "contact_reference"}
         for which, name in names.items():
             size = self._laws[which].layout.reference_size
@@ -108,9 +117,16 @@ class TaskSupervisor(LeafSystem):
         size = self._laws[FREE].system.num_outputs + 1
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
         self.DeclareVectorOutputPort("phase", 1, weakly(self._calc_phase), by_state)
-        self.DeclareVectorOutputPort("free_hold", 1, weakly(self._calc_free_hold), by_state)
-        felt.add(self.time_ticket())
-        self.DeclareVectorOutputPort("contact_hold", 1, weakly(self._calc_contact_hold), felt)
+        self.DeclareVectorOutputPort("in_contact", 1, weakly(self._calc_in_contact), by_state)
+        hold = self.input_port_ticket(self._hold_port.get_index())
+        for name, calc, tickets in (
+            ("free_hold", self._calc_free_hold, by_state),
+            ("contact_hold", self._calc_contact_hold, by_time | seen),
+        ):
+            self.DeclareVectorOutputPort(name, 1, weakly(calc), tickets | {hold})
+        if self.task.tare_time:
+            size = self._force_port.size()
+            self.DeclareVectorOutputPort("tared_force", size, weakly(self._calc_tared), seen)
 
     def progress(self, context: Context) -> Progress:
         """How far the task is, in a context of this system."""
@@ -141,10 +157,15 @@ class TaskSupervisor(LeafSystem):
 
     def _moment(self, context: Context, segment: Segment) -> Moment:
         time = context.get_time()
-        force = float(self._force_port.Eval(context)[self._force])
+        force = float(self._seen(context)[0])
         distance, rate = self._plan.distance(self._now(context))
         wanted = segment.reference(time)[segment.layout.lowest[self._place]]
         return Moment(time - segment.change.time, force, distance, rate, float(wanted))
+
+    def _seen(self, context: Context) -> FloatArray:
+        """What is seen of the force with the present sample: see `SEEN`."""
+        held = context.get_discrete_state(self._held).value()
+        return self._traced.seen(held, float(self._force_port.Eval(context)[self._force]))
 
     def _margins(
         self, context: Context, progress: Progress, segment: Segment
@@ -160,8 +181,10 @@ class TaskSupervisor(LeafSystem):
         if phase.if_lost and segment.change.in_contact and not progress.is_felt:
             lost = task.patience - (context.get_time() - progress.felt)
         end = phase.margin(moment, task.contact_force)
+        if self._traced.tares(context.get_discrete_state(self._held).value()):
+            end = 1.0
         felt = excess if progress.is_felt else -excess
-        return moment, np.array([end, lost, phase.within - moment.time, felt])
+        return moment, np.array([end, lost, float(phase.remaining(moment)), felt])
 
     def _guard(self, context: Context) -> float:
         """Positive while the phase goes on: Drake seeks where that ends."""
@@ -190,7 +213,7 @@ class TaskSupervisor(LeafSystem):
                 time,
                 self._state_port.Eval(context).copy(),
             )
-        self._put(state, Progress((self._segment(context),), time, time))
+        self._put(state, Progress((self._segment(context),), time, time), np.zeros(len(SEEN)))
         return EventStatus.Succeeded()
 
     def _at_guard(
@@ -200,9 +223,10 @@ class TaskSupervisor(LeafSystem):
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         progress, time = self.progress(context), context.get_time()
-        segment = progress.segments[-1]
+        segment, seen = progress.segments[-1], self._seen(context)
         if self._is_over(segment):
-            return EventStatus.DidNothing()
+            self._put(state, progress, seen)
+            return EventStatus.Succeeded()
         moment, margins = self._margins(context, progress, segment)
         status, found = EventStatus.Succeeded(), progress.segments
         if np.any(margins[:-1] <= 2.0 * EARLY):
@@ -210,12 +234,13 @@ class TaskSupervisor(LeafSystem):
             found = (*found, following)
         known: dict[str, Any] = {"felt": time} if progress.is_felt else {}
         is_felt = progress.is_felt != bool(margins[-1] <= 2.0 * EARLY)
-        self._put(state, replace(progress, segments=found, step=time, is_felt=is_felt, **known))
+        after = replace(progress, segments=found, step=time, is_felt=is_felt, **known)
+        self._put(state, after, seen)
         return status
 
-    def _put(self, state: State, progress: Progress) -> None:
+    def _put(self, state: State, progress: Progress, seen: FloatArray) -> None:
         state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
-        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress))
+        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, seen))
 
     def _changed(
         self, context: Context, segment: Segment, moment: Moment, margins: FloatArray
@@ -230,8 +255,7 @@ class TaskSupervisor(LeafSystem):
         if margins[1] <= 2.0 * EARLY:
             reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
         else:
-            reaction = phase.if_late
-            reason = f"{phase.name} has waited {phase.within:g} s for {awaited}"
+            reaction, reason = phase.if_late, phase.lateness(moment, task.contact_force)
         if reaction == "fail":
             raise self._failed(context, reason, moment)
         if reaction == "stop":
@@ -265,19 +289,32 @@ class TaskSupervisor(LeafSystem):
     def _calc_phase(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([float(self._segment(context).change.place)])
 
-    def _calc_free_hold(self, context: Context, output: BasicVector) -> None:
+    def _calc_in_contact(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([float(self._segment(context).change.in_contact)])
+
+    def _calc_tared(self, context: Context, output: BasicVector) -> None:
+        force = self._force_port.Eval(context).copy()
+        force[self._force] -= self._seen(context)[1]
+        output.SetFromVector(force)
+
+    def _holds(self, context: Context) -> bool:
+        """Whether the input port `hold` says so."""
+        port = self._hold_port
+        return port.HasValue(context) and bool(port.Eval(context)[0])
+
+    def _calc_free_hold(self, context: Context, output: BasicVector) -> None:
+        is_held = self._segment(context).change.in_contact or self._holds(context)
+        output.SetFromVector([float(is_held)])
 
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        force = self._force_port.Eval(context)[self._force]
-        is_open = not begin.in_contact or force < self.task.contact_force
+        is_open = not begin.in_contact or self._seen(context)[0] < self.task.contact_force
         # The force of an impact is no error to be integrated.
         settles = (
             self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over
         )
-        output.SetFromVector([float(is_open or settles)])
+        output.SetFromVector([float(is_open or settles or self._holds(context))])
 
     def traced(self) -> Block:
         period, updates = self._sample_period, tuple[Update, ...]()
@@ -288,5 +325,6 @@ class TaskSupervisor(LeafSystem):
             self._traced.computations(),
             updates,
             guard=Guard(self._traced.guard(), self._advance, bool(period)),
+            unwired={"hold": Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",))},
             ports={"phase": (Signal("phase"),)},
         )

@@ -2,11 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Phase
+
+_STEADY = 6.0
+"""So many standard deviations of the noise are below `contact_force`: one sample in 1e9."""
+
+_SLOWEST = 10.0
+"""The low-pass of the force reduces noise by this at most: it then takes 50 samples."""
 
 
 @checked(ModelError)
@@ -20,6 +27,12 @@ class Task:
             touched, and below it it has let go.
         patience: How long the force of a contact that shall hold may be none before the contact is
             lost, in s; a contact that gives way may bounce at first.
+        force_noise: The standard deviation of the force sensor's noise, in N. At samples the guards
+            see the force through a low-pass that leaves a sixth of `contact_force` of it, so that
+            noise is no touch; 0 for none.
+        tare_time: For how long, in s, a task that begins free takes the mean of the measured force
+            as the sensor's bias, which is subtracted from then on for guards, laws and observers.
+            No phase ends before. 0 for no taring.
 
     Raises:
         ModelError: There are no phases, one begins in contact where that before does not end so, or
@@ -29,14 +42,27 @@ class Task:
     phases: Sequence[Phase]
     contact_force: float = 0.5
     patience: float = 0.25
+    force_noise: float = 0.0
+    tare_time: float = 0.0
 
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
         positive("patience", self.patience)
+        for name in ("force_noise", "tare_time"):
+            if not 0.0 <= getattr(self, name) < inf:
+                raise ModelError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        least = self.force_noise * _STEADY / _SLOWEST
+        if self.contact_force < least:
+            raise ModelError(
+                f"contact_force: noise of {self.force_noise:g} N hides a force of "
+                f"{self.contact_force:g} N; it must be {least:.2g} N or more"
+            )
         object.__setattr__(self, "phases", tuple(self.phases))
         if not self.phases:
             raise ModelError("a task needs phases, such as Approach(0.05), Press(20.0), Release()")
         left = self.phases[0].begins_in_contact
+        if self.tare_time and left:
+            raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
         for index, phase in enumerate(self.phases):
             where = f"phase {index + 1} of the task, {phase.name}"
             if phase.begins_in_contact and not left:
@@ -56,6 +82,17 @@ class Task:
                         f"{where}: {key}: approach goes back to an Approach, and there is none "
                         "before it"
                     )
+
+    @property
+    def force_gain(self) -> float:
+        """The gain of the low-pass of the force, y += gain (F - y) at each sample, from 0 to 1.
+
+        Its output has gain / (2 - gain) of the variance of white noise.
+        """
+        if not self.force_noise:
+            return 1.0
+        kept = min((self.contact_force / (_STEADY * self.force_noise)) ** 2, 1.0)
+        return 2.0 * kept / (1.0 + kept)
 
     @property
     def contacts(self) -> tuple[bool, ...]:

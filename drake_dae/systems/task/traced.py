@@ -25,7 +25,11 @@ from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
-NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt")
+SEEN = ("force", "bias", "count")
+"""What a context holds of the force: after its low-pass, its mean before a touch, and of how many
+samples that is."""
+
+NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt", *SEEN)
 """Which numbers a context holds of a task, before base, rate and fade of its present segment."""
 
 EARLY = 1e-12
@@ -39,6 +43,7 @@ class TracedTask:
         task, laws, place, force: As of the supervisor.
         plan: What makes its references.
         num_forces: How many constraint forces are measured.
+        tares: Of how many samples the bias of the force is the mean; 0 for no taring.
 
     Attributes:
         size: How many numbers there are.
@@ -52,8 +57,10 @@ class TracedTask:
         force: int,
         plan: Planner,
         num_forces: int,
+        tares: int,
     ) -> None:
         self._task, self._laws, self._place, self._plan = task, laws, place, plan
+        self._tares = tares
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
@@ -64,10 +71,44 @@ class TracedTask:
         self._faded = ca.reshape(fade, *self._shape)
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
-        self._force = self._forces[force]
+        self._index = force
+        seen = ca.vertcat(*(self._named[name] for name in SEEN))
+        self._seen = self._after(seen, self._forces[force])
+        self._force, self._bias = self._seen[0], self._seen[1]
+        given = [seen, self._forces[force]]
+        self._seeing = ca.Function("seeing", given, [self._seen])
 
-    def numbers(self, progress: Progress) -> FloatArray:
-        """The numbers of a task that is so far; zeros before a run."""
+    def _after(self, seen: ca.SX, measured: ca.SX) -> ca.SX:
+        """What is seen of the force with one more sample."""
+        force, bias, count = ca.vertsplit(seen)
+        if self._tares:
+            waits = count < self._tares - 0.5
+            count = ca.if_else(waits, count + 1, count)
+            bias = ca.if_else(waits, bias + (measured - bias) / count, bias)
+            known = ca.if_else(waits, 0, measured - bias)
+        else:
+            known = measured
+        return ca.vertcat(force + self._task.force_gain * (known - force), bias, count)
+
+    def seen(self, held: FloatArray, measured: float) -> FloatArray:
+        """What is held of the force after a sample: see `SEEN`.
+
+        Args:
+            held: What was held, shape (size,).
+            measured: The force of the contact, in N.
+        """
+        return np.array(self._seeing(held[self._places], measured)).ravel()
+
+    def tares(self, held: FloatArray) -> bool:
+        """Whether the bias of the force is still being found."""
+        return bool(held[NAMES.index("count")] < self._tares - 0.5)
+
+    @property
+    def _places(self) -> list[int]:
+        return [NAMES.index(name) for name in SEEN]
+
+    def numbers(self, progress: Progress, seen: FloatArray) -> FloatArray:
+        """The numbers of a task that is so far, with what is seen of the force; see `SEEN`."""
         found = np.zeros(self.size)
         if not progress.segments:
             return found
@@ -77,7 +118,14 @@ class TracedTask:
         flags = [change.place, change.in_contact, change.time, segment.over, touched, felt]
         faded = np.zeros(self._shape)
         faded[: segment.faded.shape[0], : segment.faded.shape[1]] = segment.faded
-        parts = [*flags, progress.is_felt, *segment.base, *segment.rate, *faded.ravel(order="F")]
+        parts = [
+            *flags,
+            progress.is_felt,
+            *seen,
+            *segment.base,
+            *segment.rate,
+            *faded.ravel(order="F"),
+        ]
         found[:] = parts
         return found
 
@@ -136,17 +184,29 @@ class TracedTask:
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
         is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
-        given = [self._time, self._held]
+        given, hold = [self._time, self._held], ca.SX.sym("hold")
         shown = ca.Function("shown", given, [wanted, self._named["place"], contact])
-        outputs = ("desired_output", "phase", "free_hold")
+        outputs = ("desired_output", "phase", "in_contact")
         found.append(Computation(shown, (TIME, HELD), outputs))
-        holds = ca.Function("hold", [*given, self._forces], [ca.logic_or(is_open, settles)])
-        found.append(Computation(holds, (TIME, HELD, "measured_force"), ("contact_hold",)))
+        waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(contact > 0.5, hold)])
+        found.append(Computation(waits, (HELD, "hold"), ("free_hold",)))
+        stands = ca.logic_or(ca.logic_or(is_open, settles), hold)
+        holds = ca.Function("hold", [*given, self._forces, hold], [stands])
+        sources = (TIME, HELD, "measured_force", "hold")
+        found.append(Computation(holds, sources, ("contact_hold",)))
+        if self._tares:
+            tared = ca.SX(self._forces)
+            tared[self._index] -= self._bias
+            function = ca.Function("tared", [self._held, self._forces], [tared])
+            found.append(Computation(function, (HELD, "measured_force"), ("tared_force",)))
         return tuple(found)
 
     def unchanged(self) -> Computation:
         """What is held after a sample at which nothing changes."""
-        return Computation(ca.Function("held", [self._held], [self._held]), (HELD,), (HELD,))
+        held = ca.SX(self._held)
+        held[self._places] = self._seen
+        function = ca.Function("held", [self._held, self._forces], [held])
+        return Computation(function, (HELD, "measured_force"), (HELD,))
 
     def guard(self) -> Computation:
         """The margins of a phase, as those of the supervisor.
@@ -161,7 +221,7 @@ class TracedTask:
             self._reference(which)[int(law.layout.lowest[self._place])]
             for which, law in ((FREE, self._laws[FREE]), (CONTACT, self._laws[CONTACT]))
         ]
-        passed = self._time - named["start"]
+        passed, tares = self._time - named["start"], named["count"] < self._tares - 0.5
         excess = self._force - task.contact_force
         moment = Moment(passed, self._force, distances[0], distances[1], lowest[0] + lowest[1])
 
@@ -169,6 +229,7 @@ class TracedTask:
             phase, lost = task.phases[index], ca.SX(1)
             try:
                 end = ca.SX(phase.margin(moment, task.contact_force))
+                late = ca.fmin(ca.SX(phase.remaining(moment)), 1e9)
             except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
                 raise ModelError(
                     f"the margin of {phase.name} takes numbers alone, so that a rollout does not "
@@ -178,8 +239,9 @@ class TracedTask:
                 patience = task.patience - (self._time - named["felt"])
                 waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
                 lost = ca.if_else(waits, patience, 1)
-            late = phase.within - passed if np.isfinite(phase.within) else ca.SX(1)
             felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
+            if self._tares:
+                end = ca.if_else(tares, 1, end)
             return ca.vertcat(end, lost, late, felt)
 
         found = self._in_phase(margins, ca.SX.ones(4))

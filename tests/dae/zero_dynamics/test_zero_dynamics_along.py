@@ -108,7 +108,7 @@ def test_growth_by_a_parameter_that_oscillates():
     assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_growth_by_an_exogenous_signal():
     """The same oscillator, pumped by a known signal while its output stands still."""
     system = DaeSystem.from_functions(
@@ -235,7 +235,7 @@ def test_multipliers_with_a_constraint():
     assert found.verdict is Verdict.UNSTABLE
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_multipliers_do_not_depend_on_units():
     system = oscillator(lambda s, w, z: -(1 + 0.9 * z) * s - 0.02 * w - s**3)
     first = along(system, sinusoid(2.0, 0.1), 40.0)
@@ -279,7 +279,7 @@ def test_neighbours_that_lag_are_not_unstable():
     assert along(system, two_tones, 120.0).verdict is Verdict.UNDECIDED
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_limit_cycle_beside_a_reference_that_never_returns_is_undecided():
     """Van der Pol driven weakly and off its own rate; the periodic motion is unstable."""
     system = oscillator(lambda s, w, z: van_der_pol(s, w, z) + z)

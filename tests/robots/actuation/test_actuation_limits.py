@@ -119,7 +119,9 @@ def test_motor_law_tends_to_the_rigid_law_at_rate_l(name):
     ("kind", "parameter", "matrix", "operation"),
     [
         ("flexible", "flexible_joints.stiffness", "stiffness", np.multiply),
-        ("motor", "dc_motors.inductance", "inductance", np.divide),
+        pytest.param(
+            "motor", "dc_motors.inductance", "inductance", np.divide, marks=pytest.mark.thorough
+        ),
     ],
 )
 def test_trajectories_tend_to_those_of_the_rigid_robot(kind, parameter, matrix, operation):

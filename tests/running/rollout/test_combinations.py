@@ -63,6 +63,7 @@ CONTROLLERS = {
     "limits": REFERENCES + "saturation: true\n",
     "task": TASK,
     "sampled task": TASK + SAMPLED,
+    "observed task": TASK + SAMPLED + "observer: {rate: 20.0}\nsaturation: true\n",
 }
 PARTS = (FRICTION, ACTUATION, SENSING, PLANTS, CONTROLLERS)
 CASES = list(product(*PARTS))

@@ -122,7 +122,7 @@ def test_a_loop_lives_as_long_as_its_simulator():
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(
-    ("again", "count"), [("loop", 200), pytest.param("scenario", 20, marks=pytest.mark.thorough)]
+    ("again", "count"), [("loop", 100), pytest.param("scenario", 20, marks=pytest.mark.thorough)]
 )
 def test_memory_does_not_grow_with_the_number_of_loops(again: str, count: int):
     chosen = scenario("two_link_wall")

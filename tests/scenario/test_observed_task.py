@@ -1,0 +1,220 @@
+"""Tasks with observers, sensors that err, drives with limits, and robots that carry something."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from runs import run_scenario
+
+from drake_dae import Approach, Press, Record, Task, build_scenario, load_scenario
+from drake_dae.cli import main
+from drake_dae.errors import ModelError, ScenarioError, SimulationError
+
+# At rest 20 mm before the wall, whose friction the law takes for zero.
+OBSERVED = """
+robot: {file: package://drake_dae_models/two_link_arm.urdf}
+constraints:
+- name: wall
+  frame: tool
+  surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}
+  friction: 0.0
+outputs:
+- {frame: tool, axes: z}
+gains: {all: [-25]}
+constraint_damping: {all: [-250]}
+sampling: {period: 0.001, delay: 0.001}
+force_feedback: !MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}
+plant: !CompliantContact {radius: 1.0e-5, friction: 0.3}
+observer: {rate: 60, identify_friction: [wall]}
+task:
+  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
+  phases:
+  - !Approach {speed: 0.1, over: 0.1}
+  - !Press {force: 10, over: 0.1}
+  - !Move
+    references:
+      tool.z: !Sinusoids {offset: 0.31, amplitudes: [0.05], frequencies: [2.0]}
+      wall.force: 12
+    duration: 2.5
+    over: 0.5
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
+duration: 2.0
+"""
+BIASED = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3, bias: 1.0}"
+NO_PICTURES = ["--set", "write={plots: false, animation: false}"]
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "observed.yaml"
+    path.write_text(OBSERVED)
+    return path
+
+
+def rolled(file, tmp_path, *settings):
+    """The record of a rollout, and what it printed is left to capsys."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    out = tmp_path / "run"
+    assert main(["simulate", str(file), "--rollout", *NO_PICTURES, *words, "--out", str(out)]) == 0
+    return Record.load(out / "record.npz")
+
+
+def late(record, after=1.0):
+    """The errors of position in m and force in N after the transient."""
+    return np.abs(record["tracking_error"][record.time > after, :2])
+
+
+def touched(record):
+    """When the second phase began, and the distance by the model there, in s and m."""
+    row = int(np.argmax(record["phase"][:, 1] > 0.5))
+    return record.time[row], record["distance"][row, 0]
+
+
+@pytest.mark.slow
+def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
+    """As of the loop of a law: 0.1 mm and, with noise of 0.3 N, 0.2 N rms; without it far more."""
+    found = rolled(file, tmp_path)
+    errors = np.sqrt(np.mean(late(found) ** 2, axis=0))
+    assert np.all(errors < [1e-4, 0.2])
+    assert_allclose(found["friction"][-1], 0.3, rtol=0.1)
+    without = np.sqrt(np.mean(late(rolled(file, tmp_path, "observer=null")) ** 2, axis=0))
+    assert np.all(without > 5.0 * errors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        (
+            "encoders={position_noise: 1.0e-5, velocity_noise: 0.01}",
+            "observer={rate: 60, state_rate: 200, identify_friction: [wall]}",
+        ),
+        ("saturation=true", "plant_payloads=[{frame: tool, mass: 0.5}]"),
+        (BIASED, "task.tare_time=0.1"),
+        (
+            BIASED,
+            "task.tare_time=0.1",
+            "encoders={position_noise: 1.0e-5}",
+            "observer={rate: 60, state_rate: 200, identify_friction: [wall]}",
+        ),
+    ],
+    ids=["observer", "estimator", "limits and a payload", "bias", "bias and estimator"],
+)
+def test_a_rollout_is_drakes_run(file, tmp_path, settings):
+    """To 1e-9 rad: single steps agree to round-off, which the loop does not amplify here."""
+    found = rolled(file, tmp_path, "duration=0.6", *settings)
+    _, _, wanted = run_scenario(load_scenario(file, ["duration=0.6", *settings]))
+    assert_allclose(found.time, wanted.time[: found.time.size], rtol=0, atol=1e-12)
+    rows = found.time.size
+    assert_allclose(found["state"], wanted["state"][:rows], rtol=0, atol=1e-9)
+    assert np.array_equal(found["phase"], wanted["phase"][:rows])
+    assert found["phase"][-1, 2] == 1.0  # It moves.
+
+
+@pytest.mark.slow
+def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_path):
+    """A payload of 0.5 kg at rest: the generalized force J^T m g, by the virtual work of a mass at
+    the tool of a planar arm with links of 1 m."""
+    settings = ["plant_payloads=[{frame: tool, mass: 0.5}]", "force_feedback.noise_deviation=0"]
+    settings += ["plant.friction=0", "observer={rate: 60}"]
+    resting = "task.phases=[!Move {references: {tool.z: 0.3, wall.distance: 0.02}, duration: 1}]"
+    pressing = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
+    for phases in (resting, pressing):
+        found = rolled(file, tmp_path, *settings, phases)
+        q1, q2 = found["state"][-1, :2]
+        lengths = np.array([np.cos(q1) + np.cos(q1 + q2), np.cos(q1 + q2)])
+        weight = 0.5 * 9.81 * lengths
+        seen = found["disturbance"][-1]
+        assert_allclose(np.abs(seen), np.abs(weight), rtol=0.02)
+
+
+def test_the_low_pass_leaves_a_sixth_of_the_force_that_counts():
+    """White noise of 0.3 N after y += g (F - y), by its sums over 200,000 samples: 2 %."""
+    task = Task([Approach(0.05), Press(10.0)], contact_force=0.5, force_noise=0.3)
+    noise = 0.3 * np.random.default_rng(1).standard_normal(200_000)
+    felt, last = np.empty_like(noise), 0.0
+    for k, force in enumerate(noise):
+        last += task.force_gain * (force - last)
+        felt[k] = last
+    assert_allclose(np.std(felt[1000:]), 0.5 / 6.0, rtol=0.02)
+    assert Task([Approach(0.05), Press(10.0)]).force_gain == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_is_no_touch(file, tmp_path, seed):
+    """It touches at the wall, within what 0.1 m/s goes in the seven samples of the low-pass."""
+    settings = [f"force_feedback.seed={seed}", "duration=0.4"]
+    _, distance = touched(rolled(file, tmp_path, *settings))
+    assert abs(distance) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_bias_is_found_before_the_touch(file, tmp_path):
+    """1 N of bias touches the air; tared, force and wall are found. 0.15 N: three deviations of the
+    mean of 100 samples, and what is left of the transient."""
+    time, distance = touched(rolled(file, tmp_path, BIASED, "duration=0.4"))
+    assert time < 0.05
+    assert distance > 0.019
+    found = rolled(file, tmp_path, BIASED, "task.tare_time=0.1")
+    assert abs(touched(found)[1]) < 1e-3
+    errors = found["tracking_error"][found.time > 1.0, 1]
+    assert abs(np.mean(errors)) < 0.15
+
+
+@pytest.mark.slow
+def test_a_contact_that_is_not_there_ends_the_approach(file):
+    settings = ["plant_parameters={wall.position: [1.3, 0, 0]}", "task.phases.0.behind=0.01"]
+    with pytest.raises(SimulationError, match=r"Approach is 0\.01 m behind the surface"):
+        run_scenario(load_scenario(file, settings))
+
+
+@pytest.mark.slow
+def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
+    """With friction of 0.3 in Drake's contact: 0.02 mm and 0.05 N were asked, 3.6 mm and 3.2 N
+    were; the peak of the touch stays below what was told."""
+    text = OBSERVED.replace("gains: {all: [-25]}\nconstraint_damping: {all: [-250]}\n", "")
+    text = text.replace('  gains: {outputs: {wall.distance: [-8], "*": [-25]}}\n', "")
+    text = text.replace("observer: {rate: 60, identify_friction: [wall]}\n", "")
+    file.write_text(text.replace(", noise_deviation: 0.3", ""))
+    found = rolled(file, tmp_path, "duration=2.5", "task.phases.0.speed=0.03")
+    errors = late(found, after=2.0)
+    assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < [2e-5, 0.05])
+    told = capsys.readouterr().out
+    peak = float(told.split("A touch at 0.03 m/s peaks at ")[1].split(" N")[0])
+    assert 0.3 * peak < np.max(found["constraint_force"][found.time < 1.0]) < peak
+
+
+def test_parameters_of_another_system_are_taken_by_name(file):
+    """The law's model has a disturbance and its derivatives, the plant's a payload."""
+    payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
+    opening = "plant=!Unilateral {restitution: {wall: 0.0}}"
+    loop, _ = build_scenario(load_scenario(file, [payload, opening]))
+    own, law = loop.plant.dae, loop.controller.law.system
+    names = {p.name for p in law.parameters} & {p.name for p in own.parameters}
+    assert len(names) < min(len(law.parameters), len(own.parameters))
+    values = np.vstack([own.parameter_values, 2.0 * own.parameter_values])
+    found = law.parameters_of(own, values)
+    for name in names:
+        wanted = values[:, own.parameter_slice(name)]
+        assert_allclose(found[:, law.parameter_slice(name)], wanted, rtol=0, atol=0)
+    assert not found[:, law.parameter_slice("disturbance")].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("tolerances={outputs: {tool.z: 0.01}}", "tolerances: the phases of a task have their own"),
+        ("task.contact_force=0.1", r"contact_force: noise of 0\.3 N hides a force of 0\.1 N"),
+        ("task.tare_time=-1", r"task: tare_time must be 0 or more, got -1"),
+        ("task.phases.0.behind=0", r"task\.phases\.0: Approach: behind must be positive"),
+    ],
+)
+def test_what_does_not_fit_is_said(file, change, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(load_scenario(file, [change]))
+
+
+def test_a_task_that_begins_in_contact_finds_no_bias():
+    with pytest.raises(ModelError, match="tare_time: a task that begins in contact finds no bias"):
+        Task([Press(10.0)], tare_time=0.1)
