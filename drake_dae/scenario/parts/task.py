@@ -26,6 +26,7 @@ class ScenarioTask:
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s for which a task that begins free measures the bias of the force
             sensor, before any phase ends; it is subtracted from then on. 0 for no taring.
+        retries: How many times a phase may go back to an approach; then the run ends with an error.
         gains: The gains of the law of the free robot, with the distance among its outputs; those of
             `gains` if left out.
     """
@@ -35,6 +36,7 @@ class ScenarioTask:
     contact_force: float = 0.5
     patience: float = 0.25
     tare_time: float = 0.0
+    retries: int = 10
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
@@ -49,4 +51,5 @@ class ScenarioTask:
         Raises:
             ModelError: The phases are not consistent.
         """
-        return Task(self.phases, self.contact_force, self.patience, force_noise, self.tare_time)
+        limits = self.contact_force, self.patience, force_noise, self.tare_time, self.retries
+        return Task(self.phases, *limits)

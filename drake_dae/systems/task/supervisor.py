@@ -1,6 +1,7 @@
 """What leads through the phases of a task: guards, changes and references."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -256,6 +257,10 @@ class TaskSupervisor(LeafSystem):
             reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
         else:
             reaction, reason = phase.if_late, phase.lateness(moment, task.contact_force)
+        places = [one.change.place for one in self.progress(context).segments]
+        tried = sum(after <= before for before, after in pairwise(places))
+        if reaction == "approach" and tried >= task.retries:
+            reaction, reason = "fail", f"{reason}, after {tried} retries"
         if reaction == "fail":
             raise self._failed(context, reason, moment)
         if reaction == "stop":

@@ -33,6 +33,7 @@ class Task:
         tare_time: For how long, in s, a task that begins free takes the mean of the measured force
             as the sensor's bias, which is subtracted from then on for guards, laws and observers.
             No phase ends before. 0 for no taring.
+        retries: How often the reaction "approach" may follow; then the run ends with an error.
 
     Raises:
         ModelError: There are no phases, one begins in contact where that before does not end so, or
@@ -44,6 +45,7 @@ class Task:
     patience: float = 0.25
     force_noise: float = 0.0
     tare_time: float = 0.0
+    retries: int = 10
 
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
@@ -51,6 +53,8 @@ class Task:
         for name in ("force_noise", "tare_time"):
             if not 0.0 <= getattr(self, name) < inf:
                 raise ModelError(f"{name} must be 0 or more, got {getattr(self, name):g}")
+        if self.retries < 0:
+            raise ModelError(f"retries must be 0 or more, got {self.retries}")
         least = self.force_noise * _STEADY / _SLOWEST
         if self.contact_force < least:
             raise ModelError(

@@ -214,6 +214,18 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
         assert_allclose(record["distance"][-1, 1], 0.0, atol=3e-3)
 
 
+def test_a_task_that_may_not_try_again_ends():
+    phases = (HOLDING, Press(10.0, over=0.1), Dwell(5.0, if_lost="approach"))
+    loop = task_loop(phases, patience=0.02, retries=0)
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 0.4)
+    push(loop, context, -40.0)
+    with pytest.raises(
+        SimulationError, match="the contact of Dwell is lost, after 0 retries, at t"
+    ):
+        run_on(loop, context, 0.5)
+
+
 def test_patience_goes_on_from_phase_to_phase():
     """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
     short = [Dwell(0.015, over=0.01), Dwell(0.015, over=0.01, if_lost="hold")]
