@@ -89,7 +89,9 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
         if tag == base["gains"][TAG] != "!Matrices":
             own["gains"] = base["gains"]
     if "seed" in (force := own["force_feedback"]):
-        deviation = float(np.any(np.array(force["noise_deviation"]) != 0.0))
+        deviation = force["noise_deviation"]
+        if not own["task"]:  # The guards of a task know the noise.
+            deviation = float(np.any(np.array(deviation) != 0.0))
         errors = {"seed": 0, "bias": 0.0, "noise_deviation": deviation}
         own["force_feedback"] = {**force, **errors}
     if own["encoders"]:

@@ -5,7 +5,16 @@ import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario
 
-from drake_dae import Approach, Press, Record, Task, build_scenario, load_scenario
+from drake_dae import (
+    Approach,
+    Press,
+    Record,
+    Task,
+    build_scenario,
+    grid_variations,
+    load_scenario,
+    sweep,
+)
 from drake_dae.cli import main
 from drake_dae.errors import ModelError, ScenarioError, SimulationError
 
@@ -147,6 +156,19 @@ def test_noise_is_no_touch(file, tmp_path, seed):
     settings = [f"force_feedback.seed={seed}", "duration=0.4"]
     _, distance = touched(rolled(file, tmp_path, *settings))
     assert abs(distance) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
+    """Each run is that of its scenario alone: its low-pass is that of its own noise."""
+    name = "force_feedback.noise_deviation"
+    chosen = load_scenario(file, ["duration=0.4"])
+    variations = grid_variations({name: [0.1, 0.3]})
+    study = sweep(chosen, variations, tmp_path / "runs.jsonl", workers=1, rollout=True)
+    for k, noise in enumerate((0.1, 0.3)):
+        alone = rolled(file, tmp_path, "duration=0.4", f"{name}={noise}")
+        largest = np.max(np.abs(alone["tracking_error"][:, 1]))
+        assert_allclose(study.values("largest error of wall.force [N]")[k], largest, rtol=1e-9)
 
 
 @pytest.mark.slow
