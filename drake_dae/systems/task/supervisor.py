@@ -175,22 +175,22 @@ class TaskSupervisor(LeafSystem):
 
         Last comes how far the contact is from being felt, or from being felt no more.
         """
-        task, place = self.task, segment.change.place
-        moment = self._moment(context, segment)
-        phase = task.phases[place]
-        excess, lost = moment.force - task.contact_force, np.inf
-        if phase.if_lost and segment.change.in_contact and not progress.is_felt:
+        task, moment, over = self.task, self._moment(context, segment), self._is_over(segment)
+        excess, lost, end, late = moment.force - task.contact_force, np.inf, np.inf, np.inf
+        phase = None if over else task.phases[segment.change.place]
+        if (phase is None or phase.if_lost) and segment.change.in_contact and not progress.is_felt:
             lost = task.patience - (context.get_time() - progress.felt)
-        end = phase.margin(moment, task.contact_force)
-        if self._traced.tares(context.get_discrete_state(self._held).value()):
-            end = 1.0
+        if phase is not None:
+            late = float(phase.remaining(moment))
+            if not self._traced.tares(context.get_discrete_state(self._held).value()):
+                end = phase.margin(moment, task.contact_force)
         felt = excess if progress.is_felt else -excess
-        return moment, np.array([end, lost, float(phase.remaining(moment)), felt])
+        return moment, np.array([end, lost, late, felt])
 
     def _guard(self, context: Context) -> float:
         """Positive while the phase goes on: Drake seeks where that ends."""
         progress = self.progress(context)
-        if not progress.segments or self._is_over(progress.segments[-1]):
+        if not progress.segments:
             return 1.0
         _, margins = self._margins(context, progress, progress.segments[-1])
         # A little early: Drake's Simulator ends the process where it finds a zero at the very end
@@ -225,9 +225,6 @@ class TaskSupervisor(LeafSystem):
     def _advance(self, context: Context, state: State) -> EventStatus:
         progress, time = self.progress(context), context.get_time()
         segment, seen = progress.segments[-1], self._seen(context)
-        if self._is_over(segment):
-            self._put(state, progress, seen)
-            return EventStatus.Succeeded()
         moment, margins = self._margins(context, progress, segment)
         status, found = EventStatus.Succeeded(), progress.segments
         if np.any(margins[:-1] <= 2.0 * EARLY):
@@ -248,6 +245,9 @@ class TaskSupervisor(LeafSystem):
     ) -> tuple[Segment, EventStatus]:
         """What follows where a phase has ended."""
         task, place, now = self.task, segment.change.place, self._now(context)
+        if self._is_over(segment):
+            reason = "the contact is lost at rest"
+            return self._plan.following(now, segment, moment, None, reason), EventStatus.Succeeded()
         phase, status = task.phases[place], EventStatus.Succeeded()
         awaited = phase.awaited(task.contact_force)
         if margins[0] <= 2.0 * EARLY:

@@ -21,6 +21,8 @@ _SLOWEST = 10.0
 class Task:
     """Phases, one after the other; after the last one the robot rests where it is.
 
+    Where it rests in contact and that is lost, it rests on as a free robot.
+
     Attributes:
         phases: The phases. Where the first one begins in contact, it does so with `contact_force`.
         contact_force: A force that is less than this, in N, is none: with it the robot has

@@ -225,8 +225,12 @@ class TracedTask:
         excess = self._force - task.contact_force
         moment = Moment(passed, self._force, distances[0], distances[1], lowest[0] + lowest[1])
 
+        waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
+        lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
+        felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
+
         def margins(index: int) -> ca.SX:
-            phase, lost = task.phases[index], ca.SX(1)
+            phase = task.phases[index]
             try:
                 end = ca.SX(phase.margin(moment, task.contact_force))
                 late = ca.fmin(ca.SX(phase.remaining(moment)), 1e9)
@@ -235,16 +239,11 @@ class TracedTask:
                     f"the margin of {phase.name} takes numbers alone, so that a rollout does not "
                     "know it: take ca.fmax, ca.fmin and abs in its place; or run it by simulate"
                 ) from error
-            if phase.if_lost:
-                patience = task.patience - (self._time - named["felt"])
-                waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
-                lost = ca.if_else(waits, patience, 1)
-            felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
             if self._tares:
                 end = ca.if_else(tares, 1, end)
-            return ca.vertcat(end, lost, late, felt)
+            return ca.vertcat(end, lost if phase.if_lost else 1, late, felt)
 
-        found = self._in_phase(margins, ca.SX.ones(4))
+        found = self._in_phase(margins, ca.vertcat(1, lost, 1, felt))
         inputs = [self._time, self._held, x, self._forces, parameters]
         none = ca.SX(0, 1)
         function = ca.Function("guard", inputs, [ca.densify(found - EARLY), none, none])

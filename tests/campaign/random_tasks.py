@@ -1,0 +1,154 @@
+"""Random tasks of the two-link arm: phases, sensors, pushes, payloads, a wall that is elsewhere.
+
+    python tests/campaign/random_tasks.py --count 1000 --seed 0
+
+Each has to end done, or by the reaction that was chosen, or with an error of the library; and
+without pushes and payloads no touch may be harder than recommended gains tell. Returns 1 if one is
+raw or too hard.
+"""
+
+import argparse
+import random
+import re
+import sys
+import tempfile
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from drake_dae import load_scenario
+from drake_dae.errors import DrakeDaeError
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.start import start_scenario
+
+REACTIONS = ("hold", "stop", "fail")
+TEXT = """
+robot: {{file: package://drake_dae_models/two_link_arm.urdf}}
+constraints:
+- name: wall
+  frame: tool
+  surface: {{point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+  friction: 0.0
+outputs:
+- {{frame: tool, axes: z}}
+sampling: {{period: 0.001, delay: 0.001}}
+start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
+duration: 6.0
+plant: {plant}
+force_feedback: !MeasuredForce {sensor}
+{settings}
+task:
+  tare_time: {tare}
+{gains}
+  phases:
+{phases}
+"""
+
+
+def random_task(draw: random.Random) -> tuple[str, bool]:
+    """A scenario, and whether the touch is that of the model."""
+    noise, bias = draw.choice((0.0, 0.1, 0.3)), draw.choice((0.0, 0.0, -1.0, 0.5, 1.0))
+    sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}}}"
+    settings, gains, moved = [], "", False
+    if draw.random() < 0.25:
+        plant = "!Unilateral {restitution: {wall: 0.0}}"
+        settings += ["gains: {all: [-25]}", draw.choice(("", "observer: {rate: 30}"))]
+        settings.append(draw.choice(("", "encoders: {position_noise: 1e-6, velocity_noise: 1e-3}")))
+        gains = '  gains: {outputs: {wall.distance: [-8], "*": [-25]}}'
+    else:
+        stiffness, friction = 10 ** draw.uniform(4.0, 6.0), draw.uniform(0.0, 0.6)
+        plant = f"!CompliantContact {{radius: 1e-5, stiffness: {stiffness}, friction: {friction}}}"
+        of_velocity = "{position_noise: 1e-5, velocity_noise: 0.005}"
+        kinds = ("", "{position_noise: 1e-5}", "{resolution: 2e-5}", of_velocity)
+        settings.append(f"encoders: {encoders}" if (encoders := draw.choice(kinds)) else "")
+    if draw.random() < 0.4:
+        force = [draw.uniform(-60.0, 20.0), 0.0, draw.uniform(-15.0, 15.0)]
+        start, end = draw.uniform(0.0, 2.0), draw.uniform(2.0, 3.0)
+        push = f"frame: tool, force: {force}, start_time: {start}, end_time: {end}"
+        settings.append(f"plant_disturbances: [{{{push}}}]")
+        moved = True
+    if draw.random() < 0.3:
+        mass = draw.uniform(0.05, 0.6)
+        settings.append(f"plant_payloads: [{{frame: tool, mass: {mass}}}]")
+        moved = True
+    if draw.random() < 0.3:
+        place = 1.2 + draw.uniform(-0.01, 0.08)
+        settings.append(f"plant_parameters: {{wall.position: [{place}, 0, 0]}}")
+    if draw.random() < 0.3:
+        settings.append("saturation: true")
+    lost = (*REACTIONS, "approach")
+    speed, late = draw.uniform(0.01, 0.1), draw.choice(REACTIONS)
+    phases = [f"!Approach {{speed: {speed}, over: 0.1, if_late: {late}}}"]
+    ends = f"within: 3, if_late: {draw.choice(REACTIONS)}, if_lost: {draw.choice(lost)}"
+    force, tolerance = draw.uniform(3.0, 40.0), max(1.0, 5.0 * noise)
+    phases.append(f"!Press {{force: {force}, tolerance: {tolerance}, over: 0.3, {ends}}}")
+    for _ in range(draw.randrange(4)):
+        goal, force, if_lost = draw.uniform(0.2, 0.4), draw.uniform(3.0, 40.0), draw.choice(lost)
+        goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
+        move, dwell = f"!Move {{{goals}, if_lost: {if_lost}}}", "!Dwell {duration: 0.3}"
+        phases.append(draw.choice((move, dwell)))
+    if draw.random() < 0.5:
+        phases += ["!Release {over: 0.3, within: 3}", "!Retreat {distance: 0.02, tolerance: 2e-3}"]
+    text = TEXT.format(
+        plant=plant,
+        sensor=sensor,
+        settings="\n".join(filter(None, settings)),
+        tare=0.1 if bias else draw.choice((0.0, 0.1)),
+        gains=gains,
+        phases="\n".join(f"  - {phase}" for phase in phases),
+    )
+    return text, not moved
+
+
+def outcome(text: str, is_model: bool, folder: Path) -> str:
+    """How a task ends; "RAW" or "HARD" first where it may not end so."""
+    file = folder / "task.yaml"
+    file.write_text(text)
+    try:
+        completed, loop = build_completed(load_scenario(file))
+        context = start_scenario(completed.scenario, loop)
+        found = roll_scenario(completed.scenario, loop, context)
+    except DrakeDaeError as error:
+        return f"refused: {error}"
+    except Exception as error:
+        return f"RAW: {error!r}"
+    changes = loop.changes(found.context or context)
+    told = re.search(r"peaks at ([0-9.e+]+) N", " ".join(completed.notes))
+    touches = [change.time for change in changes if change.in_contact]
+    if told and touches and is_model:
+        record = found.record
+        near = np.abs(record.time - touches[0] - 0.02) < 0.03
+        peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
+        if peak > float(told[1]):
+            return f"HARD: {peak:.3g} N where {told[1]} N is told"
+    if found.failure is not None:
+        return f"error: {found.failure}"
+    return f"{changes[-1].phase}: {changes[-1].reason}" if changes else "no phase"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    kinds, bad = Counter[str](), 0
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(options.seed, options.seed + options.count):
+            began = time.perf_counter()
+            found = outcome(*random_task(random.Random(seed)), Path(folder))
+            bad += (is_bad := found.startswith(("RAW", "HARD")))
+            kinds[re.sub(r"[-+]?\d[\d.e+-]*", "#", found)[:100]] += 1
+            if is_bad or time.perf_counter() - began > 60.0:
+                print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)
+    for kind, count in kinds.most_common():
+        print(f"{count:6} {kind}")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
