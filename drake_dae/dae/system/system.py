@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, vector
+from drake_dae.arrays import FloatArray, numbers, vector
 from drake_dae.dae.system.called import called_functions
 from drake_dae.dae.system.checks import checked_fields
 from drake_dae.dae.system.contacts import Contact, Contacts
@@ -380,13 +380,23 @@ class DaeSystem:
             return parameters
         return vector(f"{self.name}: parameters", parameters, self._defaults.size)
 
-    def parameters_of(self, other: "DaeSystem", values: FloatArray) -> FloatArray:
+    @checked(ModelError)
+    def parameters_of(self, other: "DaeSystem", values: ArrayLike) -> FloatArray:
         """The parameters of this system as another one has them, by name; else the defaults.
 
         Args:
             other: A system of the same robot, as that of a plant with a payload.
             values: Its parameters, shape (k,) or (samples, k).
+
+        Raises:
+            ModelError: The shape is wrong.
         """
+        values, size = numbers("values", values), other.parameter_symbol.numel()
+        if values.ndim not in (1, 2) or values.shape[-1] != size:
+            raise ModelError(
+                f"{self.name}: values must have shape ({size},) or (samples, {size}), got "
+                f"{values.shape}"
+            )
         found = np.empty((*values.shape[:-1], self._defaults.size))
         found[...] = self._defaults
         names = {p.name for p in other.parameters}
