@@ -64,6 +64,12 @@ def add_observer(
             "an observer needs the measured force: make the law with measured_force=True, or give "
             "the observer a state_rate and the loop encoders, by which the model's force serves"
         )
+    if controller.HasOutputPort("contact_reference") and not controller.law.measured_force:
+        raise WiringError(
+            "the model's force is that of a closed contact, and a task has an open one, too: give "
+            "an observer the measured force, with a law made with measured_force=True (in a "
+            "scenario: force_feedback: !MeasuredForce {sample_period: ...})"
+        )
     late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
     seen = state

@@ -52,15 +52,19 @@ def task_controller(
     task = scenario.task
     assert task is not None
     assert scenario.gains is not None  # advised.
+    noise = float(np.max(np.asarray(getattr(scenario.force_feedback, "noise_deviation", 0.0))))
+    if noise and not period:
+        text = (
+            f"needed: a task tells a touch from the force sensor's noise of {noise:g} N in samples"
+        )
+        raise ScenarioError(("sampling", text))
     (force,) = [signal.name for signal in opening_contact(scenario, model).force_signals]
     with at("task"):
         free_system = open_contact(law.system, force)
     with at("task.gains" if task.gains else "gains"):
         free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
     with at("task"):
-        noise = getattr(scenario.force_feedback, "noise_deviation", 0.0)
-        made = task.made(float(np.max(np.asarray(noise))) if period else 0.0)
-        return TaskController(made, law, free_law, sample_period=period)
+        return TaskController(task.made(noise), law, free_law, sample_period=period)
 
 
 def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:

@@ -158,6 +158,12 @@ def test_noise_is_no_touch(file, tmp_path, seed):
     assert abs(distance) < 1e-3
 
 
+def test_noise_without_samples_is_refused(file):
+    settings = ["plant=!Unilateral {restitution: {wall: 0.0}}", "sampling=null", "observer=null"]
+    with pytest.raises(ScenarioError, match=r"sampling: needed: a task tells .* noise of 0\.3 N"):
+        build_scenario(load_scenario(file, settings))
+
+
 @pytest.mark.slow
 def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
     """Each run is that of its scenario alone: its low-pass is that of its own noise."""
@@ -227,14 +233,21 @@ def test_parameters_of_another_system_are_taken_by_name(file):
     ("change", "message"),
     [
         ("tolerances={outputs: {tool.z: 0.01}}", "tolerances: the phases of a task have their own"),
+        (
+            "force_feedback=!ModelForce {}",
+            "the model's force is that of a closed contact, and a task has an open one, too",
+        ),
         ("task.contact_force=0.1", r"contact_force: noise of 0\.3 N hides a force of 0\.1 N"),
         ("task.tare_time=-1", r"task: tare_time must be 0 or more, got -1"),
         ("task.phases.0.behind=0", r"task\.phases\.0: Approach: behind must be positive"),
     ],
 )
 def test_what_does_not_fit_is_said(file, change, message):
+    settings = [change]
+    if "ModelForce" in change:
+        settings += ["encoders={position_noise: 1.0e-5}", "observer={rate: 60, state_rate: 200}"]
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(load_scenario(file, [change]))
+        build_scenario(load_scenario(file, settings))
 
 
 def test_a_task_that_begins_in_contact_finds_no_bias():

@@ -152,7 +152,8 @@ def test_a_task_has_the_noise_of_its_seed(file):
     noisy = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
     found = []
     for seed in (1, 2, 1):
-        loop, context = build_scenario(load_scenario(file, [noisy, f"force_feedback.seed={seed}"]))
+        settings = [noisy, "sampling={period: 0.001}", f"force_feedback.seed={seed}"]
+        loop, context = build_scenario(load_scenario(file, settings))
         own = loop.noise.GetMyContextFromRoot(context)
         found.append(loop.noise.get_output_port().Eval(own).item())
     assert found[0] == found[2] != found[1]
