@@ -74,10 +74,12 @@ def add_exogenous(
     return generator
 
 
-_NEEDS = dict.fromkeys(
-    ("observer", "tolerances"), "it needs the references of a generator, and there is none"
-)
-"""What a controller without a generator cannot be wired with; a task has references of its own."""
+def contact_reference(
+    controller: Controller, reference: ReferenceGenerator | None
+) -> OutputPort | None:
+    """R of the law in contact, from its generator, or from a controller that plans it; or None."""
+    block, name = reference or controller, "reference" if reference else "contact_reference"
+    return block.GetOutputPort(name) if block.HasOutputPort(name) else None
 
 
 def check_parts(
@@ -103,11 +105,10 @@ def check_parts(
         if reference is None:
             needs = "needs a ReferenceGenerator(references, controller.law.degrees)"
         raise WiringError(f"{controller.get_name()} {needs}")
-    refused = dict(controller.refused)
-    if reference is None:
-        refused = {**_NEEDS, **refused}
-        if controller.HasOutputPort("contact_reference"):
-            del refused["observer"]
+    needs = "it needs the references of a generator, and there is none"
+    missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}
+    refused = {name: needs for name, source in missing.items() if source is None}
+    refused |= controller.refused
     given = {name: getattr(parts, name) for name in refused}
     found = [
         f"{name}: {refused[name]}"

@@ -22,6 +22,7 @@ from drake_dae.diagrams.parts import (
     add_hold,
     add_watch,
     check_parts,
+    contact_reference,
     hold_before,
     log_steps,
     open_holds,
@@ -147,8 +148,7 @@ def wire_loop(
     for block in (plant, reference, controller):
         if block is not None:
             add_block(builder, block)
-    planned = (controller, "contact_reference") if reference is None else (reference, "reference")
-    goal = planned[0].GetOutputPort(planned[1]) if planned[0].HasOutputPort(planned[1]) else None
+    goal = contact_reference(controller, reference)
 
     # The state goes to the controller, through encoders.
     state, measured = plant.GetOutputPort("state"), None
@@ -176,9 +176,8 @@ def wire_loop(
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
         builder.Connect(control, plant.GetInputPort("control"))
-        if reference is not None:
-            goes = reference.GetOutputPort("reference")
-            builder.Connect(goes, controller.GetInputPort("reference"))
+        if goal is not None and controller.HasInputPort("reference"):
+            builder.Connect(goal, controller.GetInputPort("reference"))
 
     if controller.HasInputPort("acting_control"):
         builder.Connect(control, controller.GetInputPort("acting_control"))

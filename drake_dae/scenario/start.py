@@ -62,8 +62,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
             sensed = loop.sensor.GetMyMutableContextFromRoot(context)
             scenario.force_feedback.begin(loop.sensor, sensed)
     if controller.takes_over:
-        with at("start"):
-            plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))
+        _begin_at_rest(scenario, loop, context)
     else:
         _begin_with_references(scenario, loop, context)
     loop.set_seed(context, scenario.force_feedback.seed)
@@ -72,17 +71,27 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     return context
 
 
-def _standing(scenario: Scenario, loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
-    """The state at rest at start.positions, or next to them on the constraints."""
-    model = loop.plant.robot("a scenario")
-    guess = start_guess(scenario.start.positions, model.links)
+def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
+    """Starts plant and sensor at rest at start.positions, or next to them on the constraints."""
+    plant = loop.plant
+    model, own = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
+    parameters = plant.current_parameters(own)
     forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
-    near = model.rest_state(guess, forces, parameters)
-    structure = loop.controller.start_structure
-    known = structure.system.parameters_of(loop.plant.dae, parameters)
-    q = structure.manifold.settle(near, known)[: guess.size]
-    _check_limits(model, q, "Give")
-    return model.rest_state(q, forces, parameters)
+    with at("start"):
+        guess = start_guess(scenario.start.positions, model.links)
+        near = model.rest_state(guess, forces, parameters)
+        structure = loop.controller.start_structure
+        known = structure.system.parameters_of(plant.dae, parameters)
+        q = structure.manifold.settle(near, known)[: guess.size]
+        _check_limits(model, q, "Give")
+        plant.set_state(own, model.rest_state(q, forces, parameters))
+    _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
+
+
+def _begin_sensor(loop: ClosedLoop, context: Context, force: FloatArray) -> None:
+    """Starts the force sensor, if there is one, as it measures a constant force."""
+    if loop.sensor is not None:
+        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
 
 
 def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
@@ -105,9 +114,7 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
         if scenario.exogenous:
             state = _in_motion(loop, context, wanted, state)
         plant.set_consistent_state(own, state)
-    if loop.sensor is not None:
-        force = model.rest_forces(q, forces, parameters)
-        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
+    _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:

@@ -55,7 +55,8 @@ def task_controller(
     noise = float(np.max(np.asarray(getattr(scenario.force_feedback, "noise_deviation", 0.0))))
     if noise and not period:
         text = (
-            f"needed: a task tells a touch from the force sensor's noise of {noise:g} N in samples"
+            f"needed: the force sensor has noise of {noise:g} N, which a task without samples "
+            "cannot filter, and would take for a touch"
         )
         raise ScenarioError(("sampling", text))
     (force,) = [signal.name for signal in opening_contact(scenario, model).force_signals]

@@ -2,9 +2,8 @@
 
     python tests/campaign/random_tasks.py --count 1000 --seed 0
 
-Each has to end done, or by the reaction that was chosen, or with an error of the library; and
-without pushes and payloads no touch may be harder than recommended gains tell. Returns 1 if one is
-raw or too hard.
+Each has to end done, or by the chosen reaction, or with an error of the library. Without pushes and
+payloads the force of the touch has to stay below the expected peak. Returns 1 if one does not.
 """
 
 import argparse
@@ -117,14 +116,14 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
     except Exception as error:
         return f"RAW: {error!r}"
     changes = loop.changes(found.context or context)
-    told = re.search(r"peaks at ([0-9.e+]+) N", " ".join(completed.notes))
+    limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
     touches = [change.time for change in changes if change.in_contact]
-    if told and touches and is_model:
+    if limit and touches and is_model:
         record = found.record
         near = np.abs(record.time - touches[0] - 0.02) < 0.03
         peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
-        if peak > float(told[1]):
-            return f"HARD: {peak:.3g} N where {told[1]} N is told"
+        if peak > float(limit[1]):
+            return f"HARD: {peak:.3g} N, expected below {limit[1]} N"
     if found.failure is not None:
         return f"error: {found.failure}"
     return f"{changes[-1].phase}: {changes[-1].reason}" if changes else "no phase"

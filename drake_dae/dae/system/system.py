@@ -382,7 +382,9 @@ class DaeSystem:
 
     @checked(ModelError)
     def parameters_of(self, other: "DaeSystem", values: ArrayLike) -> FloatArray:
-        """The parameters of this system as another one has them, by name; else the defaults.
+        """The parameters of this system as another one has them; else the defaults.
+
+        Those are taken that have the same name and size in both.
 
         Args:
             other: A system of the same robot, as that of a plant with a payload.
@@ -399,9 +401,11 @@ class DaeSystem:
             )
         found = np.empty((*values.shape[:-1], self._defaults.size))
         found[...] = self._defaults
-        names = {p.name for p in other.parameters}
-        for name in [p.name for p in self.parameters if p.name in names]:
-            found[..., self.parameter_slice(name)] = values[..., other.parameter_slice(name)]
+        sizes = {p.name: p.value.size for p in other.parameters}
+        for p in self.parameters:
+            if sizes.get(p.name) == p.value.size:
+                own = self.parameter_slice(p.name)
+                found[..., own] = values[..., other.parameter_slice(p.name)]
         return found
 
     def state_vector(self, state: ArrayLike) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_dae.dae.beyond.contact_advice import advised_gains
-from drake_dae.dae.beyond.contact_gains import contact_gains
+from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
 from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ScenarioError
@@ -32,12 +32,29 @@ _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 
-def _touches(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """What the fastest touch of a task does, v (sqrt(k / A) + k t) with the time t to react."""
+def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> parts.Coefficients:
+    """The gains of the free robot of a task, soft along the distance: see `TaskController`."""
+    constraint = opening_contact(scenario, model)
+    names = [signal.name for signal in model.dae.constraint_input_signals]
+    place = names.index(constraint.force_signals[0].name)
+    distance, rate = model.dae.constraint_output_signals[place].name, found.position_rate / _SOFTER
+    gains = {signal.name: found.position_gains(2) for signal in model.position_signals}
+    gains[distance] = [rate**2, 2.0 * rate]
+    return parts.Coefficients(
+        outputs={name: [rounded(gain) for gain in each] for name, each in gains.items()}
+    )
+
+
+def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
+    """The force of the fastest touch, v (sqrt(k / A) + k t).
+
+    The first term stops the mass 1 / A at the tool; the second is how far the tool goes in the time
+    t until the law reacts.
+    """
     speeds = [] if task is None else [phase.speed_of_approach for phase in task.phases]
     speed = max(speeds, default=0.0)
     peak = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
-    return f". A touch at {speed:g} m/s peaks at {peak:.3g} N or less" if speed else ""
+    return f". A touch at {speed:g} m/s is expected to stay below {peak:.3g} N" if speed else ""
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
@@ -148,15 +165,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         )
     task = scenario.task
     if task is not None and task.gains is None:
-        # Soft along the distance, where it touches: see `TaskController`.
-        distance = rounded(found.position_rate / _SOFTER)
-        force_name = opening_contact(scenario, model).force_signals[0].name
-        inputs = [signal.name for signal in model.dae.constraint_input_signals]
-        opens = model.dae.constraint_output_signals[inputs.index(force_name)].name
-        free = {name: found.position_gains(2) for name in positions.tolist()}
-        free[opens] = [distance**2, 2.0 * distance]
-        of_free = {name: [rounded(gain) for gain in each] for name, each in free.items()}
-        task = replace(task, gains=parts.Coefficients(outputs=of_free))
+        task = replace(task, gains=_free_gains(scenario, model, found))
     chosen = replace(
         scenario,
         task=task,
@@ -176,6 +185,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
-        f"{loop_note(scenario)}{outlook}{_touches(task, stiffness, mobility, period * (1 + late))}"
+        f"{loop_note(scenario)}{outlook}"
+        f"{_touch_note(task, stiffness, mobility, period * (1 + late))}"
     )
     return Completed(chosen, (note,))

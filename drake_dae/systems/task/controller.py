@@ -58,12 +58,11 @@ class TaskController(Diagram, Controller):
     Where it lets go, lambda is the task's `contact_force` at most, and the jump is J^T lambda. A
     touch that is slow, and a free law that is soft along the distance, keep the first one small.
 
-    It needs of a plant the state x and the constraint forces, as measured; no more. Where the laws
-    are for a system with a disturbance, an observer feeds both: with the measured force it needs
-    not know whether the contact is closed. Guards are
-    found by Drake's Simulator as zeros of a witness function, which needs a context with an
-    accuracy as `simulate` sets it, or are looked at in samples. All that a run has done stands in
-    its context.
+    It needs of a plant the state x and the constraint forces, as measured; no more. If the laws are
+    for a system with a disturbance, one observer feeds both: with the measured force its equation
+    holds for the closed and for the open contact. Guards are found by Drake's Simulator as zeros of
+    a witness function, which needs a context with an accuracy as `simulate` sets it, or are looked
+    at in samples. All that a run has done stands in its context.
 
     Input ports:
         estimated_state: x, shape (n,).

@@ -123,8 +123,8 @@ class Approach(Phase):
     Attributes:
         speed: With which it touches, in m/s; less where it touches before the references of this
             phase are reached, as where it starts from rest nearer than speed * over / 2.
-        behind: How far behind the surface of the model, in m, it seeks the contact; then it is
-            late.
+        behind: The largest distance behind the surface of the model, in m, up to which it seeks
+            the contact; farther behind it is late.
         over: How long the references before take to become those of this phase, in s.
         within: How long the phase may last, in s.
         if_late: What follows where it lasts longer: "hold", "stop" or "fail".

@@ -73,7 +73,7 @@ class TaskSupervisor(LeafSystem):
         self._sample_period = sample_period
         self.task, self._laws, self._place, self._force = task, laws, place, force
         self._plan = plan = Planner(task, laws, place)
-        tares = round(task.tare_time / sample_period) if sample_period else 0
+        tares = task.tare_samples(sample_period)
         self._traced = TracedTask(task, laws, place, force, plan, num_forces, tares)
         self._state_port = self.DeclareVectorInputPort(
             "estimated_state", laws[FREE].system.num_states

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import ceil, inf
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
@@ -10,10 +10,11 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Phase
 
 _STEADY = 6.0
-"""So many standard deviations of the noise are below `contact_force`: one sample in 1e9."""
+"""`contact_force` is at least so many standard deviations of the filtered noise, so that one sample
+in 1e9 exceeds it."""
 
 _SLOWEST = 10.0
-"""The low-pass of the force reduces noise by this at most: it then takes 50 samples."""
+"""The low-pass divides the noise by this at most; its time constant is then 50 samples."""
 
 
 @checked(ModelError)
@@ -21,7 +22,7 @@ _SLOWEST = 10.0
 class Task:
     """Phases, one after the other; after the last one the robot rests where it is.
 
-    Where it rests in contact and that is lost, it rests on as a free robot.
+    If it rests in contact and the contact is lost, the law of the free robot keeps it at rest.
 
     Attributes:
         phases: The phases. Where the first one begins in contact, it does so with `contact_force`.
@@ -29,13 +30,13 @@ class Task:
             touched, and below it it has let go.
         patience: How long the force of a contact that shall hold may be none before the contact is
             lost, in s; a contact that gives way may bounce at first.
-        force_noise: The standard deviation of the force sensor's noise, in N. At samples the guards
-            see the force through a low-pass that leaves a sixth of `contact_force` of it, so that
-            noise is no touch; 0 for none.
-        tare_time: For how long, in s, a task that begins free takes the mean of the measured force
-            as the sensor's bias, which is subtracted from then on for guards, laws and observers.
-            No phase ends before. 0 for no taring.
-        retries: How often the reaction "approach" may follow; then the run ends with an error.
+        force_noise: The standard deviation of the force sensor's noise, in N. The guards take the
+            force through a low-pass, after which the noise has a standard deviation of at most a
+            sixth of `contact_force`, so that it is not taken for a touch; 0 without noise.
+        tare_time: The time in s at the begin of a task that begins free, in which the mean of the
+            measured force is taken as the sensor's bias. No phase ends before it is over; then the
+            bias is subtracted for guards, laws and observers. 0 for no taring.
+        retries: How many times a task may go back to an Approach; then the run ends with an error.
 
     Raises:
         ModelError: There are no phases, one begins in contact where that before does not end so, or
@@ -99,6 +100,26 @@ class Task:
             return 1.0
         kept = min((self.contact_force / (_STEADY * self.force_noise)) ** 2, 1.0)
         return 2.0 * kept / (1.0 + kept)
+
+    def tare_samples(self, sample_period: float) -> int:
+        """Of how many samples the bias of the force is the mean; 0 without a tare_time.
+
+        Args:
+            sample_period: In s.
+
+        Raises:
+            ModelError: The mean is of so few samples that their noise may be taken for a touch.
+        """
+        if not self.tare_time:
+            return 0
+        found = ceil(self.tare_time / sample_period - 1e-9)
+        needed = ceil((_STEADY * self.force_noise / self.contact_force) ** 2)
+        if found < needed:
+            raise ModelError(
+                f"tare_time: a mean over {self.tare_time:g} s keeps too much of the force sensor's "
+                f"noise of {self.force_noise:g} N; it must be {needed * sample_period:g} s or more"
+            )
+        return found
 
     @property
     def contacts(self) -> tuple[bool, ...]:
