@@ -224,16 +224,19 @@ def test_no_phase_ends_before_the_bias_is_found(file, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rollout", [True, False])
-def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, rollout):
-    """A push pulls with 40 N where the arm rests with 10 N; the law in contact would throw it."""
+def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rollout):
+    """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
     push = "plant_disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
     only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
     settings = [push, only, "observer=null", "task.patience=0.02", "duration=1.6"]
     settings.append("plant.friction=0")
     if rollout:
         found = rolled(file, tmp_path, *settings)
+        told = capsys.readouterr().out
     else:
-        found = run_scenario(load_scenario(file, settings))[2]
+        loop, context, found = run_scenario(load_scenario(file, settings))
+        told = "\n".join(map(str, loop.changes(context)))
+    assert "held, the contact is lost at rest" in " ".join(told.split("; "))
     assert found["constraint_force"][found.time < 0.8][-1] > 5.0
     assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
     assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
