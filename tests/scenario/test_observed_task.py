@@ -269,6 +269,17 @@ def test_integrals_of_a_task_wait_for_limited_drives(file):
     assert holds() == [1.0, 1.0]
 
 
+@pytest.mark.slow
+def test_a_release_ends_though_a_bias_hides_that_the_contact_is_open(file, tmp_path):
+    """Formerly the law in contact drew the arm away until it diverged."""
+    phases = "task.phases=[!Press {force: 10, over: 0.1, tolerance: 3}, !Release {if_late: hold}]"
+    weak = "constraint_damping={all: [-25]}"  # Or it goes slowly.
+    found = rolled(file, tmp_path, BIASED, phases, weak, "duration=4")
+    assert found["phase"][-1, 2] == 1.0
+    assert 0.02 < found["distance"][-1, 0] < 0.05
+    assert np.max(np.abs(found["state"][-1, 2:])) < 0.02
+
+
 def test_a_sensor_begins_with_its_bias(file):
     """The first sample counts for the mean."""
     loop, context = build_scenario(load_scenario(file, [BIASED]))

@@ -19,6 +19,9 @@ Approach and from there through all phases again; "hold" brings the robot to res
 good; "stop" does so too, and ends the run; "fail" ends it with an error."""
 
 
+_AWAY = 0.02
+"""So far from where it began, in m, a Release has left the contact."""
+
 _FAIL: Reaction = "fail"
 _NOTHING: Reaction | None = None
 
@@ -33,6 +36,7 @@ class Moment:
         distance: The distance from the surface by the law's model, in m.
         rate: Its derivative, in m/s.
         wanted: What the reference of the force is (in contact), in N, or of the distance, in m.
+        away: How much the distance has grown since the phase began, in m.
     """
 
     time: float
@@ -40,6 +44,7 @@ class Moment:
     distance: float
     rate: float
     wanted: float
+    away: float = 0.0
 
 
 @checked(ModelError)
@@ -264,6 +269,9 @@ class Dwell(_Lasting):
 class Release(Phase):
     """The force goes to zero, smoothly; the phase ends where it is none.
 
+    It is late also where the tool has gone 20 mm away and a force is still measured, which is then
+    the bias of a sensor.
+
     Attributes:
         over: How long the references before take to become those of this phase, in s.
         within: How long the phase may last, in s.
@@ -279,6 +287,18 @@ class Release(Phase):
 
     def margin(self, now: Moment, contact_force: float) -> float:
         return now.force - contact_force
+
+    def remaining(self, now: Moment) -> float:
+        found: float = ca.fmin(super().remaining(now), _AWAY - now.away)
+        return found
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        if now.time >= self.within:
+            return super().lateness(now, contact_force)
+        return (
+            f"Release has gone {now.away:.3g} m away, and a force of {now.force:.3g} N is still "
+            "measured, as by a sensor with a bias; see tare_time"
+        )
 
     def awaited(self, contact_force: float) -> str:
         return f"a force of no more than {contact_force:g} N"

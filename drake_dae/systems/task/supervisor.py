@@ -161,7 +161,8 @@ class TaskSupervisor(LeafSystem):
         force = float(self._seen(context)[0])
         distance, rate = self._plan.distance(self._now(context))
         wanted = segment.reference(time)[segment.layout.lowest[self._place]]
-        return Moment(time - segment.change.time, force, distance, rate, float(wanted))
+        passed, away = time - segment.change.time, distance - segment.change.distance
+        return Moment(passed, force, distance, rate, float(wanted), away)
 
     def _seen(self, context: Context) -> FloatArray:
         """What is seen of the force with the present sample: see `SEEN`."""

@@ -29,7 +29,7 @@ SEEN = ("force", "bias", "count")
 """What a context holds of the force: after its low-pass, its mean before a touch, and of how many
 samples that is."""
 
-NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt", *SEEN)
+NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt", "distance", *SEEN)
 """Which numbers a context holds of a task, before base, rate and fade of its present segment."""
 
 EARLY = 1e-12
@@ -121,6 +121,7 @@ class TracedTask:
         parts = [
             *flags,
             progress.is_felt,
+            change.distance,
             *seen,
             *segment.base,
             *segment.rate,
@@ -223,7 +224,8 @@ class TracedTask:
         ]
         passed, tares = self._time - named["start"], named["count"] < self._tares - 0.5
         excess = self._force - task.contact_force
-        moment = Moment(passed, self._force, distances[0], distances[1], lowest[0] + lowest[1])
+        wanted, away = lowest[0] + lowest[1], distances[0] - named["distance"]
+        moment = Moment(passed, self._force, distances[0], distances[1], wanted, away)
 
         waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)

@@ -43,6 +43,14 @@ def test_phase_keeps_the_rules(name):
     assert not (phase.speed_of_approach and goals)
 
 
+def test_a_release_that_has_left_does_not_wait_for_the_force():
+    near, far = (Moment(0.3, 1.0, 0.0, 0.0, 0.0, away) for away in (0.019, 0.021))
+    assert Release().remaining(near) > 0.0 > Release().remaining(far)
+    assert "gone 0.021 m away, and a force of 1 N" in Release().lateness(far, CONTACT_FORCE)
+    late = replace(far, time=61.0)
+    assert Release().lateness(late, CONTACT_FORCE).startswith("Release has waited 60 s")
+
+
 @pytest.mark.parametrize("name", MEMBERS)
 def test_phase_takes_time(name):
     phase = MEMBERS[name][0]
