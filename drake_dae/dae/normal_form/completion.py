@@ -73,12 +73,12 @@ def check_completion(
             f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
             "there"
         )
-    function = system.trace("coordinates", {"gradient": gradient}, often=False)
-    (matrix,) = function(margin.state, system.parameter_values)
-    # The distance of each differential from the span of those before it.
-    rows = _unit_rows(matrix.reshape(system.num_states, -1) * samples.scale)
-    distances = np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]
-    worst = int(np.argmin(distances))
+    # A row that vanishes at a state has no direction there; the others are compared by direction.
+    worst = -1 if margin.vanishing_row is None else margin.vanishing_row - chains.numel()
+    if worst < 0:
+        # The distance of each differential from the span of those before it.
+        rows = _unit_rows(margin.matrix * samples.scale)
+        worst = int(np.argmin(np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]))
     raise ModelError(
         f"{system.name}: the completion '{signals[worst].name}' = "
         f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "

@@ -23,17 +23,17 @@ class Margin:
         relative: The smallest one after rows and columns are scaled to about length one, by factors
             that are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
+        matrix: The matrix there.
         vanishing_row: The row that is zero there; None if none is.
         least: The threshold of `relative` for singular: `DaeSystem.least_margin`.
-        matrix: The matrix there.
     """
 
     singular_value: float
     relative: float
     state: FloatArray
+    matrix: FloatArray = field(compare=False, repr=False)
     vanishing_row: int | None = None
     least: float = SINGULAR
-    matrix: FloatArray | None = field(default=None, compare=False, repr=False)
 
     @property
     def is_singular(self) -> bool:
@@ -72,9 +72,9 @@ def find_margin(
         singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
         relative=scaled.distance(state),
         state=state,
+        matrix=scaled.plain(state),
         vanishing_row=int(np.argmin(length)) if length.min() < least else None,
         least=least,
-        matrix=scaled.plain(state),
     )
 
 

@@ -295,7 +295,6 @@ def control_violation(structure: Structure) -> Violation | None:
     violation = rank_violation(margin, signals, degrees, *causes)
     if violation is not None and violation.cause is Cause.CONTROL_RANK:
         assert margin is not None
-        assert margin.matrix is not None
         rows = combinations_of([signal.name for signal in signals], [margin.matrix])
         violation = replace(violation, combinations=tuple(rows))
     matrix = structure.control_matrix
