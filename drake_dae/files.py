@@ -19,18 +19,23 @@ def open_file(path: str | Path) -> BinaryIO:
         OSError: It cannot be read, or is no regular file.
         ValueError: The path contains a null byte, or characters that paths must not have.
     """
+    return open(path, "rb", opener=_open_regular)
+
+
+def _open_regular(path: str, flags: int) -> int:
+    """The descriptor of a file; `open` owns it, also where a signal ends the caller."""
     # A pipe is opened without waiting for its writer.
-    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    number = os.open(path, flags | os.O_NONBLOCK)
     try:
         mode = os.fstat(number).st_mode
         if stat.S_ISDIR(mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if not stat.S_ISREG(mode):
             raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
-        return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)
         raise
+    return number
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:

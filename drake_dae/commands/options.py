@@ -64,9 +64,10 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="run a scenario",
         epilog=(
             "exit code: 0 if the run came to its end, 1 for an error, also where it ended "
-            "early; with --check 2 if it missed its task: errors are not as predicted, "
-            "without a reason or up to the end, or a contact would have to pull, or a drive "
-            "or a joint exceeds its limit"
+            "early; with --check 2 if it missed its task (the first line begins with BAD): an "
+            "output is not at its reference, a contact is lost or would have to pull, a link is "
+            "behind a surface, a drive or a joint exceeds its limit; or if errors are not as "
+            "predicted without a reason"
         ),
     )
     run.add_argument(

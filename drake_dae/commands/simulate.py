@@ -12,6 +12,7 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
+from textwrap import fill
 from typing import Any, TextIO
 
 from pydrake.systems.framework import Context
@@ -31,7 +32,6 @@ from drake_dae.dae.timing.profile import TimeOptimalReference
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
-from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
@@ -45,8 +45,10 @@ from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.simulation.job import JobVerdict, Outcome, judge_job
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
@@ -57,8 +59,8 @@ from drake_dae.simulation.remarks import (
     surface_remarks,
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
-from drake_dae.simulation.summary import Limits, shortfalls, summary
-from drake_dae.simulation.verdict import RunVerdict, as_data, judge
+from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
+from drake_dae.simulation.verdict import RunVerdict, Tracking, as_data, judge
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -254,11 +256,26 @@ def _write(run: _CommandRun) -> bool:
             reference, state = loop.generator.reference, record["state"][0]
             bound = loop.controller.error_bound(reference, record.time, state)
         text = summary(
-            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind, bound
+            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, bound
         )
-        run.results = _as_data(run, judge(record, predicted, accuracy), reasons)
-        run.results["shortfalls"] = [*shortfalls(record, limits), *map(str, behind)]
-        run.results["missed"] |= bool(run.results["shortfalls"])
+        changes = loop.changes(run.context)
+        interrupted = run.statistics is not None and run.statistics.interrupted is not None
+        job = judge_job(
+            record,
+            predicted,
+            {} if run.scenario.tolerances is None else run.scenario.tolerances.outputs,
+            [*shortfalls(record, limits), *map(str, behind)],
+            limits.pushing,
+            changes,
+            is_cut_short=bool(run.failure) or interrupted,
+        )
+        verdict = judge(record, predicted, accuracy)
+        is_unexplained = verdict.tracking is Tracking.OFF and not reasons
+        run.results = {
+            "missed": job.outcome is Outcome.BAD or is_unexplained,
+            "job": job.to_dict(),
+            **_as_data(run, verdict, reasons),
+        }
         if model is not None:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
@@ -267,14 +284,14 @@ def _write(run: _CommandRun) -> bool:
         scenario = run.scenario
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         text = "\n".join([text, *reference_remarks(followed)])
-        if changes := loop.changes(run.context):
+        if changes:
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])
         if write.record:
             with _collected(problems):
                 _write_record(replace(record, about=run.writer.about), run)
         with _collected(problems), stage(folder, "summary.txt") as place:
-            results = "\n".join([text, *run.notes, ""])
+            results = "\n".join([_filled(job), "", text, *run.notes, ""])
             (place / "summary.txt").write_text(results, encoding="utf-8")
     try:
         if ending.signal is not None:
@@ -299,12 +316,27 @@ def _write(run: _CommandRun) -> bool:
         files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]
         run.results["files"] = files
         with _collected(problems):
-            _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
+            _print(
+                f"{_colored(job)}\n\n{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout
+            )
             if ANIMATION in files:
                 _print(f"watch it: drake-dae play {shlex.quote(str(folder))}", sys.stdout)
         with suppress(OSError):
             _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
     return not problems
+
+
+def _filled(job: JobVerdict) -> str:
+    return fill(str(job), WIDTH)
+
+
+def _colored(job: JobVerdict) -> str:
+    """A verdict for the screen: its first word green, red or yellow on a terminal."""
+    text, word = _filled(job), job.outcome.value
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
+        return text
+    color = {Outcome.GOOD: 32, Outcome.BAD: 31, Outcome.UNDECIDED: 33}[job.outcome]
+    return f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
 
 
 def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind | Collision, ...]:

@@ -17,7 +17,6 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import LEAST_SCALE, PATH_COLOR, path_of
-from drake_dae.pictures.phases import PhaseSpan, phase_spans
 from drake_dae.pictures.run_motion import RunMotion, ShownLoop, follow, run_extent
 from drake_dae.pictures.surroundings import scene_extent, surroundings
 from drake_dae.pictures.view import (
@@ -29,6 +28,7 @@ from drake_dae.pictures.view import (
     view_of_links,
 )
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
 from drake_dae.simulation.records.record import Record
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)

@@ -35,10 +35,10 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.phases import phases_at
 from drake_dae.pictures.run_motion import RunMotion, ShownLoop, follow, run_extent
 from drake_dae.pictures.surroundings import surroundings
 from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.simulation.records.phases import phases_at
 from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first film.
@@ -91,11 +91,13 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
 
         figure, (axis,) = _screen(1)
         writer = PillowWriter(fps=int(RATE))
-        with writer.saving(figure, str(path), dpi=100):
-            for number in range(last + 1):
-                axis.clear()
-                scene.draw(axis, number)
-                writer.grab_frame()
+        # Not `writer.saving`, which also writes what an interruption left.
+        writer.setup(figure, str(path), dpi=100)
+        for number in range(last + 1):
+            axis.clear()
+            scene.draw(axis, number)
+            writer.grab_frame()
+        writer.finish()
     else:
         figure, axes = _screen(STRIP)
         for place, axis in enumerate(axes):

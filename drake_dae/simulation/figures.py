@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.job import late_rms
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import SLACK, Limits
 
@@ -28,7 +29,9 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
         return {}
     found = {}
     errors = record["tracking_error"]
-    figures = _each(record, "tracking_error", _largest(errors), errors[-1], _late_sizes(record))
+    figures = _each(
+        record, "tracking_error", _largest(errors), errors[-1], late_rms(record.time, errors)
+    )
     for signal, largest, final, late in figures:
         found[_label("largest error of", signal)] = largest
         found[_label("final error of", signal)] = final
@@ -51,22 +54,6 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
         "largest residual": float(residual),
         "end [s]": float(record.time[-1]),
     }
-
-
-def _late_sizes(record: Record) -> FloatArray:
-    """Root mean squares over the second half of tracking errors, piecewise linear, shape (p,)."""
-    times, values = record.time, by_columns(record["tracking_error"])
-    middle = 0.5 * (times[0] + times[-1])
-    first = int(np.searchsorted(times, middle, side="right"))
-    if first == times.size:
-        return np.abs(values[:, -1])
-    before, after = values[:, first - 1], values[:, first]
-    begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
-    found = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
-    steps = np.diff(np.concatenate([[middle], times[first:]]))
-    squares = (found[:, :-1] ** 2 + found[:, :-1] * found[:, 1:] + found[:, 1:] ** 2) / 3.0
-    sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
-    return sizes
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:

@@ -10,10 +10,10 @@ import numpy as np
 from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.geometry.clearances import LinkBehind
-from drake_dae.robots.geometry.shapes import Collision
 from drake_dae.robots.model import RobotModel
+from drake_dae.simulation.job import late_rms
 from drake_dae.simulation.open_contacts import contact_notes
+from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
@@ -22,7 +22,7 @@ _PROJECTED = "before each step's projection"
 
 _ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
 
-_WIDTH = 100
+WIDTH = 100
 """The width of a paragraph, in characters."""
 
 SLACK = 1e-9
@@ -75,10 +75,9 @@ def summary(
     failure: str = "",
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
-    behind: Sequence[LinkBehind | Collision] = (),
     bound: FloatArray | None = None,
 ) -> str:
-    """The results of a run in plain text, compared with the prediction.
+    """The figures of a run in plain text, compared with the prediction.
 
     Numbers that are round-off relative to others of the same unit are shown as 0.
 
@@ -91,13 +90,13 @@ def summary(
         failure: The reason of the failure.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
         reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
-        behind: Links that moved behind a surface, or collided.
         bound: A bound of what the controller adds to the prediction by design, shape (p,); None if
             it adds nothing.
     """
     limits = limits or Limits()
     sections = [
         _errors(record, predicted, bound),
+        _phases(record),
         _forces(record, limits),
         _controls(record, limits),
     ]
@@ -122,8 +121,7 @@ def summary(
         ended = f"The run ended early, at {record.time[-1]:.4g} s"
         reasons = ["of what ended it, see above"]
     words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
-    beware = [*shortfalls(record, limits), *map(str, behind)]
-    verdict = [fill(f"{words} But {'; '.join(beware)}." if beware else words, _WIDTH)]
+    verdict = [fill(words, WIDTH)]
     return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 
 
@@ -132,13 +130,25 @@ def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> 
     if not signals:
         return []
     sizes = unit_sizes(record)
-    columns = zip(signals, record["tracking_error"].T, predicted.T, strict=True)
+    errors = record["tracking_error"].T
+    columns = zip(
+        signals, errors, predicted.T, late_rms(record.time, record["tracking_error"]), strict=True
+    )
     added = [[] if bound is None else [f"{number:.2g}"] for number in _numbers(bound, len(signals))]
     more = [] if bound is None else ["springs add"]
     about = [] if bound is None else [_ADDED]
     return [
         *Table(
-            ["tracking error", "unit", "start", "largest", "final", "off prediction by", *more],
+            [
+                "tracking error",
+                "unit",
+                "start",
+                "largest",
+                "final",
+                "late rms",
+                "off prediction by",
+                *more,
+            ],
             [
                 [
                     signal.name,
@@ -146,16 +156,40 @@ def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> 
                     _number(error[0], sizes[signal.unit], 3),
                     _number(np.max(np.abs(error)), sizes[signal.unit], 3),
                     _number(error[-1], sizes[signal.unit], 3),
+                    _number(rms, sizes[signal.unit], 2),
                     _number(np.max(np.abs(error - theory)), sizes[signal.unit], 2),
                     *own,
                 ]
-                for (signal, error, theory), own in zip(columns, added, strict=True)
+                for (signal, error, theory, rms), own in zip(columns, added, strict=True)
             ],
             left=2,
         ).lines(),
+        "late rms: the root mean square in the second half of the run",
         "off prediction by: the largest deviation from the predicted error, which decays",
         "from its initial value by the gains alone",
         *about,
+    ]
+
+
+def _phases(record: Record) -> list[str]:
+    """The errors of each phase of a task, after transients."""
+    spans, signals = phase_spans(record), record.signals["tracking_error"].signals
+    if not spans or not signals:
+        return []
+    units = list(dict.fromkeys(signal.unit for signal in signals))
+    places = [[i for i, one in enumerate(signals) if one.unit == unit] for unit in units]
+    sizes, rows, last = unit_sizes(record), [], 0
+    for span in spans:
+        # At the time of a change a row has the values before it.
+        first, last = last, int(np.searchsorted(record.time, span.end, side="right"))
+        rms = late_rms(record.time[first:last], record["tracking_error"][first:last])
+        sums = [float(np.linalg.norm(rms[each])) for each in places]
+        numbers = [_number(sum_, sizes[unit], 2) for sum_, unit in zip(sums, units, strict=True)]
+        rows.append([span.name, f"{span.begin:.4g}", f"{span.end:.4g}", *numbers])
+    heads = [f"late rms [{unit or '1'}]" for unit in units]
+    return [
+        *Table(["phase", "from [s]", "to [s]", *heads], rows).lines(),
+        "late rms: of all errors in a unit together, in the second half of the phase",
     ]
 
 

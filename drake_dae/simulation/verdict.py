@@ -117,17 +117,6 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     return RunVerdict(tracking, signals[column], off, float(record.time[row]), share, settled)
 
 
-def is_missed(verdict: RunVerdict, reasons: Sequence[str] = ()) -> bool:
-    """Whether a run missed its task: it deviates, and permanently or without a known reason.
-
-    Args:
-        verdict: The verdict.
-        reasons: Reasons for a deviation, as in `in_words`.
-    """
-    is_off = verdict.tracking is Tracking.OFF
-    return is_off and not (reasons and verdict.settled <= NEAR)
-
-
 def as_data(verdict: RunVerdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
     """A verdict as plain data, where a number that is not finite is None.
 
@@ -137,7 +126,6 @@ def as_data(verdict: RunVerdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
     """
     worst = verdict.worst
     return {
-        "missed": is_missed(verdict, reasons),
         "tracking": verdict.tracking.name.lower(),
         "worst_output": None if worst is None else worst.name,
         "off_prediction": _finite(verdict.off),

@@ -15,7 +15,7 @@ from drake_dae.robots.links.textbook import LinkExpressions
 from drake_dae.simulation.open_contacts import contact_notes, open_spans
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.summary import Limits, summary
+from drake_dae.simulation.summary import Limits, shortfalls, summary
 from drake_dae.simulation.verdict import Tracking, judge
 
 
@@ -59,8 +59,9 @@ def test_every_figure():
     text = summary(record(), PREDICTED, Limits(np.array([10.0, np.inf])), run)
     # Beside axes of length one 2e-14 is round-off.
     assert table(text, "tracking error  unit")[:2] == [
-        ["tool.z", "m", "0.05", "0.0625", "0.001", "0.00025"],
-        ["axis.y", "1", "0", "0", "0", "0"],
+        # From -0.05192 at 0.5 s to 0.001 at 1 s.
+        ["tool.z", "m", "0.05", "0.0625", "0.001", "0.03", "0.00025"],
+        ["axis.y", "1", "0", "0", "0", "0", "0"],
     ]
     assert "off prediction by: the largest deviation from the predicted error" in text
     assert table(text, "constraint force  unit") == [["wall.force", "N", "15.25", "25"]]
@@ -80,7 +81,7 @@ def test_every_figure():
 def test_columns_stand_below_their_heads():
     lines = summary(record(), PREDICTED).splitlines()
     head, first, second, *_ = lines
-    for title in ("start", "largest", "final", "off prediction by"):
+    for title in ("start", "largest", "final", "late rms", "off prediction by"):
         end = head.index(title) + len(title)
         for row in (first, second):
             assert row[end - 1] != " "
@@ -170,7 +171,7 @@ def test_round_off_of_an_output_that_is_zero_is_no_drift():
         desired_output=([[0.5, 0.0], [0.25, 0.0], [0.0, 0.0]], signals),
     )
     text = summary(run, PREDICTED)
-    assert table(text, "tracking error  unit")[1] == ["grasp.mx", "N", "m", "0", "0", "0", "0"]
+    assert table(text, "tracking error  unit")[1] == ["grasp.mx", "N", "m", *"00000"]
     assert verdict(text).startswith("Tracked as predicted")
     run["tracking_error"][1, 1] = 0.1
     assert judge(run, PREDICTED).share == pytest.approx(0.1 / 7.25)
@@ -211,12 +212,24 @@ def test_a_run_that_failed_is_not_called_good():
     assert text.startswith("Interrupted at 1 s; up to there: ")
 
 
-def test_what_no_robot_would_do_is_in_the_verdict():
+def test_what_no_robot_would_do_is_a_shortfall():
     pulling = ([[20.0], [-0.5], [15.25]], [("wall.force", "N")])
     limits = Limits(np.array([7.0, 40.0]), (np.array([-1.0, -2.0]), np.array([0.4, 3.0])))
-    text = verdict(summary(record(constraint_force=pulling, **EXACT), PREDICTED, limits))
-    assert "But wall.force would have to pull, which a contact cannot; motor1 would" in text
-    assert text.endswith("exceed the limits; q would leave the joint limits.")
+    assert shortfalls(record(constraint_force=pulling, **EXACT), limits) == [
+        "wall.force would have to pull, which a contact cannot",
+        "motor1 would exceed the limits",
+        "q would leave the joint limits",
+    ]
+
+
+def test_the_phases_of_a_task():
+    """Roots of the mean squares of straight lines in the second half of each phase."""
+    phases = ([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [("0 Press", ""), ("1 Move", "")])
+    rows = table(summary(record(phase=phases), PREDICTED), "phase  from [s]")
+    assert [row[:4] for row in rows[:2]] == [
+        ["Press", "0", "0.4", "0.038"],
+        ["Move", "0.4", "1", "0.001"],
+    ]
 
 
 def test_without_contact():

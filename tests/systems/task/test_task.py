@@ -47,7 +47,7 @@ from drake_dae import (
     wire_loop,
 )
 from drake_dae.errors import ModelError, SimulationError, WiringError
-from drake_dae.pictures.phases import phase_spans, phases_at
+from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.systems.task.fade import fade
 
 TOUCH = FAR / SPEED + OVER / 2.0

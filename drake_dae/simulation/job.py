@@ -1,0 +1,285 @@
+"""Whether a run did what the user wished: outputs at their references, and nothing violated."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, by_columns
+from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.verdict import output_sizes
+from drake_dae.systems.control.phase_change import PhaseChange
+
+SHARE = 0.01
+"""The tolerance of an output, relative to how far references in its unit move."""
+
+LATE = 0.5
+"""An output must be within its tolerance from this fraction of the run on, or from when it is
+predicted to be, if that is later."""
+
+GRACE = 0.1
+"""So much later than predicted, as a fraction of the run, it may be."""
+
+
+class Outcome(Enum):
+    """Whether a run did its job; the values start the sentence."""
+
+    GOOD = "GOOD"
+    BAD = "BAD"
+    UNDECIDED = "UNDECIDED"
+
+
+@dataclass(frozen=True)
+class OutputQuality:
+    """How well an output followed its reference.
+
+    Attributes:
+        signal: The output.
+        tolerance: The tolerated |z - r|, in its unit.
+        since: The time from which |z - r| stayed within the tolerance, in s; None if it was outside
+            at the end.
+        predicted_since: The same of the predicted error; None if the run is too short for it.
+        largest: The largest |z - r| in the second half of the run.
+        rms: The root mean square of z - r in the second half of the run.
+    """
+
+    signal: Signal
+    tolerance: float
+    since: float | None
+    predicted_since: float | None
+    largest: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class JobVerdict:
+    """Whether a run did its job.
+
+    Attributes:
+        outcome: The outcome.
+        outputs: The quality of each output; none for a task, whose phases have their own ends.
+        problems: What was violated, each in words.
+        remarks: What the user should know besides.
+    """
+
+    outcome: Outcome
+    outputs: tuple[OutputQuality, ...] = ()
+    problems: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        parts = [*self.problems, *self.remarks]
+        return f"{self.outcome.value}: {'; '.join(parts)}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """The verdict as plain data."""
+        return {
+            "outcome": self.outcome.name.lower(),
+            "problems": list(self.problems),
+            "remarks": list(self.remarks),
+            "outputs": {
+                one.signal.name: {
+                    "unit": one.signal.unit,
+                    "tolerance": one.tolerance,
+                    "within_since": one.since,
+                    "largest": one.largest,
+                    "rms": one.rms,
+                }
+                for one in self.outputs
+            },
+        }
+
+
+def judge_job(
+    record: Record,
+    predicted: FloatArray,
+    tolerances: Mapping[str, float] | None = None,
+    violations: Sequence[str] = (),
+    pushing: frozenset[str] | None = frozenset(),
+    changes: Sequence[PhaseChange] = (),
+    is_cut_short: bool = False,
+) -> JobVerdict:
+    """Whether a run did its job.
+
+    Without phases each output must come within its tolerance in the first half of the run, or
+    when the prediction does, and stay there. A run in which a predicted error is still larger at
+    the end is undecided. With phases the last one must have come to its end.
+
+    Args:
+        record: A record with desired_output, tracking_error and constraint_force.
+        predicted: The tracking error by theory, shape (k, p).
+        tolerances: Output name -> tolerated |z - r|. For the others it is 1 % of the range of the
+            references in their unit, or of their largest value where they do not move.
+        violations: What was violated, in words, such as joint limits.
+        pushing: Names of the unilateral constraint forces; None if all are.
+        changes: The starts of phases of a task.
+        is_cut_short: Whether the run failed or was interrupted before its end.
+    """
+    ended = [f"the run broke off at {record.time[-1]:.4g} s"] if is_cut_short else []
+    problems, remarks = [*ended, *violations], list[str]()
+    if changes:
+        undecided = _judge_task(changes, problems, remarks)
+        outputs: tuple[OutputQuality, ...] = ()
+    else:
+        outputs = tuple(_qualities(record, predicted, dict(tolerances or {})))
+        _judge_contacts(record, pushing, problems, remarks)
+        undecided = _judge_outputs(record, outputs, problems, remarks)
+    outcome = Outcome.BAD if problems else Outcome.UNDECIDED if undecided else Outcome.GOOD
+    return JobVerdict(outcome, outputs, tuple(problems), tuple(remarks))
+
+
+def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: list[str]) -> bool:
+    """Whether a task was still going on."""
+    last, count = changes[-1], len({change.place for change in changes})
+    if last.phase == "held":
+        problems.append(f"the task was given up at {last.time:.4g} s, since {last.reason}")
+    elif last.phase == "done":
+        again = len(changes) - count
+        repeated = f", {again} of them again" if again else ""
+        remarks.append(
+            f"the task was done at {last.time:.4g} s, in {len(changes) - 1} phases{repeated}"
+        )
+    else:
+        remarks.append(
+            f"the run ended during phase {last.place + 1}, {last.phase}, which began at "
+            f"{last.time:.4g} s"
+        )
+        return True
+    return False
+
+
+def _judge_contacts(
+    record: Record, pushing: frozenset[str] | None, problems: list[str], remarks: list[str]
+) -> None:
+    """The contacts that were lost: a problem in the second half of a run."""
+    times, forces = record.time, record.signals["constraint_force"]
+    steps, middle = np.diff(times), times[0] + LATE * (times[-1] - times[0])
+    for signal, values in zip(forces.signals, forces.values.T, strict=True):
+        touches = np.flatnonzero(values > 0.0)
+        if pushing is not None and signal.name not in pushing:
+            continue
+        if not touches.size:
+            if values.size > 1 and not values.any():
+                problems.append(f"{signal.name} is 0 all the time")
+            continue
+        lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
+        if lost.size:
+            first = times[lost[0]]
+            text = f"{signal.name} was 0 for {steps[lost].sum():.2g} s, first at {first:.4g} s"
+            (problems if times[lost[-1]] >= middle else remarks).append(text)
+
+
+def _judge_outputs(
+    record: Record,
+    outputs: Sequence[OutputQuality],
+    problems: list[str],
+    remarks: list[str],
+) -> bool:
+    """Whether the run is too short for some output."""
+    times = record.time
+    middle, grace = times[0] + LATE * (times[-1] - times[0]), GRACE * (times[-1] - times[0])
+    short = []
+    for one in outputs:
+        unit = f" {one.signal.unit}".rstrip()
+        size = f"{one.largest:.2g}{unit}, {one.tolerance:.2g}{unit} tolerated"
+        due = None if one.predicted_since is None else max(middle, one.predicted_since + grace)
+        if one.since is not None and (due is None or one.since <= due):
+            continue
+        if due is None:
+            short.append(one.signal.name)
+        elif one.since is None:
+            problems.append(f"{one.signal.name} ends off its reference ({size})")
+        else:
+            problems.append(f"{one.signal.name} is off its reference until {one.since:.3g} s")
+    if short:
+        remarks.append(
+            f"the run is too short: {', '.join(short)} cannot yet be at the reference, by the gains"
+        )
+    settled = [one for one in outputs if one.since is not None]
+    if settled and not problems:
+        worst = max(settled, key=lambda one: one.largest / one.tolerance)
+        since = max(one.since for one in settled if one.since is not None)
+        which = "every output" if len(settled) == len(outputs) else "every other output"
+        unit = f" {worst.signal.unit}".rstrip()
+        remarks.append(
+            f"{which} is at its reference from {since:.3g} s on; in the second half of the run "
+            f"{worst.signal.name} comes closest to its tolerance, with {worst.largest:.2g} of "
+            f"{worst.tolerance:.2g}{unit}"
+        )
+    return bool(short)
+
+
+def _qualities(
+    record: Record, predicted: FloatArray, tolerances: dict[str, float]
+) -> list[OutputQuality]:
+    error = record["tracking_error"]
+    if not error.size:
+        return []
+    signals = record.signals["tracking_error"].signals
+    sizes, rms, found = SHARE * _ranges(record, predicted), late_rms(record.time, error), []
+    first = int(np.searchsorted(record.time, (record.time[0] + record.time[-1]) / 2.0))
+    for i, signal in enumerate(signals):
+        tolerance = tolerances.get(signal.name, float(sizes[i]))
+        found.append(
+            OutputQuality(
+                signal,
+                tolerance,
+                _within_since(record.time, error[:, i], tolerance),
+                _within_since(record.time, predicted[:, i], tolerance),
+                float(np.max(np.abs(error[first:, i]))),
+                float(rms[i]),
+            )
+        )
+    return found
+
+
+def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
+    """How far the references in the unit of each output move, shape (p,), positive."""
+    desired = record["desired_output"]
+    sizes = output_sizes(record, predicted)
+    ranges = desired.max(axis=0) - desired.min(axis=0)
+    units = [signal.unit for signal in record.signals["desired_output"].signals]
+    found = {unit: float(ranges[[u == unit for u in units]].max()) for unit in set(units)}
+    largest = {
+        unit: float(np.abs(desired[:, [u == unit for u in units]]).max()) for unit in set(units)
+    }
+    return np.array(
+        [
+            found[unit] or largest[unit] or size
+            if unit not in ("", "rad")
+            else max(found[unit], 1.0)
+            for unit, size in zip(units, sizes, strict=True)
+        ]
+    )
+
+
+def _within_since(times: FloatArray, error: FloatArray, tolerance: float) -> float | None:
+    """The first time from which |error| stays within the tolerance; None if the last is outside."""
+    outside = np.flatnonzero(~(np.abs(error) <= tolerance))
+    if not outside.size:
+        return float(times[0])
+    return float(times[outside[-1] + 1]) if outside[-1] + 1 < times.size else None
+
+
+def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
+    """Root mean squares over the second half of the time, shape (p,).
+
+    Args:
+        times: The times in s, shape (k,), k >= 1.
+        errors: The errors at these times, shape (k, p); linear between them.
+    """
+    values = by_columns(errors)
+    middle = 0.5 * (times[0] + times[-1])
+    first = int(np.searchsorted(times, middle, side="right"))
+    if first == times.size:
+        return np.abs(values[:, -1])
+    before, after = values[:, first - 1], values[:, first]
+    begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
+    found = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
+    steps = np.diff(np.concatenate([[middle], times[first:]]))
+    squares = (found[:, :-1] ** 2 + found[:, :-1] * found[:, 1:] + found[:, 1:] ** 2) / 3.0
+    sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
+    return sizes

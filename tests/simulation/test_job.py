@@ -1,0 +1,161 @@
+"""Whether a run did its job: the verdict by the user's wish, not by the prediction."""
+
+import numpy as np
+import pytest
+
+from drake_dae import Record
+from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.job import Outcome, judge_job, late_rms
+from drake_dae.simulation.records.record import Recorded
+from drake_dae.systems.control.phase_change import PhaseChange
+
+TIMES = np.linspace(0.0, 10.0, 1001)
+SIGNALS = (Signal("tool.y", "m"), Signal("wall.force", "N"))
+
+
+def run(y_error=0.0, force_error=0.0, force=20.0, unit=1.0):
+    """A circle of 0.1 m with a force of 20 N: 1 % of what they move is 2 mm and 0.2 N."""
+    desired = np.column_stack([unit * 0.1 * np.sin(TIMES), np.full(TIMES.size, 20.0)])
+    error = np.column_stack(np.broadcast_arrays(unit * y_error, force_error, TIMES)[:2])
+    signals = (Signal("tool.y", "m" if unit == 1.0 else "mm"), SIGNALS[1])
+    return Record(
+        TIMES,
+        {
+            "desired_output": Recorded(desired, signals),
+            "tracking_error": Recorded(error, signals),
+            "constraint_force": Recorded(
+                np.broadcast_to(force, TIMES.shape)[:, None].copy(), SIGNALS[1:]
+            ),
+        },
+    )
+
+
+def decaying(rate, start=0.05):
+    return start * np.exp(-rate * TIMES)
+
+
+def judged(record, predicted=None, **options):
+    if predicted is None:
+        predicted = np.zeros_like(record["tracking_error"])
+    return judge_job(record, predicted, pushing=frozenset({"wall.force"}), **options)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_an_error_that_decays_is_good_from_when_it_is_within_the_tolerance(unit):
+    """0.05 e^-t falls below 1 % of 0.2 m at ln 25 = 3.22 s."""
+    record = run(decaying(1.0), unit=unit)
+    found = judged(record, record["tracking_error"])
+    assert found.outcome is Outcome.GOOD
+    y, force = found.outputs
+    assert y.tolerance == pytest.approx(0.002 * unit, rel=1e-4)
+    assert y.since == pytest.approx(np.log(25.0), abs=0.011)
+    assert (force.tolerance, force.since, force.rms) == (0.2, 0.0, 0.0)
+    # The mean of e^-2t from 5 to 10 s is (e^-10 - e^-20) / 10.
+    expected = 0.05 * unit * np.sqrt((np.exp(-10.0) - np.exp(-20.0)) / 10.0)
+    assert y.rms == pytest.approx(expected, rel=1e-4)
+    assert y.largest == pytest.approx(0.05 * unit * np.exp(-5.0))
+    assert "every output is at its reference from 3.22 s on" in str(found)
+
+
+def test_far_from_the_path_is_bad_though_it_is_as_predicted():
+    """A run beside its path is no success, though plant and law agree."""
+    record = run(0.079)
+    found = judged(record)
+    assert found.outcome is Outcome.BAD
+    assert "tool.y ends off its reference (0.079 m, 0.002 m tolerated)" in str(found)
+
+
+def test_near_the_path_is_good_though_it_is_not_as_predicted():
+    found = judged(run(6e-7, np.where(TIMES < 0.2, -20.0, 0.01)))
+    assert found.outcome is Outcome.GOOD
+    assert "wall.force comes closest to its tolerance, with 0.01 of 0.2 N" in str(found)
+
+
+def test_an_error_that_comes_back_is_bad():
+    found = judged(run(np.where((TIMES > 7.0) & (TIMES < 7.5), 0.01, 0.0)))
+    assert found.outcome is Outcome.BAD
+    assert "tool.y is off its reference until 7.5 s" in str(found)
+
+
+def test_a_run_that_is_too_short_is_undecided():
+    """0.05 e^(-0.1 t) is 18 mm at the end, as the gains say."""
+    record = run(decaying(0.1))
+    found = judged(record, record["tracking_error"])
+    assert found.outcome is Outcome.UNDECIDED
+    assert "too short: tool.y" in str(found)
+    assert "every other output" in str(found)
+    # A prediction that decays leaves no such excuse.
+    assert judged(record).outcome is Outcome.BAD
+
+
+def test_what_is_predicted_late_may_be_late():
+    """0.05 e^(-0.45 t) is within 2 mm at 7.15 s."""
+    record = run(decaying(0.45))
+    assert judged(record, record["tracking_error"]).outcome is Outcome.GOOD
+    assert judged(record).outcome is Outcome.BAD
+
+
+def test_the_users_tolerances_come_first():
+    record = run(1e-4)
+    assert judged(record).outcome is Outcome.GOOD
+    found = judged(record, tolerances={"tool.y": 5e-5})
+    assert found.outcome is Outcome.BAD
+    assert judged(record, tolerances={"tool.y": 2e-4}).outcome is Outcome.GOOD
+
+
+def test_a_contact_that_is_lost():
+    """At first it bounces, which is said; later it is a problem."""
+    bounces = run(force=np.where((TIMES > 0.5) & (TIMES <= 0.6), 0.0, 20.0))
+    assert judged(bounces).outcome is Outcome.GOOD
+    assert "wall.force was 0 for 0.1 s, first at 0.51 s" in str(judged(bounces))
+    lost = judged(run(force=np.where(TIMES > 8.0, 0.0, 20.0)))
+    assert lost.outcome is Outcome.BAD
+    assert "wall.force was 0 for 2 s, first at 8.01 s" in str(lost)
+    assert "wall.force is 0 all the time" in str(judged(run(force=0.0)))
+    # Before it is touched it is not lost, and a weld may pull.
+    late = run(force=np.where(TIMES < 4.0, 0.0, 20.0))
+    assert judged(late).outcome is Outcome.GOOD
+    weld = run(force=0.0)
+    assert judge_job(weld, np.zeros_like(weld["tracking_error"])).outcome is Outcome.GOOD
+
+
+def test_violations_and_early_ends_are_bad():
+    found = judged(run(), violations=["joint3 would leave the joint limits"])
+    assert found.outcome is Outcome.BAD
+    assert str(found) == "BAD: joint3 would leave the joint limits."
+    assert "broke off at 10 s" in str(judged(run(), is_cut_short=True))
+
+
+def change(time, phase, place, reason):
+    return PhaseChange(time, phase, place, False, reason, 0.0, 0.1, 0.0)
+
+
+def test_a_task_is_judged_by_its_end():
+    begin = [change(0.0, "Approach", 0, "the task begins"), change(2.0, "Press", 1, "a force")]
+    done = change(4.0, "done", 2, "the end of 2 s")
+    found = judged(run(0.079), changes=[*begin, done])
+    assert (found.outcome, found.outputs) == (Outcome.GOOD, ())
+    assert str(found) == "GOOD: the task was done at 4 s, in 2 phases."
+    held = judged(run(), changes=[*begin, change(4.0, "held", 2, "the contact was lost")])
+    assert str(held) == "BAD: the task was given up at 4 s, since the contact was lost."
+    going_on = judged(run(), changes=begin)
+    assert going_on.outcome is Outcome.UNDECIDED
+    assert "the run ended during phase 2, Press, which began at 2 s" in str(going_on)
+
+
+def test_plain_data():
+    found = judged(run()).to_dict()
+    assert found["outcome"] == "good"
+    assert found["outputs"]["wall.force"] == {
+        "unit": "N",
+        "tolerance": 0.2,
+        "within_since": 0.0,
+        "largest": 0.0,
+        "rms": 0.0,
+    }
+
+
+def test_the_late_size_of_a_straight_line():
+    """Of t on 0 .. 1 from 0.5 on: the root of the mean of t^2, (1 - 1/8) / (3 / 2)."""
+    times = np.array([0.0, 0.3, 1.0])
+    np.testing.assert_allclose(late_rms(times, times[:, None]), np.sqrt(7.0 / 12.0), rtol=1e-14)
