@@ -145,6 +145,33 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         type=_path,
         help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
     )
+    drawn = commands.add_parser(
+        "plot",
+        help="draw signals of runs over each other",
+        description="Draws outputs of runs with their references, or other signals by name, with "
+        "the errors as predicted beside those measured, into one picture.",
+    )
+    drawn.add_argument(
+        "runs", nargs="+", type=_path, metavar="RUN", help="a folder of a run, or a record.npz"
+    )
+    drawn.add_argument(
+        "--signals",
+        action="append",
+        default=[],
+        metavar="NAMES",
+        help="what to draw, as wall.force,control or state/joint1; may be repeated (default: all "
+        "outputs)",
+    )
+    drawn.add_argument(
+        "--errors", action="store_true", help="|z - r| of outputs, over the predicted one"
+    )
+    drawn.add_argument(
+        "--out",
+        type=_path,
+        default=Path("plot.png"),
+        metavar="FILE",
+        help="a .png, .pdf or .svg (default: plot.png)",
+    )
     kept = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)

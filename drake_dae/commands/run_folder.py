@@ -17,12 +17,13 @@ from drake_dae.pictures.profile import PROFILE
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 
 SCENARIO = "scenario.yaml"
+RECORD = "record.npz"
 PART = "record.part"
 """The record during the run, and after a run that was killed."""
 
 ANIMATION = "animation.html"
 
-FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, ANIMATION)
+FILES = (SCENARIO, "summary.txt", RECORD, *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
 FILM = "film.gif"

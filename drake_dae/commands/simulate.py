@@ -24,6 +24,7 @@ from drake_dae.commands.run_folder import (
     FILES,
     MARK,
     PART,
+    RECORD,
     SCENARIO,
     run_folder,
     stage,
@@ -49,7 +50,7 @@ from drake_dae.simulation.job import JobVerdict, Outcome, judge_job
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.phases import phase_spans
-from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
@@ -288,8 +289,10 @@ def _write(run: _CommandRun) -> bool:
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])
         if write.record:
+            signals = record.signals["tracking_error"].signals
+            more = {**record.signals, "predicted_error": Recorded(predicted, signals)}
             with _collected(problems):
-                _write_record(replace(record, about=run.writer.about), run)
+                _write_record(replace(record, signals=more, about=run.writer.about), run)
         with _collected(problems), stage(folder, "summary.txt") as place:
             results = "\n".join([_filled(job), "", text, *run.notes, ""])
             (place / "summary.txt").write_text(results, encoding="utf-8")
@@ -390,8 +393,8 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
 def _write_record(record: Record, run: _CommandRun) -> None:
     writer = run.writer
     try:
-        with stage(run.folder, "record.npz") as place:
-            record.save(place / "record.npz")
+        with stage(run.folder, RECORD) as place:
+            record.save(place / RECORD)
     except OSError as error:
         with suppress(OSError):
             writer.finish(run.context)  # The rows written so far are kept.

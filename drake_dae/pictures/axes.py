@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
 # Of a figure, in inches: the axes' height, or the side of square ones, what is left and right of
 # them for the numbers of their scale, between rows, below the last and above the first; of a
 # legend, a line, what stands before a label, and a letter of it.
-_AXES, _SQUARE, _LEFT, _RIGHT, _GAP, _BOTTOM, _TITLE = 1.4, 3.6, 0.75, 0.2, 0.5, 0.55, 0.25
+_AXES, _SQUARE, _LEFT, _RIGHT, _GAP, _BOTTOM, _TITLE = 1.4, 3.6, 0.85, 0.2, 0.5, 0.55, 0.25
 _LINE, _HANDLE, _LETTER = 0.2, 0.65, 0.075
 
 _RAISED = str.maketrans(

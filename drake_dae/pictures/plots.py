@@ -20,8 +20,7 @@ from drake_dae.pictures.axes import (
     short,
     squares,
 )
-from drake_dae.pictures.event_marks import mark_events, mark_labels
-from drake_dae.pictures.phases import mark_phases
+from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
