@@ -1,30 +1,53 @@
-"""`drake-dae plot`: draws signals of runs over each other."""
+"""`drake-dae plot` and `drake-dae render`: pictures of recorded runs."""
 
 import argparse
 from pathlib import Path
 
-from drake_dae.commands.run_folder import PART, RECORD, stage
+from drake_dae.commands.run_folder import FILM, PART, RECORD, SCENARIO, stage
 from drake_dae.errors import ModelError
+from drake_dae.pictures.film import save_film
 from drake_dae.pictures.runs import plot_runs
+from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.files import load_scenario
 from drake_dae.simulation.records.record import Record
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Draws the runs that the options name; returns the exit code."""
-    if options.out.suffix not in SUFFIXES:
-        raise ModelError(f"a plot is a .png, .pdf or .svg, got '{options.out}'")
-    records = {_label(path, options.runs): load_run(path) for path in options.runs}
-    names = [name for text in options.signals for name in text.split(",") if name]
-    figure = plot_runs(records, names, options.errors)
-    with stage(options.out.parent, options.out.name) as place:
-        figure.savefig(place / options.out.name, dpi=110)
-    print(f"written to {options.out}")
+    """Draws or renders what the options name; returns the exit code."""
+    path = _render(options) if options.command == "render" else _plot(options)
+    print(f"written to {path}")
     return 0
 
 
-def load_run(path: Path) -> Record:
+def _render(options: argparse.Namespace) -> Path:
+    """Films the run in a folder."""
+    folder: Path = options.folder
+    if not (folder / SCENARIO).is_file():
+        raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
+    record = _load(folder)
+    loop, context = build_scenario(load_scenario(folder / SCENARIO, []))
+    path: Path = options.out or folder / FILM
+    with stage(path.parent, path.name) as place:
+        save_film(loop, record, context, place / path.name)
+    return path
+
+
+def _plot(options: argparse.Namespace) -> Path:
+    """Draws signals of runs over each other."""
+    path: Path = options.out
+    if path.suffix not in SUFFIXES:
+        raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
+    records = {_label(run, options.runs): _load(run) for run in options.runs}
+    names = [name for text in options.signals for name in text.split(",") if name]
+    figure = plot_runs(records, names, options.errors)
+    with stage(path.parent, path.name) as place:
+        figure.savefig(place / path.name, dpi=110)
+    return path
+
+
+def _load(path: Path) -> Record:
     """The record of a run.
 
     Args:
