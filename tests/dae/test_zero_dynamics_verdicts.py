@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae import analyze
@@ -167,7 +168,7 @@ AT_INFINITY = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", AT_INFINITY)
-@pytest.mark.parametrize("others", [0, 1, 2])
+@pytest.mark.parametrize("others", some([0, 1, 2]))
 def test_what_only_falls_is_no_equilibrium(name, others):
     """Alone, beside a state that decays, and beside an oscillation that does."""
     rate = AT_INFINITY[name]
@@ -196,7 +197,7 @@ DEGENERATE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("others", [0, 1])
+@pytest.mark.parametrize("others", [0, pytest.param(1, marks=pytest.mark.thorough)])
 def test_an_equilibrium_without_a_slope_is_one(name, others):
     """However many searches end near it, and its linearization decides nothing."""
     rate, places = DEGENERATE[name]

@@ -1,5 +1,6 @@
 """Scenarios and closed loops, run into records."""
 
+import shutil
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
@@ -13,6 +14,18 @@ from pydrake.systems.framework import Context
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
 from drake_dae.scenario.scenario import Scenario, scenario_schema
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
+
+with_compiler = pytest.param(
+    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+)
+
+both = pytest.mark.parametrize("compiled", [False, with_compiler])
+"""Interpreted, and as machine code."""
+
+mostly_compiled = pytest.mark.parametrize(
+    "compiled", [pytest.param(False, marks=pytest.mark.thorough), with_compiler]
+)
+"""As machine code; interpreted where all is tested, since other tests compare both."""
 
 DEAR = (
     "three_fingers",
@@ -47,8 +60,12 @@ def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
 
 def some(cases: Iterable[Any]) -> list[ParameterSet]:
     """Cases of which every second one is thorough: they show the same."""
-    marks = ([], [pytest.mark.thorough])
-    return [pytest.param(case, marks=marks[i % 2]) for i, case in enumerate(cases)]
+    found = []
+    for i, case in enumerate(cases):
+        given = case if isinstance(case, ParameterSet) else pytest.param(case)
+        marks = [*given.marks, *[pytest.mark.thorough] * (i % 2)]
+        found.append(pytest.param(*given.values, marks=marks, id=given.id))
+    return found
 
 
 def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:

@@ -8,6 +8,7 @@ import pytest
 from arms import consistent_states, error_controlled, fixed_step, numbers, parse, touching
 from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable
+from runs import some
 
 from drake_dae import (
     JointPositions,
@@ -117,7 +118,7 @@ def scenario_run(name, accuracy, *settings, duration=2.0):
     return loop, loop.record(context)
 
 
-@pytest.mark.parametrize("friction", [0.3, 0.8])
+@pytest.mark.parametrize("friction", some([0.3, 0.8]))
 @pytest.mark.parametrize(
     ("name", "tolerance"),
     [

@@ -11,6 +11,7 @@ import pytest
 from members import Saddle, subclasses
 from meshes import obj_of_grid
 from pydrake import geometry
+from runs import some
 
 from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
@@ -125,7 +126,7 @@ def test_coordinates_that_there_are_not_are_refused(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", some(SURFACES))
 def test_any_surface_is_drawn_from_its_distance_alone(name):
     """As `Surface` does where a class has no shape of its own: around a point, on the surface."""
     surface, size = SURFACES[name], 0.4

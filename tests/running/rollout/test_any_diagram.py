@@ -25,15 +25,11 @@ from pydrake.systems.primitives import (
     WrapToSystem,
     ZeroOrderHold,
 )
+from runs import both
 from scipy.linalg import expm
 
 from drake_dae import export_code, rollout, start_values
 from drake_dae.errors import ModelError
-
-with_compiler = pytest.param(
-    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-)
-both = pytest.mark.parametrize("compiled", [False, with_compiler])
 
 
 def fixed(step=1e-3):

@@ -1,12 +1,10 @@
 """Loops on Drake's own contact, rolled out, against Drake's Simulator."""
 
-import shutil
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
-from runs import first_quick, run_scenario, scenario
+from runs import first_quick, mostly_compiled, run_scenario, scenario
 
 from drake_dae import build_scenario, rollout, start_values
 from drake_dae.errors import ModelError, SimulationError
@@ -47,18 +45,12 @@ LOOPS = {
 }
 
 
-with_compiler = pytest.param(
-    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-)
-both = pytest.mark.parametrize("compiled", [False, with_compiler])
-
-
 def chosen(name, duration=0.06):
     robot, *settings = LOOPS[name]
     return scenario(robot, *settings, f"duration={duration}")
 
 
-@both
+@mostly_compiled
 @pytest.mark.parametrize("name", first_quick(LOOPS))
 def test_the_record_is_that_of_simulate(name, compiled):
     """Drake makes the same steps of the plant in both, so that only round-off differs.

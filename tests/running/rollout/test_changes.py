@@ -10,7 +10,7 @@ from polishing import CLIMB, push, run_on, started, task_loop
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from runs import first_quick, run, scenario
+from runs import both, first_quick, mostly_compiled, run, scenario
 
 from drake_dae import (
     Approach,
@@ -30,11 +30,6 @@ from drake_dae import (
 )
 from drake_dae.errors import InconsistentStateError, ModelError, PainleveError, SimulationError
 from drake_dae.running.rollout.program import program_of
-
-with_compiler = pytest.param(
-    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-)
-both = pytest.mark.parametrize("compiled", [False, with_compiler])
 
 FIXED = (
     "use_error_control=false",
@@ -88,7 +83,7 @@ def assert_same_records(found, wanted, tolerance, before, changes=()):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     ("words", "settings", "duration"),
     [
@@ -157,7 +152,7 @@ TASKS = {
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize("name", TASKS)
 def test_tasks_are_those_of_drake(name, compiled):
     """To 1e-9: when each phase begins and why, and all signals; or why the run fails."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.trajectories import PiecewisePolynomial
-from runs import each_scenario, run, scenario
+from runs import both, each_scenario, run, scenario
 
 from drake_dae import (
     ConstantReference,
@@ -33,11 +33,6 @@ from drake_dae.errors import (
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import run_loop
 from drake_dae.scenario.rolled import roll_scenario
-
-with_compiler = pytest.param(
-    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-)
-both = pytest.mark.parametrize("compiled", [False, with_compiler])
 
 COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}
 """Those that are also made machine code; others take the compiler longer."""
