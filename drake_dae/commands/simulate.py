@@ -260,6 +260,7 @@ def _write(run: _CommandRun) -> bool:
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, bound
         )
         changes = loop.changes(run.context)
+        stopped = stop_remarks(run.statistics, run.scenario.duration) if changes else []
         interrupted = run.statistics is not None and run.statistics.interrupted is not None
         job = judge_job(
             record,
@@ -268,7 +269,7 @@ def _write(run: _CommandRun) -> bool:
             [*shortfalls(record, limits), *map(str, behind)],
             limits.pushing,
             changes,
-            is_cut_short=bool(run.failure) or interrupted,
+            is_cut_short=bool(run.failure or stopped) or interrupted,
         )
         verdict = judge(record, predicted, accuracy)
         is_unexplained = verdict.tracking is Tracking.OFF and not reasons
@@ -286,7 +287,6 @@ def _write(run: _CommandRun) -> bool:
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         text = "\n".join([text, *reference_remarks(followed)])
         if changes:
-            stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])
         if write.record:
             signals = record.signals["tracking_error"].signals

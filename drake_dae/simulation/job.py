@@ -71,7 +71,7 @@ class JobVerdict:
     remarks: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        parts = [*self.problems, *self.remarks]
+        parts = [*self.problems, *self.remarks] or ["there is no output, and nothing is violated"]
         return f"{self.outcome.value}: {'; '.join(parts)}."
 
     def to_dict(self) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
     """Whether a task was still going on."""
     last, count = changes[-1], len({change.place for change in changes})
     if last.phase == "held":
-        problems.append(f"the task was given up at {last.time:.4g} s, since {last.reason}")
+        problems.append(f"the task was given up at {last.time:.4g} s: {last.reason}")
     elif last.phase == "done":
         again = len(changes) - count
         repeated = f", {again} of them again" if again else ""
@@ -183,17 +183,20 @@ def _judge_outputs(
     middle, grace = times[0] + LATE * (times[-1] - times[0]), GRACE * (times[-1] - times[0])
     short = []
     for one in outputs:
-        unit = f" {one.signal.unit}".rstrip()
-        size = f"{one.largest:.2g}{unit}, {one.tolerance:.2g}{unit} tolerated"
         due = None if one.predicted_since is None else max(middle, one.predicted_since + grace)
         if one.since is not None and (due is None or one.since <= due):
             continue
         if due is None:
             short.append(one.signal.name)
-        elif one.since is None:
-            problems.append(f"{one.signal.name} ends off its reference ({size})")
-        else:
-            problems.append(f"{one.signal.name} is off its reference until {one.since:.3g} s")
+            continue
+        unit = f" {one.signal.unit}".rstrip()
+        when = "ends off its reference"
+        if one.since is not None:
+            when = f"is off its reference until {one.since:.3g} s"
+        problems.append(
+            f"{one.signal.name} {when}, by up to {one.largest:.2g}{unit} in the second half of the "
+            f"run ({one.tolerance:.2g}{unit} tolerated)"
+        )
     if short:
         remarks.append(
             f"the run is too short: {', '.join(short)} cannot yet be at the reference, by the gains"

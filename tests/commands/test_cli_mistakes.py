@@ -207,7 +207,7 @@ def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monke
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
     assert main([*arguments, "--set", "write.plots=false"]) == 0
     assert (tmp_path / "animation.html").exists()
-    assert seen[1:] == [seen[0], seen[0]]
+    assert seen[1] | seen[2] <= seen[0]  # One of an earlier test may have been closed.
     assert main([*arguments, *QUICK, "--meshcat"]) == 0
     assert len(seen[3] - seen[0]) == 1
     capsys.readouterr()

@@ -62,7 +62,10 @@ def test_far_from_the_path_is_bad_though_it_is_as_predicted():
     record = run(0.079)
     found = judged(record)
     assert found.outcome is Outcome.BAD
-    assert "tool.y ends off its reference (0.079 m, 0.002 m tolerated)" in str(found)
+    assert str(found) == (
+        "BAD: tool.y ends off its reference, by up to 0.079 m in the second half of the run "
+        "(0.002 m tolerated)."
+    )
 
 
 def test_near_the_path_is_good_though_it_is_not_as_predicted():
@@ -74,7 +77,7 @@ def test_near_the_path_is_good_though_it_is_not_as_predicted():
 def test_an_error_that_comes_back_is_bad():
     found = judged(run(np.where((TIMES > 7.0) & (TIMES < 7.5), 0.01, 0.0)))
     assert found.outcome is Outcome.BAD
-    assert "tool.y is off its reference until 7.5 s" in str(found)
+    assert "tool.y is off its reference until 7.5 s, by up to 0.01 m in the second" in str(found)
 
 
 def test_a_run_that_is_too_short_is_undecided():
@@ -137,10 +140,28 @@ def test_a_task_is_judged_by_its_end():
     assert (found.outcome, found.outputs) == (Outcome.GOOD, ())
     assert str(found) == "GOOD: the task was done at 4 s, in 2 phases."
     held = judged(run(), changes=[*begin, change(4.0, "held", 2, "the contact was lost")])
-    assert str(held) == "BAD: the task was given up at 4 s, since the contact was lost."
+    assert str(held) == "BAD: the task was given up at 4 s: the contact was lost."
     going_on = judged(run(), changes=begin)
     assert going_on.outcome is Outcome.UNDECIDED
     assert "the run ended during phase 2, Press, which began at 2 s" in str(going_on)
+
+
+def test_a_task_that_begins_again_says_so():
+    names = ["Approach", "Press", "Approach", "Press", "done"]
+    changes = [
+        change(1.0 * i, name, place, "why")
+        for i, (name, place) in enumerate(zip(names, [0, 1, 0, 1, 2], strict=True))
+    ]
+    found = str(judged(run(), changes=changes))
+    assert found == "GOOD: the task was done at 4 s, in 4 phases, 2 of them again."
+
+
+def test_a_run_without_outputs():
+    empty = Recorded(np.zeros((TIMES.size, 0)), ())
+    names = ("desired_output", "tracking_error", "constraint_force")
+    record = Record(TIMES, dict.fromkeys(names, empty))
+    found = str(judge_job(record, np.zeros((TIMES.size, 0))))
+    assert found == "GOOD: there is no output, and nothing is violated."
 
 
 def test_plain_data():
