@@ -25,6 +25,7 @@ from .dae.references import CircleReference as CircleReference
 from .dae.references import ConstantReference as ConstantReference
 from .dae.references import CsvReference as CsvReference
 from .dae.references import ExpressionReference as ExpressionReference
+from .dae.references import GCodeReference as GCodeReference
 from .dae.references import LineReference as LineReference
 from .dae.references import PathLimits as PathLimits
 from .dae.references import PointToPointReference as PointToPointReference

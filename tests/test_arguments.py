@@ -411,6 +411,10 @@ PLACES: dict[str, Callable[[], Any]] = {
     ),
     "columns of CsvReference": lambda: ["x"],
     "origin of TextReference": lambda: [0.0, 0.0],
+    "file of GCodeReference": lambda: str(
+        Path(__file__).parent / "systems" / "control" / "program.nc"
+    ),
+    "origin of GCodeReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
     "degrees of references_by_name": lambda: [1],
     "q": lambda: ca.SX.sym("q"),

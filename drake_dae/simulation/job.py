@@ -10,7 +10,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.verdict import output_sizes
+from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 from drake_dae.systems.control.phase_change import PhaseChange
 
 SHARE = 0.01
@@ -244,6 +244,7 @@ def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
     desired = record["desired_output"]
     sizes = output_sizes(record, predicted)
     ranges = desired.max(axis=0) - desired.min(axis=0)
+    ranges[ranges <= ROUND_OFF * sizes] = 0.0
     units = [signal.unit for signal in record.signals["desired_output"].signals]
     found = {unit: float(ranges[[u == unit for u in units]].max()) for unit in set(units)}
     largest = {

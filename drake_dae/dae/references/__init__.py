@@ -8,6 +8,7 @@ from drake_dae.dae.references.formulas import (
     PointToPointReference,
     SinusoidReference,
 )
+from drake_dae.dae.references.gcode.gcode import GCodeReference
 from drake_dae.dae.references.paths import CircleReference, LineReference, SpiralReference
 from drake_dae.dae.references.reference import Reference, stack_references
 from drake_dae.dae.references.splines import PolylineReference
@@ -20,6 +21,7 @@ __all__ = [
     "ConstantReference",
     "CsvReference",
     "ExpressionReference",
+    "GCodeReference",
     "LineReference",
     "PathLimits",
     "PointToPointReference",

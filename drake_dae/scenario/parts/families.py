@@ -82,6 +82,7 @@ Reference = Annotated[
     | Annotated[references.PolylineReference, Form(tag="!Polyline")]
     | Annotated[references.WaypointsReference, Form(tag="!Waypoints")]
     | Annotated[references.CsvReference, Form(tag="!Csv")]
+    | Annotated[references.GCodeReference, Form(tag="!GCode")]
     | Annotated[references.TextReference, Form(tag="!Text")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]

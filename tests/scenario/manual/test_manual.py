@@ -40,6 +40,8 @@ PURE = {
     ("!ForceCombination", "weights"),
     ("!Circle", "turns"),
     ("!Csv", "tolerance"),
+    ("!GCode", "along"),
+    ("!GCode", "up"),
     ("!Text", "along"),
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),

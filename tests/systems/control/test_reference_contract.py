@@ -15,6 +15,7 @@ from drake_dae import (
     ConstantReference,
     CsvReference,
     ExpressionReference,
+    GCodeReference,
     LineReference,
     MotionLimits,
     PathLimits,
@@ -80,6 +81,7 @@ MEMBERS = {
     "file": CsvReference(
         str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2
     ),
+    "program": GCodeReference(str(Path(__file__).parent / "program.nc"), LIMITS, tolerance=0.05),
     "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),

@@ -1,0 +1,1 @@
+"""References from programs of machine tools, in G-code."""

@@ -1,0 +1,205 @@
+"""Programs in G-code: what they move, and the reference over it."""
+
+import numpy as np
+import pytest
+
+from drake_dae import GCodeReference, PathLimits
+from drake_dae.dae.references.gcode.program import read_program
+from drake_dae.errors import ReferenceSignalError
+
+LIMITS = PathLimits(0.2, 2.0)
+SHARES = np.linspace(0.0, 1.0, 101)
+
+PLATE = """
+%
+N10 (a plate) g21 G90 G17 ; millimetres
+M3 S1000
+G0 Z5 X0 Y0
+G1 Z-1 F6000
+X80
+G3 X80 Y80 J40 F4500
+G1 X0
+G3 X0 Y0 J-40
+G0 X0 Y40
+G1 X80 F3000
+M30
+G1 X1000
+"""
+
+
+def moves(text):
+    return read_program(text, "a.nc").moves
+
+
+def test_lines_arcs_feeds_and_the_end():
+    program = read_program(PLATE, "a.nc")
+    ends = [move.end.tolist() for move in program.moves]
+    expected = [[0.08, 0.0], [0.08, 0.08], [0.0, 0.08], [0.0, 0.0], [0.0, 0.04], [0.08, 0.04]]
+    np.testing.assert_allclose(ends, expected, atol=1e-15)
+    speeds = [move.speed for move in program.moves]
+    np.testing.assert_allclose(speeds, [0.1, 0.075, 0.075, 0.075, np.inf, 0.05], rtol=1e-15)
+    half = np.pi * 0.04
+    lengths = [move.length for move in program.moves]
+    np.testing.assert_allclose(lengths, [0.08, half, 0.08, half, 0.04, 0.08], rtol=1e-14)
+    assert program.ignored == ("M3", "S", "Z")
+    # Each begins where the one before ends.
+    for before, after in zip(program.moves, program.moves[1:], strict=False):
+        np.testing.assert_array_equal(before.end, after.start)
+
+
+@pytest.mark.parametrize(
+    ("text", "center", "sweep"),
+    [
+        ("G2 X20 I10", (10, 0), -np.pi),
+        ("G3 X20 I10", (10, 0), np.pi),
+        ("G3 X10 Y10 J10", (0, 10), np.pi / 2),
+        ("G2 X10 Y10 J10", (0, 10), -3 * np.pi / 2),
+        ("G3 I10", (10, 0), 2 * np.pi),
+        ("G2 X0 Y0 I10", (10, 0), -2 * np.pi),
+        # By the radius: below half a turn, or above it where it is negative.
+        ("G3 X10 Y10 R10", (0, 10), np.pi / 2),
+        ("G3 X10 Y10 R-10", (10, 0), 3 * np.pi / 2),
+        ("G2 X10 Y10 R10", (10, 0), -np.pi / 2),
+        ("G2 X10 Y10 R-10", (0, 10), -3 * np.pi / 2),
+    ],
+)
+def test_arcs(text, center, sweep):
+    (move,) = moves(f"G1 F600 {text}" if text.startswith("G1") else f"F600 {text}")
+    np.testing.assert_allclose(move.center, np.array(center) / 1000, atol=1e-15)
+    assert move.sweep == pytest.approx(sweep)
+    points = move.at(SHARES)
+    np.testing.assert_allclose(points[[0, -1]], [move.start, move.end], atol=1e-15)
+    np.testing.assert_allclose(
+        np.linalg.norm(points - move.center, axis=1), move.radius, rtol=1e-12
+    )
+    # The directions are those of differences, which are off by a hundredth of half a turn or less.
+    for share, pair in ((0.0, points[:2]), (1.0, points[-2:])):
+        chord = np.diff(pair, axis=0)[0]
+        assert move.direction(share) @ chord / np.linalg.norm(chord) > 0.999
+
+
+def test_inches_and_increments():
+    inch, mm = moves("G20 G91 F60\nG0 X1 Y1\nG1 X1\nG21\nY25.4")
+    np.testing.assert_allclose(inch.start, [0.0254, 0.0254], rtol=1e-15)
+    np.testing.assert_allclose(inch.end, [0.0508, 0.0254], rtol=1e-15)
+    assert inch.speed == pytest.approx(0.0254)
+    np.testing.assert_allclose(mm.end, [0.0508, 0.0508], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("G1 X1", "line 1: G1 before any F"),
+        ("F100\nX1", "line 2: coordinates before any G0, G1, G2 or G3"),
+        ("G43 H1", "line 1: H is not followed"),
+        ("G43", "line 1: G43 is not followed; lines and arcs"),
+        ("G18", "G18 is not followed"),
+        ("M98 P3", "P is not followed"),
+        ("M6", "M6 is not followed"),
+        ("G1 X1 X2 F1", "X occurs twice"),
+        ("G1 X#1 F1", "'X#1' is not understood"),
+        ("G1 X1 F0", "F must be positive, got 0"),
+        ("G1 X1 I3 F9", "I, J and R are those of arcs"),
+        ("G2 X1 F9", "an arc needs its center by I and J, or its radius R"),
+        ("G2 X10 I3 F9", "the arc begins 0.003 m from its center and ends 0.007 m from it"),
+        ("G2 X10 R3 F9", "no arc of radius 0.003 m joins two points 0.01 m apart"),
+        ("G2 X10 R9 I3 F9", "either R, or I and J"),
+        ("G1 X1e9 F9", "'E9' is not understood|E is not followed"),
+        ("G1 X9999999999 F9", "X must be below 1e9, got 9999999999"),
+        ("(nothing)", "'a.nc' moves nothing along X or Y"),
+        ("G0 X5 Y5", "'a.nc' moves nothing"),
+    ],
+)
+def test_what_is_not_followed_is_refused_with_its_line(text, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        moves(text)
+
+
+@pytest.fixture
+def file(tmp_path):
+    found = tmp_path / "plate.nc"
+    found.write_text(PLATE, encoding="utf-8")
+    return str(found)
+
+
+def samples(reference, degree, count=6001):
+    function = reference.derivatives([degree] * reference.size)
+    times = np.linspace(0.0, reference.spline.duration, count)
+    values = np.array([function(time) for time in times])
+    return times, values.reshape(count, reference.size, degree + 1)
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+def test_the_path_is_within_the_tolerance_and_the_motion_within_limits(file, tolerance, order):
+    """By the distances of 600 points of the path from 6,001 of the motion.
+
+    The motion is nearer than its nearest point, which is at most half of their distance beside.
+    """
+    reference = GCodeReference(file, LIMITS, tolerance=tolerance, order=order)
+    _, values = samples(reference, 2)
+    curve = values[:, :, 0]
+    points = np.concatenate([move.at(SHARES) for move in reference.program.moves])
+    off = np.array([np.linalg.norm(curve - point, axis=1).min() for point in points])
+    spacing = np.linalg.norm(np.diff(curve, axis=0), axis=1).max()
+    assert np.max(off) <= np.hypot(tolerance, spacing / 2.0)
+    assert reference.deviation <= tolerance
+    assert reference.deviation > 0.5 * tolerance
+    np.testing.assert_allclose(curve[[0, -1]], points[[0, -1]], atol=1e-12)
+    speeds, accelerations = (np.linalg.norm(values[:, :, k], axis=1).max() for k in (1, 2))
+    assert speeds <= LIMITS.speed * (1.0 + 1e-9)
+    assert accelerations <= LIMITS.acceleration * (1.0 + 1e-9)
+
+
+def test_feeds_are_those_programmed(tmp_path):
+    """In the middle of a line of 0.4 m the speed is the feed of 0.12 m/s.
+
+    The corners at both ends use the peak of a B-spline by a normal distribution, within 1 %: by so
+    much the whole motion may be slowed.
+    """
+    file = tmp_path / "line.nc"
+    file.write_text("G1 X400 F7200")
+    reference = GCodeReference(str(file), LIMITS)
+    times, values = samples(reference, 1)
+    middle = np.abs(times / times[-1] - 0.5) < 0.2
+    np.testing.assert_allclose(values[middle, 0, 1], 0.12, rtol=1e-2)
+    assert np.ptp(values[middle, 0, 1]) < 1e-9
+    np.testing.assert_allclose(values[:, 1], 0.0, atol=1e-15)
+    # The rise from rest to the feed and back takes the rest of the time.
+    assert 0.4 / 0.12 < reference.spline.duration < 0.4 / 0.12 + 0.3
+    assert np.linalg.norm(samples(reference, 2)[1][:, :, 2], axis=1).max() <= 2.0 * (1.0 + 1e-9)
+
+
+def test_place_force_and_slower_limits(file):
+    reference = GCodeReference(
+        file, LIMITS, origin=[0.1, 0.2], along=[0.0, 1.0], up=[-1.0, 0.0], press=[15.0, 5.0]
+    )
+    assert reference.size == 3
+    plain = GCodeReference(file, LIMITS)
+    _, values = samples(reference, 0, 501)
+    _, own = samples(plain, 0, 501)
+    turned = np.column_stack([0.1 - own[:, 1, 0], 0.2 + own[:, 0, 0]])
+    np.testing.assert_allclose(values[:, :2, 0], turned, atol=1e-12)
+    assert values[:, 2, 0].max() == pytest.approx(15.0)
+    assert values[:, 2, 0].min() == pytest.approx(5.0)
+    slower = GCodeReference(file, PathLimits(0.2, 2.0, 5.0))
+    _, values = samples(slower, 3)
+    assert np.linalg.norm(values[:, :, 3], axis=1).max() <= 5.0 * (1.0 + 1e-9)
+    assert slower.spline.duration > plain.spline.duration
+    assert "Z not followed" in plain.remark
+    assert f"takes {plain.spline.duration:.3g} s" in plain.remark
+
+
+def test_wrong_numbers_and_files(file, tmp_path):
+    for given, message in (
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"tolerance": 1e-9}, "needs .* points, and 20,000 are the most"),
+        ({"along": [1, 0], "up": [2, 0]}, "along and up must be two directions"),
+        ({"order": 1}, "order must be from 2 to 12"),
+        ({"file": str(tmp_path)}, "cannot read"),
+        ({"file": str(tmp_path / "none.nc")}, "No such file"),
+    ):
+        with pytest.raises(ReferenceSignalError, match=message):
+            GCodeReference(**{"file": file, "limits": LIMITS, **given}).derivatives([2, 2])
+    beside = GCodeReference("plate.nc", LIMITS).beside(tmp_path)
+    assert beside.file == file
