@@ -203,3 +203,37 @@ def test_wrong_numbers_and_files(file, tmp_path):
             GCodeReference(**{"file": file, "limits": LIMITS, **given}).derivatives([2, 2])
     beside = GCodeReference("plate.nc", LIMITS).beside(tmp_path)
     assert beside.file == file
+
+
+def test_an_arc_of_many_short_lines_is_as_fast_as_an_arc(tmp_path):
+    """As programs of CAM have them: 400 lines of 0.8 mm on a circle."""
+    angles = 2.0 * np.pi * np.arange(1, 401) / 400
+    lines = [f"X{50 * np.cos(a) - 50:.4f} Y{50 * np.sin(a):.4f}" for a in angles]
+    for name, text in (("lines", "\n".join(lines)), ("arc", "G3 X0 Y0 I-50")):
+        (tmp_path / f"{name}.nc").write_text(f"G1 F12000\n{text}\n")
+    lines, arc = (
+        GCodeReference(str(tmp_path / f"{name}.nc"), PathLimits(0.2, 1.0))
+        for name in ("lines", "arc")
+    )
+    assert max(lines.deviation, arc.deviation) <= 1e-4
+    assert 0.7 < lines.spline.duration / arc.spline.duration < 1.3
+    _, values = samples(lines, 2, 1001)
+    assert np.linalg.norm(values[:, :, 2], axis=1).max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_damaged_program_is_refused_or_followed_within_the_tolerance(seed, tmp_path):
+    choice = np.random.default_rng(seed)
+    text = list(PLATE)
+    for _ in range(choice.integers(1, 5)):
+        place, letter = choice.integers(len(text)), choice.choice(list("GXYIJRFMZ()-.0159 \n"))
+        text[place : place + choice.integers(2)] = [letter] * choice.integers(2)
+    file = tmp_path / "damaged.nc"
+    file.write_text("".join(text))
+    reference = GCodeReference(str(file), LIMITS)
+    try:
+        _, values = samples(reference, 2, 51)
+    except ReferenceSignalError:
+        return
+    assert np.isfinite(values).all()
+    assert reference.deviation <= 1e-4

@@ -183,7 +183,7 @@ class _Path:
         self.moves, self._speeds = moves, speeds
         self.ends = np.concatenate([[0.0], np.cumsum([move.length for move in moves])])
         parts = [
-            np.linspace(first, last, max(8, int(NODES * (last - first) / self.ends[-1])))[1:]
+            np.linspace(first, last, max(3, int(NODES * (last - first) / self.ends[-1])))[1:]
             for first, last in pairwise(self.ends)
         ]
         self.distances = np.concatenate([[0.0], *parts])
