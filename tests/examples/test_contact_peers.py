@@ -139,7 +139,7 @@ def test_law_on_its_goal_asks_for_what_the_motion_takes(robot, law):
     assert_allclose(built.GetOutputPort("control").Eval(context), wanted, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_force_of_the_hybrid_law_converges():
     """State and reference are of one instant: the tool goes on by 0.1 mm in a sample."""
     found = run_law(CONDITIONS[0], Hybrid, load_gains()[_name(Hybrid)], FRICTION, 1.3, 1.0)

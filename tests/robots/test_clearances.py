@@ -62,4 +62,4 @@ def test_analysis_and_summary_tell_it(tmp_path, capsys):
     options = [word for setting in settings for word in ("--set", setting)]
     main(["simulate", "two_link_wall", *options, "--out", str(tmp_path / "run")])
     told = " ".join(capsys.readouterr().out.split())
-    assert "But link2 is behind the surface of 'wall' from 0 s on" in told
+    assert "BAD: link2 is behind the surface of 'wall' from 0 s on" in told

@@ -65,7 +65,7 @@ def test_a_cone_that_is_none(cone, text):
         FrictionCone(**cone)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_held_box_does_not_slide_in_the_time_optimal_motion():
     """Two arms carry a box; how they press along and across it follows from Newton's law."""
     scenario = load_scenario(find_scenario("two_arms_free_box"))

@@ -14,7 +14,7 @@ VARIATIONS = dd.grid_variations(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_two_workers_give_the_table_of_processes(tmp_path):
     """Whoever runs them; and what processes began, a cluster ends."""
     distributed = pytest.importorskip("distributed")

@@ -200,8 +200,8 @@ def test_a_run_whose_process_died_is_tried_again_and_no_other(outcome, tmp_path)
     assert lines(file) == 4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stopped", [True, pytest.param(False, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("stopped", [True, False])
 def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
     """Its process is stopped, or it runs against the clock, 10,000 s; other runs are not lost."""
     rates = [0.0, 0.05 if stopped else 0.00005, 0.0]

@@ -58,12 +58,12 @@ def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
     ]
 
 
-def some(cases: Iterable[Any]) -> list[ParameterSet]:
-    """Cases of which every second one is thorough: they show the same."""
+def some(cases: Iterable[Any], of: int = 2) -> list[ParameterSet]:
+    """Cases of which all but one in so many are thorough: they show the same."""
     found = []
     for i, case in enumerate(cases):
         given = case if isinstance(case, ParameterSet) else pytest.param(case)
-        marks = [*given.marks, *[pytest.mark.thorough] * (i % 2)]
+        marks = [*given.marks, *[pytest.mark.thorough] * (i % of > 0)]
         found.append(pytest.param(*given.values, marks=marks, id=given.id))
     return found
 

@@ -127,7 +127,7 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(5)))
+@pytest.mark.parametrize("seed", some(range(5), of=5))
 def test_units_do_not_matter(problem, seed):
     """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
 

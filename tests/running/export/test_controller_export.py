@@ -62,7 +62,9 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         pytest.param("seven_joint_moving_plate", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", (), marks=pytest.mark.slow),
-        pytest.param("wall_point_contact", ("sampling=null",), marks=pytest.mark.slow),
+        pytest.param(
+            "wall_point_contact", ("sampling=null",), marks=[pytest.mark.slow, pytest.mark.thorough]
+        ),
         pytest.param("wall_flexible_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
     ],
 )

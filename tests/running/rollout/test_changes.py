@@ -10,7 +10,7 @@ from polishing import CLIMB, push, run_on, started, task_loop
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from runs import both, first_quick, mostly_compiled, run, scenario
+from runs import both, first_quick, mostly_compiled, run, scenario, some
 
 from drake_dae import (
     Approach,
@@ -153,7 +153,7 @@ TASKS = {
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", some(TASKS))
 def test_tasks_are_those_of_drake(name, compiled):
     """To 1e-9: when each phase begins and why, and all signals; or why the run fails."""
     loop, context = TASKS[name]()
@@ -226,7 +226,7 @@ FALLING = {
 }
 
 
-@both
+@mostly_compiled
 @pytest.mark.parametrize("name", first_quick(FALLING))
 def test_bodies_fall_as_in_drake(name, compiled):
     """To 1e-9 at the end, of a plant without a law and without a loop."""

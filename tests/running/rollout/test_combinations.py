@@ -73,7 +73,7 @@ CASES = list(product(*PARTS))
 @pytest.mark.parametrize(
     "names",
     [
-        pytest.param(names, marks=[] if index % 11 == 0 else [pytest.mark.thorough])
+        pytest.param(names, marks=[] if index % 22 == 0 else [pytest.mark.thorough])
         for index, names in enumerate(CASES)
     ],
     ids=", ".join,

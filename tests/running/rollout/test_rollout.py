@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.trajectories import PiecewisePolynomial
-from runs import both, each_scenario, run, scenario
+from runs import both, each_scenario, mostly_compiled, run, scenario
 
 from drake_dae import (
     ConstantReference,
@@ -65,7 +65,7 @@ def assert_equal_records(found, wanted, tolerance) -> None:
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     ("name", "scheme"),
     [

@@ -6,7 +6,7 @@ from actuated import actuated, at_rest, drive, output_bias, rates, start_positio
 from arms import arm, fixed_step, numbers
 from numpy.testing import assert_allclose
 from pydrake.multibody.plant import MultibodyPlant
-from runs import scenario
+from runs import scenario, some
 from scenario_texts import run
 
 from drake_dae import (
@@ -165,7 +165,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", some(CASES))
 def test_contact_is_kept_and_tracked_behind_springs(name):
     """What was asked of it, rms from 2 s on in mm and N; the law of four derivatives loses all but
     the first. The reversals are at 1.6 and 4.7 s."""
