@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, positive
+from drake_dae.arrays import FloatArray, numbers, positive, vector
 from drake_dae.dae.references.paths import check_order
 from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
 from drake_dae.dae.references.travel import PathLimits
@@ -207,6 +207,22 @@ def settle_points(reference: Any) -> FloatArray:
         place = int(np.argmin(lengths))
         raise ReferenceSignalError(f"points {place} and {place + 1} are the same, {rows[place]}")
     return points
+
+
+def settle_axes(reference: Any) -> None:
+    """Makes the fields of a drawing in a plane, and its two forces, pairs of numbers.
+
+    Raises:
+        ReferenceSignalError: They are none, or `along` and `up` are not two directions.
+    """
+    names = ["origin", "along", "up"] + ["press"] * (reference.press is not None)
+    for name in names:
+        value = vector(name, getattr(reference, name), 2, ReferenceSignalError)
+        object.__setattr__(reference, name, tuple(float(number) for number in value))
+    if np.linalg.matrix_rank(np.array([reference.along, reference.up])) < 2:
+        raise ReferenceSignalError(
+            f"along and up must be two directions, got {reference.along!r} and {reference.up!r}"
+        )
 
 
 def check_spline(corner: float, order: int, length: float) -> None:

@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, vector
+from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.references.letters import HEIGHT, strokes
 from drake_dae.dae.references.splines import (
     SplineReference,
     TimeSpline,
     along_edges,
     check_spline,
+    settle_axes,
     spline_within,
 )
 from drake_dae.dae.references.travel import PathLimits
@@ -57,15 +58,8 @@ class TextReference(SplineReference):
     order: int = 4
 
     def __post_init__(self) -> None:
-        names = ["origin", "along", "up"] + ["press"] * (self.press is not None)
-        for name in names:
-            value = vector(name, getattr(self, name), 2, ReferenceSignalError)
-            object.__setattr__(self, name, tuple(float(number) for number in value))
+        settle_axes(self)
         positive("height", self.height, ReferenceSignalError)
-        if np.linalg.matrix_rank(np.array([self.along, self.up])) < 2:
-            raise ReferenceSignalError(
-                f"along and up must be two directions, got {self.along!r} and {self.up!r}"
-            )
         corners, _ = self._corners()
         length = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
         check_spline(self._rounding, self.order, float(length))

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, vector
+from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.references.gcode.program import Move, Program, read_program
 from drake_dae.dae.references.paths import check_order
 from drake_dae.dae.references.splines import (
@@ -23,6 +23,7 @@ from drake_dae.dae.references.splines import (
     TimeSpline,
     basis_pieces,
     rounded_up,
+    settle_axes,
     spline_within,
 )
 from drake_dae.dae.references.travel import PathLimits
@@ -80,14 +81,7 @@ class GCodeReference(SplineReference):
     order: int = 4
 
     def __post_init__(self) -> None:
-        names = ["origin", "along", "up"] + ["press"] * (self.press is not None)
-        for name in names:
-            value = vector(name, getattr(self, name), 2, ReferenceSignalError)
-            object.__setattr__(self, name, tuple(float(number) for number in value))
-        if np.linalg.matrix_rank(np.array([self.along, self.up])) < 2:
-            raise ReferenceSignalError(
-                f"along and up must be two directions, got {self.along!r} and {self.up!r}"
-            )
+        settle_axes(self)
         positive("tolerance", self.tolerance, ReferenceSignalError)
         check_order(self.order)
 
@@ -111,12 +105,12 @@ class GCodeReference(SplineReference):
 
     @cached_property
     def spline(self) -> TimeSpline:
-        return self._found[0]
+        return self._fitted[0]
 
     @property
     def deviation(self) -> float:
         """The largest distance of the path from the reference, in m."""
-        return self._found[1]
+        return self._fitted[1]
 
     @property
     def remark(self) -> str:
@@ -135,7 +129,7 @@ class GCodeReference(SplineReference):
         return min(move.speed, self.limits.speed)
 
     @cached_property
-    def _found(self) -> tuple[TimeSpline, float]:
+    def _fitted(self) -> tuple[TimeSpline, float]:
         """The spline, and the distance of the path from it."""
         # The peak of the B-spline of degree order - 1, and half the mean distance from its middle
         # for that of degree order + 1, by normal distributions of the same variance.
@@ -240,8 +234,7 @@ def _distance(spline: TimeSpline, path: _Path, along: FloatArray) -> float:
         path: The path.
         along: How far along the path the points are.
     """
-    shares = np.arange(_SAMPLES) / _SAMPLES
-    powers = shares[:, None] ** np.arange(spline.degree + 1)
+    powers = (np.arange(_SAMPLES)[:, None] / _SAMPLES) ** np.arange(spline.degree + 1)
     spans = sliding_window_view(spline.differences[0], spline.degree + 1, axis=0)
     curve = np.einsum("si,ik,nck->nsc", powers, basis_pieces(spline.degree), spans)
     curve = np.concatenate([curve.reshape(-1, 2), spline.points[-1:]])
