@@ -12,7 +12,8 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.references import Reference, stack_references
+from drake_dae.dae.references import Reference, ReferenceRows, stack_references
+from drake_dae.dae.references.pieces import MOST_IN_EXPRESSION
 from drake_dae.dae.references.reference import with_degrees
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Signal
@@ -258,10 +259,13 @@ def traced_references(
     for reference, own in with_degrees(references, degrees):
         row = reference.expression(own, time)
         if row is None:
+            whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ModelError(
-                f"a {type(reference).__name__} is no expression of time, and a rollout needs one: "
-                "take an ExpressionReference, PointToPointReference or SinusoidReference, or run "
-                "the loop by simulate"
+                f"a {type(whole).__name__} is no expression of time, or one of more than "
+                f"{MOST_IN_EXPRESSION} polynomials, and a rollout needs one: take an "
+                "ExpressionReference, PointToPointReference or SinusoidReference, fewer "
+                "polynomials (by a larger tolerance, corner or smoothing), or run the loop by "
+                "simulate"
             )
         rows.append(row)
     return ca.vertcat(*rows)
