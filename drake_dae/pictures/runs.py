@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
 from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first figure.
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
@@ -73,7 +74,6 @@ def plot_runs(
                 raise ModelError(f"{text} in {course.signal.unit or '1'}")
     single = first if not others else None
     marks = () if single is None else mark_labels(single)
-    extra = ("predicted",) if errors else ("reference",)
     figure, axes = grid(
         [
             labelled(Signal(f"|error of {one.signal.name}|", one.signal.unit))
@@ -81,36 +81,44 @@ def plot_runs(
             else labelled(one.signal)
             for one in chosen
         ],
-        (*records, *extra, *marks),
+        (*records, "predicted" if errors else "reference", *marks),
     )
+    draw = _draw_errors if errors else _draw_signals
     for axis, course in zip(axes, chosen, strict=True):
-        floor = np.inf
-        for number, (label, record) in enumerate(records.items()):
-            place = _signals(record, course.group).index(course.signal)
-            values, color = record[course.group][:, place], f"C{number % 10}"
-            if errors:
-                floor = min(floor, round_off(values))
-                predicted = _entry(record, "predicted_error", place)
-                if predicted is not None:
-                    shown = np.maximum(np.abs(predicted), round_off(values))
-                    axis.semilogy(record.time, shown, color=color, linewidth=4, alpha=0.35)
-                error = np.abs(values - record["desired_output"][:, place])
-                shown = np.maximum(error, round_off(values))
-                axis.semilogy(record.time, shown, color=color, label=label)
-                continue
-            axis.plot(record.time, values, color=color, label=label)
-            desired = _entry(record, "desired_output", place)
-            if course.group == _FIRST[0] and desired is not None:
-                axis.plot(record.time, desired, color=color, linestyle="--", alpha=0.6)
-        if errors:
-            decades(axis, floor)
-        style = {"linewidth": 4, "alpha": 0.35} if errors else {"linestyle": "--"}
-        axis.plot([], [], color="0.5", label=extra[0], **style)
+        draw(axis, records, course)
     if single is not None:
         mark_events(axes, single)
         mark_phases(figure, single)
     legend(figure, axes[0])
     return figure
+
+
+def _draw_signals(axis: Axes, records: Mapping[str, Record], course: _Course) -> None:
+    """An entry of each run; of outputs with its reference."""
+    for number, (label, record) in enumerate(records.items()):
+        place, color = _signals(record, course.group).index(course.signal), f"C{number % 10}"
+        axis.plot(record.time, record[course.group][:, place], color=color, label=label)
+        desired = _entry(record, "desired_output", place)
+        if course.group == _FIRST[0] and desired is not None:
+            axis.plot(record.time, desired, color=color, linestyle="--", alpha=0.6)
+    axis.plot([], [], color="0.5", label="reference", linestyle="--")
+
+
+def _draw_errors(axis: Axes, records: Mapping[str, Record], course: _Course) -> None:
+    """|z - r| of an output in each run, over the predicted one."""
+    wide: dict[str, Any] = {"linewidth": 4, "alpha": 0.35}
+    floors = []
+    for number, (label, record) in enumerate(records.items()):
+        place, color = _signals(record, course.group).index(course.signal), f"C{number % 10}"
+        values = record[course.group][:, place]
+        floors.append(floor := round_off(values))
+        predicted = _entry(record, "predicted_error", place)
+        if predicted is not None:
+            axis.semilogy(record.time, np.maximum(np.abs(predicted), floor), color=color, **wide)
+        error = np.abs(values - record["desired_output"][:, place])
+        axis.semilogy(record.time, np.maximum(error, floor), color=color, label=label)
+    decades(axis, min(floors))
+    axis.plot([], [], color="0.5", label="predicted", **wide)
 
 
 def _courses(record: Record, name: str) -> list[_Course]:
