@@ -139,9 +139,8 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
     elif last.phase == "done":
         again = len(changes) - count
         repeated = f", {again} of them again" if again else ""
-        remarks.append(
-            f"the task was done at {last.time:.4g} s, in {len(changes) - 1} phases{repeated}"
-        )
+        ended = f"{len(changes) - 1} phases" if len(changes) > 2 else "1 phase"
+        remarks.append(f"the task was done at {last.time:.4g} s, in {ended}{repeated}")
     else:
         remarks.append(
             f"the run ended during phase {last.place + 1}, {last.phase}, which began at "

@@ -139,6 +139,8 @@ def test_a_task_is_judged_by_its_end():
     found = judged(run(0.079), changes=[*begin, done])
     assert (found.outcome, found.outputs) == (Outcome.GOOD, ())
     assert str(found) == "GOOD: the task was done at 4 s, in 2 phases."
+    one = judged(run(), changes=[begin[0], change(4.0, "done", 1, "the end of 4 s")])
+    assert str(one) == "GOOD: the task was done at 4 s, in 1 phase."
     held = judged(run(), changes=[*begin, change(4.0, "held", 2, "the contact was lost")])
     assert str(held) == "BAD: the task was given up at 4 s: the contact was lost."
     going_on = judged(run(), changes=begin)
