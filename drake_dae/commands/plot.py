@@ -39,6 +39,8 @@ def _plot(options: argparse.Namespace) -> Path:
     path: Path = options.out
     if path.suffix not in SUFFIXES:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
+    if len(set(options.runs)) < len(options.runs):
+        raise ModelError("a run is named twice; name each run once")
     records = {_label(run, options.runs): _load(run) for run in options.runs}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)

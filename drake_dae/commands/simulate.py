@@ -46,7 +46,7 @@ from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.job import JobVerdict, Outcome, judge_job
+from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.phases import phase_spans
@@ -274,7 +274,7 @@ def _write(run: _CommandRun) -> bool:
         verdict = judge(record, predicted, accuracy)
         is_unexplained = verdict.tracking is Tracking.OFF and not reasons
         run.results = {
-            "missed": job.outcome is Outcome.BAD or is_unexplained,
+            "missed": job.outcome is JobOutcome.BAD or is_unexplained,
             "job": job.to_dict(),
             **_as_data(run, verdict, reasons),
         }
@@ -338,7 +338,7 @@ def _colored(job: JobVerdict) -> str:
     text, word = _filled(job), job.outcome.value
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
         return text
-    color = {Outcome.GOOD: 32, Outcome.BAD: 31, Outcome.UNDECIDED: 33}[job.outcome]
+    color = {JobOutcome.GOOD: 32, JobOutcome.BAD: 31, JobOutcome.UNDECIDED: 33}[job.outcome]
     return f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
 
 

@@ -24,7 +24,7 @@ GRACE = 0.1
 """So much later than predicted, as a fraction of the run, it may be."""
 
 
-class Outcome(Enum):
+class JobOutcome(Enum):
     """Whether a run did its job; the values start the sentence."""
 
     GOOD = "GOOD"
@@ -42,6 +42,8 @@ class OutputQuality:
         since: The time from which |z - r| stayed within the tolerance, in s; None if it was outside
             at the end.
         predicted_since: The same of the predicted error; None if the run is too short for it.
+        follows_prediction: Whether the error is within the tolerance of the predicted one in the
+            second half of the run.
         largest: The largest |z - r| in the second half of the run.
         rms: The root mean square of z - r in the second half of the run.
     """
@@ -50,6 +52,7 @@ class OutputQuality:
     tolerance: float
     since: float | None
     predicted_since: float | None
+    follows_prediction: bool
     largest: float
     rms: float
 
@@ -65,7 +68,7 @@ class JobVerdict:
         remarks: What the user should know besides.
     """
 
-    outcome: Outcome
+    outcome: JobOutcome
     outputs: tuple[OutputQuality, ...] = ()
     problems: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -105,8 +108,8 @@ def judge_job(
     """Whether a run did its job.
 
     Without phases each output must come within its tolerance in the first half of the run, or
-    when the prediction does, and stay there. A run in which a predicted error is still larger at
-    the end is undecided. With phases the last one must have come to its end.
+    when the prediction does, and stay there. A run that follows a predicted error which is still
+    larger at the end is undecided. With phases the last one must have come to its end.
 
     Args:
         record: A record with desired_output, tracking_error and constraint_force.
@@ -127,7 +130,7 @@ def judge_job(
         outputs = tuple(_qualities(record, predicted, dict(tolerances or {})))
         _judge_contacts(record, pushing, problems, remarks)
         undecided = _judge_outputs(record, outputs, problems, remarks)
-    outcome = Outcome.BAD if problems else Outcome.UNDECIDED if undecided else Outcome.GOOD
+    outcome = JobOutcome.BAD if problems else JobOutcome.UNDECIDED if undecided else JobOutcome.GOOD
     return JobVerdict(outcome, outputs, tuple(problems), tuple(remarks))
 
 
@@ -185,7 +188,7 @@ def _judge_outputs(
         due = None if one.predicted_since is None else max(middle, one.predicted_since + grace)
         if one.since is not None and (due is None or one.since <= due):
             continue
-        if due is None:
+        if due is None and one.follows_prediction:
             short.append(one.signal.name)
             continue
         unit = f" {one.signal.unit}".rstrip()
@@ -231,6 +234,7 @@ def _qualities(
                 tolerance,
                 _within_since(record.time, error[:, i], tolerance),
                 _within_since(record.time, predicted[:, i], tolerance),
+                bool(np.all(np.abs(error - predicted)[first:, i] <= tolerance)),
                 float(np.max(np.abs(error[first:, i]))),
                 float(rms[i]),
             )

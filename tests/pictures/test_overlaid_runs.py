@@ -122,6 +122,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     for arguments, said in (
         ([folders[0], "--out=a.txt"], "a plot is a .png, .pdf or .svg, got 'a.txt'"),
+        ([folders[0], folders[0]], "a run is named twice"),
         ([str(tmp_path)], "is no folder of a run: it has no record.npz"),
         (["nothing"], "nothing is not a record of a run: No such file or directory"),
         ([folders[0], "--signals=tool.x"], "no signal 'tool.x'; did you mean 'tool."),
