@@ -108,6 +108,15 @@ def test_the_users_tolerances_come_first():
     assert judged(record, tolerances={"tool.y": 2e-4}).outcome is JobOutcome.GOOD
 
 
+def test_round_off_of_a_constant_reference_is_no_motion():
+    """A spline over equal forces varies by 1e-15, of which 1 % is no tolerance."""
+    record = run(force_error=1e-3)
+    record["desired_output"][:, 1] += 1e-15 * 20.0 * np.sin(TIMES)
+    found = judged(record)
+    assert found.outputs[1].tolerance == pytest.approx(0.2)
+    assert found.outcome is JobOutcome.GOOD
+
+
 def test_a_contact_that_is_lost():
     """At first it bounces, which is said; later it is a problem."""
     bounces = run(force=np.where((TIMES > 0.5) & (TIMES <= 0.6), 0.0, 20.0))

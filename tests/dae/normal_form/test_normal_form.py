@@ -12,6 +12,7 @@ from arms import arm, consistent_states, numbers
 from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
 from two_arms import two_arms
 
+from drake_dae.dae.normal_form import completion as completion_module
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
@@ -272,6 +273,23 @@ def test_completions_that_do_not_complete_are_refused(completion, message):
     structure = find_structure(system)
     with pytest.raises(ModelError, match=message):
         NormalForm(structure.system, completion(system.state), structure=structure)
+
+
+def test_a_differential_that_vanishes_is_named_whatever_round_off_leaves_of_it(monkeypatch):
+    """The rest of 1e-20 may have a direction, which says nothing."""
+    system = knife_edge().system
+    structure, found = find_structure(system), completion_module.find_margin
+
+    def with_round_off(*arguments):
+        margin = found(*arguments)
+        matrix = margin.matrix.copy()
+        matrix[-2] = 1e-20 * np.eye(1, matrix.shape[1], 0)[0]
+        return replace(margin, matrix=matrix)
+
+    monkeypatch.setattr(completion_module, "find_margin", with_round_off)
+    x = system.state
+    with pytest.raises(ModelError, match=r"'xi0' = .* at x = \[-(0\.00)?3"):
+        NormalForm(structure.system, ca.vertcat((x[0] + 0.003) ** 2, x[1]), structure=structure)
 
 
 def test_outputs_that_repeat_each_other_are_refused():

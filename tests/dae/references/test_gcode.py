@@ -255,3 +255,14 @@ def test_rollouts_take_few_polynomials(file):
     rows = traced_references([coarse], [2, 2], time)
     found = ca.Function("rows", [time], [rows])(1.3).full().ravel()
     np.testing.assert_allclose(found, coarse.derivatives([2, 2])(1.3), rtol=1e-11, atol=1e-13)
+
+
+def test_a_tight_arc_does_not_slow_the_lines_beside_it(tmp_path):
+    """On 5 mm with 2 m/s^2 at most 0.1 m/s are possible; the lines have 0.2 m/s all the same."""
+    file = tmp_path / "arc.nc"
+    file.write_text("G1 X200 F12000\nG3 X200 Y10 J5\nG1 X0")
+    _, values = samples(GCodeReference(str(file), LIMITS), 2)
+    speeds, accelerations = (np.linalg.norm(values[:, :, k], axis=1) for k in (1, 2))
+    assert speeds.max() > 0.98 * 0.2
+    assert speeds[values[:, 0, 0] > 0.203].max() < 0.1
+    assert accelerations.max() <= 2.0 * (1.0 + 1e-9)
