@@ -1,10 +1,12 @@
 """A Drake diagram as functions, one for each of its rates."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import casadi as ca
-from pydrake.systems.framework import Context, Diagram, OutputPort, System
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
@@ -51,7 +53,7 @@ def compile_diagram(
         ModelError: There is no such output, an input has neither a wire nor a value, blocks close
             an algebraic loop, or a block cannot be traced: its name and why.
     """
-    return _compiled(Wires.of(diagram), outputs, context, {})
+    return _compiled(Wires.of(diagram), outputs, context)
 
 
 def compile_part(
@@ -79,7 +81,33 @@ def compile_part(
         {name: leaf_port(port) for name, port in inputs.items()},
         {name: leaf_port(port) for name, port in outputs.items()},
     )
-    return _compiled(wires, None, context, {})
+    return _compiled(wires, None, context)
+
+
+def compile_open(
+    diagram: Diagram, inputs: Sequence[InputPort], outputs: Mapping[str, OutputPort]
+) -> CompiledDiagram:
+    """A part of a diagram as functions, with some input ports of its systems as parameters.
+
+    The wires to these ports are cut, and what comes to others is computed. So a plant with its
+    exogenous signals stands alone, whose control is given.
+
+    Args:
+        diagram: The diagram.
+        inputs: Input ports of systems in it; see `CompiledDiagram.fixed` for their places.
+        outputs: Name -> the output port of a system in it that is computed.
+
+    Raises:
+        ModelError: As of `compile_diagram`.
+    """
+    wires, context = Wires.of(diagram), diagram.CreateDefaultContext()
+    cut = {(port.get_system(), int(port.get_index())) for port in inputs}
+    for port in inputs:
+        port.FixValue(port.get_system().GetMyMutableContextFromRoot(context), np.zeros(port.size()))
+    sources = {taken: source for taken, source in wires.sources.items() if taken not in cut}
+    systems = tuple(one for one in wires.systems if not getattr(one, "ends_runs", False))
+    ports = {name: leaf_port(port) for name, port in outputs.items()}
+    return _compiled(replace(wires, systems=systems, sources=sources, outputs=ports), None, context)
 
 
 def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
@@ -102,7 +130,7 @@ def _compiled(
     wires: Wires,
     outputs: Sequence[str] | None,
     context: Context | None,
-    twins: Mapping[System, System],
+    twins: Mapping[System, System] | None = None,
     is_short: bool = False,
 ) -> CompiledDiagram:
     if outputs is None:
@@ -111,7 +139,7 @@ def _compiled(
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
     context = context or wires.diagram.CreateDefaultContext()
-    expressions = Expressions(wires, context, twins, is_short)
+    expressions = Expressions(wires, context, twins or {}, is_short)
     chosen = [wires.outputs[name] for name in outputs]
     for system in wires.systems:
         # It counts, though it leads to no output; a part of a diagram does not end its run.

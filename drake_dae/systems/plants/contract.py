@@ -59,7 +59,8 @@ class Plant(System):
     8. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
        `current_parameters` the same with the current exogenous ones, and `parameters_along` those
        at the times of a run. `set_parameter` changes one in a context; a plant with fixed numbers
-       refuses.
+       refuses. `further_parameters` are those that follow them in numeric parameter 0 and may be
+       identified, each with its place there.
     9. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
        guess, with all contacts closed, and returns it. Both refuse wrong shapes.
     10. Opening contacts. `contacts` names the contacts that open and close, in the order of the
@@ -94,6 +95,11 @@ class Plant(System):
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         """Name of a further output port in a record -> names and units of its entries."""
+        return {}
+
+    @property
+    def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
+        """Name of a further parameter -> its name and unit, and its place."""
         return {}
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:

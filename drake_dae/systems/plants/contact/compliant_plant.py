@@ -36,7 +36,7 @@ from drake_dae.systems.blocks.traced import (
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contact.compliance import CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
-from drake_dae.systems.plants.contact.contact_material import PointMaterial
+from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.plants.contact.stepped_stages import check_step
 from drake_dae.systems.plants.contract import Plant
 
@@ -152,6 +152,15 @@ class CompliantPlant(ParameterizedSystem, Plant):
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         return {"contact_force": self.contact_force_signals}
+
+    @property
+    def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
+        first = self.dae.parameter_symbol.numel()
+        return {
+            signal.name: (signal, first + place)
+            for place, signal in enumerate(self.material.signals)
+            if signal is not FRICTION or self.material.friction is not None
+        }
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         along = super().parameters_along(context, times)

@@ -15,7 +15,11 @@ from pydrake.multibody.plant import CoulombFriction
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+
+FRICTION = Signal("plant.friction")
+"""The coefficient of friction of all contacts, among `PointMaterial.signals`."""
 
 
 @checked(ModelError)
@@ -60,6 +64,13 @@ class PointMaterial:
     def stiffness_at(self, force: float) -> float:
         """The slope of the normal force over depth, in N/m, at a normal force in N."""
         return self.stiffness
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of `values`, named by the keys of a scenario's `plant`."""
+        named = {"stiffness": "N/m", "dissipation": "s/m"}
+        first = (Signal(f"plant.{name}", unit) for name, unit in named.items())
+        return (*first, FRICTION, Signal("plant.radius", "m"))
 
     @property
     def values(self) -> FloatArray:

@@ -1,0 +1,287 @@
+"""The plant of a loop alone, driven by recorded controls, with exact derivatives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import Context, OutputPort
+
+from drake_dae.arrays import FloatArray
+from drake_dae.compiler.compile import compile_open
+from drake_dae.compiler.wires import Wires
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.running.rollout.stepping.many import Many
+from drake_dae.systems.plants.contract import Plant
+
+HALVES = (0.0, 0.5, 0.5, 1.0)
+"""When the stages of the fourth-order Runge-Kutta method are, in steps."""
+
+WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+
+
+class Moved(NamedTuple):
+    """Values at one moment of many pieces, and how they depend on where these begin.
+
+    Attributes:
+        values: Shape (j, k).
+        slopes: Their derivatives with respect to the state at the beginning and to the unknown
+            parameters, shape (j, k, n + p).
+    """
+
+    values: FloatArray
+    slopes: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """The plant of a loop as functions of its state, its control and some of its parameters.
+
+    A continuous plant takes steps of the classical Runge-Kutta method of fourth order, a discrete
+    one its own. The state of a discrete plant is all that it holds.
+
+    Attributes:
+        loop: The loop.
+        context: A context of its diagram, with the values of all parameters.
+        outputs: Name -> the output port whose values are of interest.
+        places: The places of the unknown parameters in numeric parameter 0 of the plant.
+    """
+
+    loop: ClosedLoop
+    context: Context
+    outputs: Mapping[str, OutputPort]
+    places: Sequence[int]
+
+    def __post_init__(self) -> None:
+        compiled, plant = self._compiled, self.loop.plant
+        if compiled.guards or compiled.watched:
+            raise ModelError(
+                f"{plant.dae.name}: contacts of a {type(plant).__name__} open and close, and a "
+                "record with impacts is not identified; take a plant whose contacts stay closed, "
+                "or a compliant one (plant: !CompliantContact)"
+            )
+        if compiled.has_stepped:
+            raise ModelError(
+                f"{plant.dae.name} is stepped by Drake's own contact, which has no derivatives; "
+                "take point contact as !CompliantContact"
+            )
+        own = sum(part.stop - part.start for system, part in compiled.held if system is plant)
+        if own != compiled.sizes["held"] or (own and compiled.sizes["state"]):
+            raise ModelError(f"{plant.dae.name}: a plant that samples cannot be identified")
+
+    @cached_property
+    def _compiled(self):  # type: ignore[no-untyped-def]
+        plant, sensor = self.loop.plant, self.loop.sensor
+        free = [plant.GetInputPort("control")]
+        if sensor is not None and sensor.HasInputPort("noise"):
+            free.append(sensor.GetInputPort("noise"))
+        return compile_open(self.loop.diagram, free, self.outputs)
+
+    @property
+    def period(self) -> float:
+        """The step of a discrete plant, in s; 0 for a continuous one."""
+        return self.loop.plant.time_step
+
+    @property
+    def num_states(self) -> int:
+        """n."""
+        return int(self._compiled.sizes["held" if self.period else "state"])
+
+    @cached_property
+    def state_of_plant(self) -> slice:
+        """Where the state of the plant stands; after it comes that of a sensor."""
+        places = self._compiled.held if self.period else self._compiled.states
+        return dict(places)[self.loop.plant]
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """The sizes of the states, shape (n,)."""
+        found = np.ones(self.num_states)
+        x = self.loop.plant.dae.scale
+        first = self.state_of_plant.start
+        found[first : first + x.size] = x
+        return found
+
+    @cached_property
+    def base(self) -> FloatArray:
+        """All parameters of the functions, with the values of the context."""
+        compiled, context = self._compiled, self.context.Clone()
+        for system, name, _ in compiled.fixed:
+            port = system.GetInputPort(name)
+            port.FixValue(system.GetMyMutableContextFromRoot(context), np.zeros(port.size()))
+        return compiled.values(context)
+
+    @cached_property
+    def nominal(self) -> FloatArray:
+        """The values of the unknown parameters in the context, shape (p,)."""
+        return self.base[self._unknown]
+
+    @cached_property
+    def _unknown(self) -> list[int]:
+        first = dict(self._compiled.parameters)[self.loop.plant].start if self.places else 0
+        return [first + place for place in self.places]
+
+    @cached_property
+    def is_held(self) -> bool:
+        """Whether the control is constant between samples."""
+        return bool(self.period) or holds_control(self.loop.plant, Wires.of(self.loop.diagram))
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """The outputs in the order of `seen`."""
+        return self._compiled.outputs
+
+    @cached_property
+    def sizes(self) -> Sequence[int]:
+        """The number of entries of each output."""
+        return [self.outputs[name].size() for name in self.names]
+
+    @cached_property
+    def _symbols(self) -> list[ca.SX]:
+        sizes = self._compiled.sizes
+        control = self.loop.plant.GetInputPort("control").size()
+        given = {"time": 1, "state": self.num_states, "unknown": len(self.places)}
+        given |= {"control": control, "base": sizes["parameters"]}
+        return [ca.SX.sym(name, size) for name, size in given.items()]
+
+    def _arguments(self) -> list[ca.SX]:
+        """What the functions of the diagram take."""
+        time, state, unknown, control, base = self._symbols
+        compiled, values = self._compiled, ca.SX(base)
+        if self.places:
+            values[self._unknown] = unknown
+        for system, name, part in compiled.fixed:
+            if name == "control" and system is self.loop.plant:
+                values[part] = control
+        nothing = ca.SX(0, 1)
+        return [time, *((nothing, state) if self.period else (state, nothing)), values]
+
+    def _function(self, value: ca.SX, valid: ca.SX) -> Many:
+        """A function with its derivatives with respect to state and unknown parameters."""
+        by = ca.vertcat(self._symbols[1], self._symbols[2])
+        slopes = ca.densify(ca.vec(ca.jacobian(value, by).T))
+        return Many(
+            ca.Function(
+                "driven",
+                self._symbols,
+                ca.cse([ca.densify(value) + 0.0 * valid, slopes]),
+                {"cse": False},
+            )
+        )
+
+    @cached_property
+    def _moves(self) -> Many:
+        """The derivative of the state, or the next state of a discrete plant."""
+        compiled, given = self._compiled, self._arguments()
+        if not self.period:
+            return self._function(*compiled.rate.call(given))
+        (rate,) = compiled.rates
+        noise = ca.SX.zeros(compiled.sizes["noise"])
+        values, valid = rate.function.call([*given, noise])
+        state = ca.SX(self._symbols[1])
+        state[list(rate.places)] = values
+        return self._function(state, valid)
+
+    @cached_property
+    def _shows(self) -> Many:
+        return self._function(*self._compiled.row.call(self._arguments()))
+
+    def _called(
+        self, function: Many, time: FloatArray, moved: Moved, unknown: FloatArray, u: FloatArray
+    ) -> Moved:
+        """A function at many moments, with derivatives along those of the state."""
+        count, n = moved.values.shape
+        values, flat = function(time[:, None], moved.values, unknown, u, self.base)
+        local = flat.reshape(count, -1, n + unknown.size)
+        slopes = np.matmul(local[:, :, :n], moved.slopes)
+        slopes[:, :, n:] += local[:, :, n:]
+        return Moved(values, slopes)
+
+    def begun(self, states: FloatArray) -> Moved:
+        """The states at the beginning of pieces, shape (j, n), as values of themselves."""
+        count, n = states.shape
+        slopes = np.zeros((count, n, n + len(self.places)))
+        slopes[:] = np.eye(n, n + len(self.places))
+        return Moved(states, slopes)
+
+    def seen(
+        self, time: FloatArray, moved: Moved, unknown: FloatArray, control: FloatArray
+    ) -> Moved:
+        """The outputs at times in s, shape (j,), below each other.
+
+        Args:
+            time: The times.
+            moved: The states.
+            unknown: The unknown parameters, shape (p,).
+            control: The controls, shape (j, q).
+        """
+        return self._called(self._shows, time, moved, unknown, control)
+
+    def step(
+        self,
+        time: FloatArray,
+        after: FloatArray,
+        moved: Moved,
+        unknown: FloatArray,
+        controls: Sequence[FloatArray],
+    ) -> Moved:
+        """The states at later times.
+
+        Args:
+            time, after: From when to when, in s, shape (j,).
+            moved: The states at the former.
+            unknown: The unknown parameters, shape (p,).
+            controls: Of a continuous plant those at the beginning, in the middle and at the end of
+                each of its equal steps; of a discrete plant that of each step. Each of shape
+                (j, q).
+        """
+        if self.period:
+            for index, control in enumerate(controls):
+                moved = self._called(
+                    self._moves, time + index * self.period, moved, unknown, control
+                )
+            return moved
+        count = len(controls) // 2
+        h = (after - time) / count
+        for index in range(count):
+            given = controls[2 * index : 2 * index + 3]
+            moved = self._stages(time + index * h, h, moved, unknown, given)
+        return moved
+
+    def _stages(
+        self,
+        time: FloatArray,
+        h: FloatArray,
+        moved: Moved,
+        unknown: FloatArray,
+        controls: Sequence[FloatArray],
+    ) -> Moved:
+        values, slopes = moved.values.copy(), moved.slopes.copy()
+        stage, rate, step = moved, moved, (h[:, None], h[:, None, None])
+        for half, weight in zip(HALVES, WEIGHTS, strict=True):
+            if half:
+                stage = Moved(
+                    moved.values + half * step[0] * rate.values,
+                    moved.slopes + half * step[1] * rate.slopes,
+                )
+            control = controls[int(2 * half)]
+            rate = self._called(self._moves, time + half * h, stage, unknown, control)
+            values += weight * step[0] * rate.values
+            slopes += weight * step[1] * rate.slopes
+        return Moved(values, slopes)
+
+
+def holds_control(plant: Plant, wires: Wires) -> bool:
+    """Whether a block holds the control of a plant between samples."""
+    port = plant, int(plant.GetInputPort("control").get_index())
+    while (source := wires.sources.get(port)) is not None:
+        system, index = source
+        if not system.HasDirectFeedthrough(index):
+            return int(system.num_continuous_states()) == 0
+        if system.num_input_ports() != 1:
+            return False
+        port = system, 0
+    return False

@@ -1,0 +1,212 @@
+"""The values of unknowns that explain records best: Gauss-Newton on pieces in a chain."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.studies.identification.chain import Chain, triangle
+from drake_dae.studies.identification.pieces import Pieces, Slopes
+
+COUPLINGS = (1e-1, 1e-3, 1e-6)
+"""How tightly pieces are joined, one after the other, in deviations of what a piece says of its
+states. From 1e-5 on the results do not change any more."""
+
+SMALLEST = 1e-7
+"""The least noise, relative to how much a column varies."""
+
+EXACT = 1e-9
+"""The deviation of constraints at the beginnings of pieces."""
+
+MOST = 25
+"""So many steps of Gauss-Newton are made with one coupling at most."""
+
+CLOSE = 1e-2
+"""A step is the last one with a coupling if it is shorter than this part of the deviations."""
+
+WEAK = 1e3
+"""The deviation of a state that nothing is known about, in its size."""
+
+UNDETERMINED = 1.0
+"""A direction of the unknowns with a larger deviation than this, relative to their sizes, is not
+determined, and is left where it began."""
+
+MOST_OF_THE_WAY = 0.9
+"""So much of the distance to its bound is the longest step of an unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The result of a fit.
+
+    Attributes:
+        values: The unknowns, shape (p,).
+        information: For each piece of all records T^T T and T^T r, with the derivatives T of the
+            weighted errors r along the motions that fit best, shape (j, p, p + 1).
+        determined: Directions of the unknowns over their sizes that the data determine, in
+            columns, shape (p, q).
+        undetermined: Those that the data do not determine, shape (p, p - q).
+        errors: Measured minus computed columns of each record, shape (k, c).
+        noise: The deviation of each column of each record, shape (c,).
+    """
+
+    values: FloatArray
+    information: FloatArray
+    determined: FloatArray
+    undetermined: FloatArray
+    errors: Sequence[FloatArray]
+    noise: Sequence[FloatArray]
+
+
+class Fit:
+    """Gauss-Newton for the unknowns of some records.
+
+    The squares of measured minus computed columns over their noise are minimized, with the states
+    at the beginning of each piece as unknowns beside the common ones; what joins the pieces and
+    what constraints say are further errors, with small deviations. The noise of each group of
+    columns is that of its errors.
+
+    Args:
+        pieces: The records.
+        start: The values at which the unknowns begin, shape (p,).
+        sizes: Their sizes, shape (p,).
+        lowest: Their lower bounds, -inf for none, shape (p,).
+    """
+
+    def __init__(
+        self, pieces: Sequence[Pieces], start: FloatArray, sizes: FloatArray, lowest: FloatArray
+    ) -> None:
+        self._pieces = [each.fine_enough(start) for each in pieces]
+        self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
+        self._states = [each.first_states.copy() for each in pieces]
+        self._spread = [_spread(each) for each in pieces]
+        self._noise = [1e-3 * spread for spread in self._spread]
+        self._parts = np.eye(start.size), np.zeros((start.size, 0))
+
+    def run(self) -> Fitted:
+        """Fits.
+
+        Raises:
+            ModelError: The computed motion leaves the recorded one, or the steps do not come to an
+                end.
+        """
+        for coupling in COUPLINGS:
+            for _ in range(MOST):
+                slopes, chains = self._chained(coupling)
+                length = self._step(slopes, chains)
+                if length < CLOSE:
+                    break
+            else:
+                if coupling == COUPLINGS[-1]:
+                    raise ModelError(
+                        f"the steps toward the best values have not come to an end after {MOST}: "
+                        "the record does not fit this robot, or the values to begin with are far "
+                        "off; free fewer parameters first"
+                    )
+        return self._fitted(*self._chained(COUPLINGS[-1]))
+
+    def _chained(self, coupling: float) -> tuple[list[Slopes], list[Chain]]:
+        slopes, chains = [], []
+        for index, pieces in enumerate(self._pieces):
+            found = pieces.slopes(self._states[index], self._values)
+            is_finite = np.isfinite(found.ends).all()
+            is_measured = np.isfinite(pieces.values)
+            if not (is_finite and np.isfinite(found.errors[is_measured]).all()):
+                raise ModelError(
+                    "the motion that is computed with these parameters leaves the recorded one: "
+                    "the record is that of another robot or run, or the values to begin with are "
+                    "far off"
+                )
+            slopes.append(found)
+            chains.append(self._chain(index, found, coupling))
+        return slopes, chains
+
+    def _chain(self, index: int, slopes: Slopes, coupling: float) -> Chain:
+        """The least squares of a record around the present states."""
+        scale, noise = self._pieces[index].driven.scale, self._noise[index]
+        count = len(slopes.ends)
+        width = slopes.of_ends.shape[2] + 1
+        found = np.concatenate([slopes.of_errors, slopes.errors[..., None]], axis=3)
+        found = np.where(np.isnan(slopes.errors)[..., None], 0.0, found) / noise[:, None]
+        exact = np.concatenate([slopes.residuals[1], slopes.residuals[0][..., None]], axis=2)
+        own = np.concatenate([found.reshape(count, -1, width), exact / EXACT], axis=1)
+        defects = slopes.ends[:-1] - self._states[index][1:]
+        moves = np.concatenate([slopes.of_ends[:-1], defects[..., None]], axis=2)
+        return Chain.of(own, moves, coupling * _known(own, scale), WEAK * scale)
+
+    def _step(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> float:
+        """Makes a step; returns its length in deviations of the unknowns."""
+        common = triangle(np.vstack([chain.common for chain in chains]))
+        p = self._values.size
+        scaled, rest = common[:p, :p] * self._sizes, common[:p, p]
+        _, strengths, rows = np.linalg.svd(scaled)
+        is_known = strengths > 1.0 / UNDETERMINED
+        self._parts = rows[is_known].T, rows[~is_known].T
+        reduced = scaled @ self._parts[0]
+        change = np.linalg.lstsq(reduced, -rest, rcond=None)[0]
+        step = self._sizes * (self._parts[0] @ change)
+        gap = MOST_OF_THE_WAY * (self._values - self._lowest)
+        down = step < 0.0
+        share = float(np.min(gap[down] / -step[down], initial=1.0))
+        self._values = self._values + share * step
+        for index, chain in enumerate(chains):
+            states, _ = chain.states(share * step)
+            self._states[index] = self._states[index] + states
+            changes = np.concatenate([states, np.broadcast_to(share * step, (len(states), p))], 1)
+            after = slopes[index].errors + np.einsum(
+                "jkci,ji->jkc", slopes[index].of_errors, changes
+            )
+            self._set_noise(index, after)
+        deviations = np.linalg.norm(reduced @ change) if share == 1.0 else np.inf
+        return float(deviations) / max(1.0, np.sqrt(p))
+
+    def _set_noise(self, index: int, errors: FloatArray) -> None:
+        """The noise of each group of columns, from their errors."""
+        channels, spread = self._pieces[index].data.channels, self._spread[index]
+        groups = [channel.group for channel in channels]
+        for group in set(groups):
+            own = [i for i, each in enumerate(groups) if each == group]
+            found = float(np.sqrt(np.nanmean(np.square(errors[:, :, own]))))
+            self._noise[index][own] = np.maximum(found, SMALLEST * float(np.max(spread[own])))
+
+    def _fitted(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> Fitted:
+        p, information, errors = self._values.size, [], []
+        for index, chain in enumerate(chains):
+            found, along = slopes[index], chain.states(np.zeros(p))[1]
+            n = along.shape[1]
+            total = np.einsum("jkcn,jnp->jkcp", found.of_errors[..., :n], along)
+            total += found.of_errors[..., n:]
+            both = np.concatenate([total, found.errors[..., None]], axis=3)
+            both = np.where(np.isnan(found.errors)[..., None], 0.0, both)
+            both /= self._noise[index][:, None]
+            flat = both.reshape(len(both), -1, p + 1)
+            information.append(np.matmul(flat[..., :p].transpose(0, 2, 1), flat))
+            rows = self._pieces[index].data.times.size
+            errors.append(found.errors.reshape(-1, found.errors.shape[2])[:rows])
+        return Fitted(self._values, np.concatenate(information), *self._parts, errors, self._noise)
+
+
+def _spread(pieces: Pieces) -> FloatArray:
+    """How much the columns of each group vary; their size if they do not, or 1 if that is zero."""
+    values, groups = pieces.values, [channel.group for channel in pieces.data.channels]
+    found = np.ones(len(groups))
+    for group in set(groups):
+        own = [i for i, each in enumerate(groups) if each == group]
+        columns = values[:, :, own].reshape(-1, len(own))
+        varies = float(np.max(np.nanstd(columns, axis=0)))
+        size = float(np.sqrt(np.nanmean(np.square(columns))))
+        found[own] = max(varies, 1e-3 * size) or 1.0
+    return found
+
+
+def _known(own: FloatArray, scale: FloatArray) -> FloatArray:
+    """The deviations of the states that a piece leads to by itself: their median, shape (n,)."""
+    count, n = len(own), scale.size
+    weak = np.broadcast_to(np.eye(n) / WEAK, (count, n, n))
+    # By the factor and not by the information, whose eigenvalues differ by more than 1e16.
+    factors = triangle(np.concatenate([own[:, :, :n] * scale, weak], axis=1))
+    deviations = np.linalg.norm(np.linalg.inv(factors), axis=2)
+    found: FloatArray = scale * np.minimum(np.median(deviations, axis=0), 1.0)
+    return found

@@ -1,0 +1,200 @@
+"""The result of an identification, as values and as text."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, listed
+from drake_dae.studies.identification.unknowns import Unknown
+
+NORMAL = 1.96
+"""An interval of 95 % has so many deviations to each side."""
+
+RESAMPLED = 400
+"""So many times the bootstrap draws pieces of the records."""
+
+SHARE = 0.1
+"""An unknown with a larger part than this in a direction that is not determined is not either."""
+
+WHITE = 3.0
+"""Errors whose correlation with the next ones is above this, in deviations of that of white noise,
+are not white."""
+
+LARGER = 1.5
+"""A deviation of the bootstrap that is larger by this factor is remarked."""
+
+STRONG = 0.95
+"""Correlations of two unknowns above this are printed."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What is left of some measured columns.
+
+    Attributes:
+        unit: Its unit.
+        deviation: Its deviation.
+        stated: The deviation that the sensor is said to have; None if nobody said.
+        correlation: The largest correlation of an error with the next one, by its absolute value.
+        is_white: Whether that is what white noise has.
+    """
+
+    unit: str
+    deviation: float
+    stated: float | None
+    correlation: float
+    is_white: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Parameters with their uncertainty, from records.
+
+    The information of the data about the parameters is F = sum T^T T, with the derivatives T of the
+    errors over their noise along the motions that fit best; their covariance is F^-1 (Fisher). It
+    holds for white noise of the deviation that the errors have. The bootstrap draws whole pieces of
+    the records with repetition, so that it knows errors that are correlated within a piece.
+
+    Attributes:
+        unknowns: The parameters.
+        values: Their values, shape (p,).
+        start: The values at the beginning, shape (p,).
+        covariance: F^-1, shape (p, p); nan for what is not determined.
+        bootstrap: The deviations by the bootstrap, shape (p,).
+        undetermined: The parameters of each combination that the data do not determine.
+        noise: Name of a measured signal, with its unit if it has several -> what is left of it.
+        errors: For each record the measured minus the computed columns, shape (k, c).
+    """
+
+    unknowns: tuple[Unknown, ...]
+    values: FloatArray
+    start: FloatArray
+    covariance: FloatArray
+    bootstrap: FloatArray
+    undetermined: tuple[tuple[str, ...], ...]
+    noise: Mapping[str, Noise]
+    errors: Sequence[FloatArray] = field(repr=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the parameters."""
+        return tuple(unknown.name for unknown in self.unknowns)
+
+    def __getitem__(self, name: str) -> float:
+        """The value of a parameter."""
+        return float(self.values[self.names.index(name)])
+
+    @property
+    def deviations(self) -> FloatArray:
+        """The standard deviations by the Fisher information, shape (p,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def intervals(self) -> FloatArray:
+        """The intervals of 95 %, lowest and highest value, shape (p, 2)."""
+        half = NORMAL * self.deviations
+        return np.column_stack([self.values - half, self.values + half])
+
+    @cached_property
+    def correlations(self) -> FloatArray:
+        """The correlations of the parameters, shape (p, p)."""
+        return self.covariance / np.outer(self.deviations, self.deviations)
+
+    def text(self) -> str:
+        """The result as lines of text."""
+        rows = [("parameter", "value", "95 % interval", "bootstrap", "before", "unit")]
+        half = NORMAL * self.deviations
+        for i, unknown in enumerate(self.unknowns):
+            if np.isfinite(half[i]):
+                shown = f"{self.values[i]:.{_digits(self.values[i], half[i])}g}"
+                around = f"+- {half[i]:.2g}", f"+- {NORMAL * self.bootstrap[i]:.2g}"
+            else:
+                shown, around = "not determined", ("", "")
+            rows.append((unknown.name, shown, *around, f"{self.start[i]:.6g}", unknown.unit))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+        return "\n".join([*lines, "", *self.remarks()])
+
+    def remarks(self) -> list[str]:
+        """What is to be known about the values."""
+        found = [
+            f"The records do not determine {listed(names)[1:-1]}: they stay as they were. A motion "
+            "or a force that depends on them is needed, or fewer free parameters."
+            for names in self.undetermined
+        ]
+        strong = np.abs(np.triu(self.correlations, 1)) > STRONG
+        found += [
+            f"{self.names[i]} and {self.names[j]} are hard to tell apart: their correlation is "
+            f"{self.correlations[i, j]:.3f}."
+            for i, j in np.argwhere(strong)
+        ]
+        for name, noise in self.noise.items():
+            stated = "" if noise.stated is None else f" ({noise.stated:.2g} is stated)"
+            kind = "white" if noise.is_white else "not white"
+            found.append(
+                f"Left of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
+                + f"{stated}, {kind} (correlation with the next one {noise.correlation:.2g})."
+            )
+        if any(not noise.is_white for noise in self.noise.values()):
+            found.append(
+                "Where errors are not white the intervals are too short: the model lacks something "
+                "(a free parameter, friction, a bias), or sensors round."
+            )
+        larger = [
+            name
+            for name, b, d in zip(self.names, self.bootstrap, self.deviations, strict=True)
+            if b > LARGER * d
+        ]
+        if larger:
+            found.append(f"By the bootstrap the intervals of {listed(larger)[1:-1]} are longer.")
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain values."""
+        rows = zip(self.unknowns, self.values, self.intervals, self.bootstrap, strict=True)
+        return {
+            "parameters": {
+                unknown.name: {
+                    "value": float(value),
+                    "interval": [*map(float, interval)] if np.isfinite(interval).all() else None,
+                    "bootstrap_deviation": float(spread) if np.isfinite(spread) else None,
+                    "unit": unknown.unit,
+                }
+                for unknown, value, interval, spread in rows
+            },
+            "undetermined": [list(names) for names in self.undetermined],
+            "noise": {name: vars(noise) for name, noise in self.noise.items()},
+        }
+
+
+def _digits(value: float, half: float) -> int:
+    """How many digits of a value its interval determines, and one more."""
+    if not value or not half:
+        return 6
+    return int(np.clip(np.ceil(np.log10(abs(value) / half)) + 2, 2, 12))
+
+
+def resampled(information: FloatArray, determined: FloatArray, sizes: FloatArray) -> FloatArray:
+    """The deviations of the unknowns by the bootstrap, shape (p,).
+
+    Args:
+        information: As of `Fitted`.
+        determined: As of `Fitted`.
+        sizes: The sizes of the unknowns.
+    """
+    p, random = len(sizes), np.random.default_rng(0)
+    basis = sizes[:, None] * determined
+    count = len(information)
+    drawn = random.multinomial(count, np.full(count, 1.0 / count), RESAMPLED)
+    sums = np.tensordot(drawn.astype(float), information, axes=1)
+    left = np.einsum("ia,kij,jb->kab", basis, sums[:, :, :p], basis)
+    right = np.einsum("ia,ki->ka", basis, sums[:, :, p])
+    # A draw may leave out the only pieces that determine something.
+    changes = np.array([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(left, right)])  # noqa: B905
+    return np.std(changes @ basis.T, axis=0)

@@ -1,0 +1,153 @@
+"""Parameters of a plant from records of it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.simulation.records.record import Record
+from drake_dae.studies.identification.driven import Driven
+from drake_dae.studies.identification.fit import SMALLEST, Fit, Fitted
+from drake_dae.studies.identification.identified import (
+    SHARE,
+    WHITE,
+    Identified,
+    Noise,
+    resampled,
+)
+from drake_dae.studies.identification.measured import Channel, measured, measured_ports
+from drake_dae.studies.identification.pieces import Pieces
+from drake_dae.studies.identification.unknowns import Unknowns
+
+
+@checked(ModelError)
+def identify(
+    loop: ClosedLoop,
+    context: Context,
+    records: Sequence[Record] | Mapping[str, Record],
+    free: Sequence[str],
+) -> Identified:
+    """Parameters of the plant of a loop, with their uncertainty, from records of it.
+
+    The plant alone is driven by the recorded controls; the law plays no part. Records are cut into
+    short pieces, each from a state of its own, and the unknowns, all these states among them,
+    minimize
+
+        sum |measured - computed|^2 / noise^2
+
+    under the condition that a piece begins where the one before ends, and on N*: multiple shooting
+    with steps of Gauss-Newton and exact derivatives. The noise of each kind of measurement is that
+    of what is left.
+
+    Measured are the positions of the state, as the loop's encoders show them if it has any, and the
+    constraint forces, of its sensor if it has one. Velocities are not: they are estimated.
+
+    Args:
+        loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`; contacts
+            stay closed, or are compliant.
+        context: A context of its diagram; parameters begin with its values, and all others have
+            them.
+        records: The records, by name or in a list: of this plant under any law, with the signals
+            "control" and "state" (or the encoders'), and "constraint_force" or "measured_force".
+        free: Names of the plant's parameters, such as "tool.mass", "wall.position[0]" or
+            "plant.stiffness"; "force.bias" and "position.bias" are what sensors add.
+
+    Raises:
+        ModelError: There is no such parameter, a record does not fit the plant, the plant is of
+            another kind, or no values are found.
+
+    Source: Bock, Randwertproblemmethoden zur Parameteridentifizierung, 1987 (multiple shooting);
+    Bierman, Factorization Methods for Discrete Sequential Estimation, 1977.
+    """
+    unknowns = Unknowns.of(loop, free)
+    named = records if isinstance(records, Mapping) else _numbered(records)
+    if not named:
+        raise ModelError("there is no record to identify parameters from")
+    driven = Driven(loop, context, measured_ports(loop), unknowns.places)
+    pieces = []
+    for title, record in named.items():
+        data = measured(record, driven, title)
+        biases = unknowns.biases(data.channels)
+        pieces.append(Pieces(driven, data, biases, len(unknowns.all) - len(unknowns.places)))
+    start = unknowns.start(driven.nominal, pieces[0].data.channels)
+    sizes = np.where(start != 0.0, np.abs(start), 1.0)
+    lowest = np.array([unknown.lowest for unknown in unknowns.all])
+    fitted = Fit(pieces, start, sizes, lowest).run()
+    return _identified(loop, unknowns, start, sizes, pieces, fitted)
+
+
+def _numbered(records: Sequence[Record]) -> dict[str, Record]:
+    if len(records) == 1:
+        return {"the record": records[0]}
+    return {f"record {number}": record for number, record in enumerate(records, 1)}
+
+
+def _identified(
+    loop: ClosedLoop,
+    unknowns: Unknowns,
+    start: FloatArray,
+    sizes: FloatArray,
+    pieces: Sequence[Pieces],
+    fitted: Fitted,
+) -> Identified:
+    names, p = [unknown.name for unknown in unknowns.all], start.size
+    basis = sizes[:, None] * fitted.determined
+    information = fitted.information[:, :, :p].sum(axis=0)
+    covariance = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
+    bootstrap = resampled(fitted.information, fitted.determined, sizes)
+    is_open = np.square(fitted.undetermined).sum(axis=1) > SHARE**2
+    covariance[is_open] = covariance[:, is_open] = np.nan
+    bootstrap[is_open] = np.nan
+    undetermined = tuple(
+        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE))
+        for column in fitted.undetermined.T
+    )
+    noise = _noise(loop, pieces, fitted)
+    given = fitted.values, start, covariance, bootstrap, undetermined, noise, fitted.errors
+    return Identified(unknowns.all, *given)
+
+
+def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[str, Noise]:
+    """What is left of each group of measured columns, over all records."""
+    groups = dict[tuple[str, str], list[FloatArray]]()
+    one_of = dict[tuple[str, str], Channel]()
+    least = dict[tuple[str, str], float]()
+    for each, errors in zip(pieces, fitted.errors, strict=True):
+        for channel, column in zip(each.data.channels, errors.T, strict=True):
+            own = column[np.isfinite(column)]
+            groups.setdefault(channel.group, []).append(own)
+            one_of[channel.group] = channel
+            spread = float(np.nanstd(each.data.values))
+            least[channel.group] = max(SMALLEST * spread, least.get(channel.group, 0.0))
+    found, signals = {}, [signal for signal, _ in groups]
+    for (signal, unit), columns in groups.items():
+        correlations = [_correlation(column) for column in columns]
+        largest = max(correlations, key=abs)
+        deviation = float(np.sqrt(np.mean(np.square(np.concatenate(columns)))))
+        limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
+        is_white = abs(largest) < limit or deviation < least[signal, unit]
+        name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
+        stated = _stated(loop, one_of[signal, unit])
+        found[name] = Noise(unit, deviation, stated, largest, is_white)
+    return found
+
+
+def _correlation(errors: FloatArray) -> float:
+    """The correlation of errors with the next ones."""
+    own = errors - errors.mean()
+    power = float(own @ own)
+    return float(own[1:] @ own[:-1]) / power if power else 0.0
+
+
+def _stated(loop: ClosedLoop, channel: Channel) -> float | None:
+    """The deviation that a sensor is said to have."""
+    if channel.signal == "measured_force" and loop.sensor is not None:
+        return float(loop.sensor.noise_deviation[channel.place])
+    if channel.signal != "state" and channel.port == "state" and loop.encoders is not None:
+        deviation = loop.encoders.sensor.encoders.position_deviation
+        return float(np.max(deviation))
+    return None

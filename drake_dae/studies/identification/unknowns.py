@@ -1,0 +1,152 @@
+"""The parameters that an identification is asked for, by name."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.studies.identification.measured import Channel
+
+FORCE_BIAS, POSITION_BIAS = "force.bias", "position.bias"
+"""What sensors add to forces and to positions."""
+
+_ENTRY = re.compile(r"(.+)\[(\d+)\]")
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A number that is asked for.
+
+    Attributes:
+        name: The name of the parameter, with its entry if it has several.
+        parameter: The name without the entry.
+        entry: The entry.
+        unit: Its unit.
+        lowest: Its lower bound; -inf for none.
+        place: Its place in numeric parameter 0 of the plant; -1 for a bias.
+    """
+
+    name: str
+    parameter: str
+    entry: int
+    unit: str
+    lowest: float = -np.inf
+    place: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """All numbers that are asked for, those of the plant first.
+
+    Attributes:
+        all: The numbers.
+    """
+
+    all: tuple[Unknown, ...]
+
+    @classmethod
+    def of(cls, loop: ClosedLoop, free: Sequence[str]) -> Self:
+        """By the names of parameters.
+
+        Args:
+            loop: The loop.
+            free: Names of the plant's parameters, "link1.mass"; entries, "wall.position[0]"; and
+                FORCE_BIAS and POSITION_BIAS.
+
+        Raises:
+            ModelError: There is no such parameter or entry, it is named twice, or it moves.
+        """
+        if isinstance(free, str) or not free:
+            raise ModelError(f"free must be a list of names of parameters, got {free!r}")
+        known = {one.name: one for one in _all(loop)}
+        names = dict[str, list[Unknown]]()
+        for one in known.values():
+            names.setdefault(one.parameter, []).append(one)
+        found: list[Unknown] = []
+        for name in free:
+            entries = [known[name]] if name in known else names.get(name)
+            if entries is None:
+                match = _ENTRY.fullmatch(name)
+                if match and match[1] in names:
+                    raise ModelError(
+                        f"'{match[1]}' has {len(names[match[1]])} entries, counted from 0, and "
+                        f"no entry {match[2]}"
+                    )
+                raise ModelError(unknown_name("parameter to identify", name, names))
+            found += entries
+        doubles = {one.name for one in found if found.count(one) > 1}
+        if doubles:
+            raise ModelError(f"'{min(doubles)}' is named twice in free")
+        plant = loop.plant
+        moving = {
+            one.name for one in found if one.place in plant.exogenous_places and one.place >= 0
+        }
+        if moving:
+            raise ModelError(
+                f"'{min(moving)}' is an exogenous signal, which moves as its references say; only "
+                "constants are identified"
+            )
+        return cls(tuple(sorted(found, key=lambda one: one.place < 0)))
+
+    @property
+    def places(self) -> list[int]:
+        """The places of those of the plant."""
+        return [one.place for one in self.all if one.place >= 0]
+
+    def biases(self, channels: Sequence[Channel]) -> np.ndarray:
+        """For each measured column the bias that it has, counted from 0; -1 for none.
+
+        Raises:
+            ModelError: A bias is asked for of a column that is not measured.
+        """
+        own = [one for one in self.all if one.place < 0]
+        found = np.full(len(channels), -1)
+        for number, unknown in enumerate(own):
+            is_force = unknown.parameter == FORCE_BIAS
+            for column, channel in enumerate(channels):
+                if (channel.port != "state") == is_force and channel.place == unknown.entry:
+                    found[column] = number
+            if number not in found:
+                raise ModelError(f"the records do not measure what '{unknown.name}' is added to")
+        return found
+
+    def start(self, nominal: FloatArray, channels: Sequence[Channel]) -> FloatArray:
+        """The values to begin with: those of the plant, and the known biases."""
+        places = self.biases(channels)
+        known = [channels[int(np.argmax(places == i))].bias for i in range(int(places.max()) + 1)]
+        return np.concatenate([nominal, known])
+
+
+def _all(loop: ClosedLoop) -> list[Unknown]:
+    """All numbers that can be asked for."""
+    found, plant = [], loop.plant
+    for parameter in plant.dae.parameters:
+        first = plant.dae.parameter_slice(parameter.name).start
+        lowest = 0.0 if parameter.positive or parameter.nonnegative else -np.inf
+        found += [
+            Unknown(name, parameter.name, entry, parameter.unit, lowest, first + entry)
+            for entry, name in enumerate(_names(parameter.name, parameter.value.size))
+        ]
+    for name, (signal, place) in plant.further_parameters.items():
+        found.append(Unknown(name, name, 0, signal.unit, 0.0, place))
+    for name, signals in (
+        (FORCE_BIAS, plant.dae.constraint_input_signals),
+        (POSITION_BIAS, plant.dae.state_signals),
+    ):
+        found += [
+            Unknown(own, name, entry, signal.unit)
+            for entry, (own, signal) in enumerate(
+                zip(_names(name, len(signals)), signals, strict=True)
+            )
+            if name == FORCE_BIAS or "/s" not in signal.unit
+        ]
+    return found
+
+
+def _names(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}[{entry}]" for entry in range(count)]
