@@ -98,7 +98,7 @@ def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
     A signal waits meanwhile: Drake's modules would convert it to an ImportError.
     """
     with ending_signals(interruption := Interruption()):
-        module = {"schema": "keys", "render": "plot"}.get(command, command)
+        module = {"schema": "keys", "print": "keys", "render": "plot"}.get(command, command)
         run_command: Callable[[argparse.Namespace], int] = import_module(
             f"drake_dae.commands.{module}"
         ).run_command

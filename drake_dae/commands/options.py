@@ -113,6 +113,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_json(examine, "print JSON")
     _add_sweep(commands, named)
+    _add_identify(commands)
     _add_new(commands)
     written = commands.add_parser(
         "export",
@@ -276,6 +277,46 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
     study.add_argument(
         "--out", type=_path, help="folder for the results (default: runs/<scenario>-sweep)"
     )
+
+
+def _add_identify(commands: Any) -> None:
+    found = commands.add_parser(
+        "identify",
+        help="find masses, friction, stiffness, places and biases from records",
+        description="Finds parameters of the plant of a scenario from records of it, with 95 % "
+        "intervals, what the records do not determine, and what is left of each measurement. The "
+        "plant alone is driven by the recorded controls; contacts stay closed or are compliant.",
+    )
+    found.add_argument(
+        "records", nargs="+", type=_path, metavar="RECORD", help="a run's folder, .npz, or a .csv"
+    )
+    found.add_argument(
+        "--free",
+        action="append",
+        required=True,
+        metavar="NAMES",
+        help="parameters of the plant, as tool.mass,wall.position[0],plant.friction, and force.bias"
+        " or position.bias of sensors; may be repeated",
+    )
+    found.add_argument(
+        "--scenario", help="that of the plant (default: the one in the first record)"
+    )
+    found.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change the scenario that --scenario names; may be repeated",
+    )
+    found.add_argument(
+        "--columns",
+        type=_path,
+        metavar="FILE",
+        help='of a .csv: a YAML file with lines "column: control.joint1_motor"',
+    )
+    found.add_argument("--out", type=_path, metavar="FILE", help="a scenario with these values")
+    _add_json(found, "print the values as JSON")
 
 
 def _path(text: str) -> Path:

@@ -3,13 +3,12 @@
 import argparse
 from pathlib import Path
 
-from drake_dae.commands.run_folder import FILM, PART, RECORD, SCENARIO, stage
+from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
-from drake_dae.simulation.records.record import Record
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -26,7 +25,7 @@ def _render(options: argparse.Namespace) -> Path:
     folder: Path = options.folder
     if not (folder / SCENARIO).is_file():
         raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
-    record = _load(folder)
+    record = load_run(folder)
     loop, context = build_scenario(load_scenario(folder / SCENARIO, []))
     path: Path = options.out or folder / FILM
     with stage(path.parent, path.name) as place:
@@ -41,29 +40,12 @@ def _plot(options: argparse.Namespace) -> Path:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
     if len(set(options.runs)) < len(options.runs):
         raise ModelError("a run is named twice; name each run once")
-    records = {_label(run, options.runs): _load(run) for run in options.runs}
+    records = {_label(run, options.runs): load_run(run) for run in options.runs}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)
     with stage(path.parent, path.name) as place:
         figure.savefig(place / path.name, dpi=110)
     return path
-
-
-def _load(path: Path) -> Record:
-    """The record of a run.
-
-    Args:
-        path: Its folder, or the file of the record.
-
-    Raises:
-        ModelError: There is none.
-    """
-    if not path.is_dir():
-        return Record.load(path)
-    for name in (RECORD, PART):
-        if (path / name).is_file():
-            return Record.load(path / name)
-    raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
 
 
 def _label(path: Path, paths: list[Path]) -> str:

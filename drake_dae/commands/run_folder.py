@@ -15,6 +15,7 @@ from drake_dae.errors import ModelError
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.profile import PROFILE
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.simulation.records.record import Record
 
 SCENARIO = "scenario.yaml"
 RECORD = "record.npz"
@@ -68,6 +69,23 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
         yield kept
     finally:
         os.close(lock)
+
+
+def load_run(path: Path) -> Record:
+    """The record of a run.
+
+    Args:
+        path: Its folder, or the file of the record.
+
+    Raises:
+        ModelError: There is none.
+    """
+    if not path.is_dir():
+        return Record.load(path)
+    for name in (RECORD, PART):
+        if (path / name).is_file():
+            return Record.load(path / name)
+    raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
 
 
 def _prepare(folder: Path) -> tuple[int, Path | None]:

@@ -1,6 +1,5 @@
 """The record of a run: every signal over time, with names and units."""
 
-import csv
 import html
 import json
 import platform
@@ -21,6 +20,7 @@ from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import open_file
+from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
 from drake_dae.systems.plants.contact_events import ContactEvent
 
@@ -106,7 +106,7 @@ class Record:
         """A table of the signals, as a notebook shows it."""
         rows = "".join(
             f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
-            f"<td>{html.escape(listed(map(_label, recorded.signals))[1:-1])}</td></tr>"
+            f"<td>{html.escape(listed(map(label, recorded.signals))[1:-1])}</td></tr>"
             for name, recorded in self.signals.items()
         )
         return (
@@ -207,16 +207,27 @@ class Record:
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
         Events are not among them; see `event_rows`.
         """
-        columns = [
-            f"{name}.{_label(signal)}"
-            for name, recorded in self.signals.items()
-            for signal in recorded.signals
-        ]
-        rows = np.column_stack([self.time, *(r.values for r in self.signals.values())])
-        with open(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["time [s]", *columns])
-            writer.writerows(rows.tolist())
+        write_csv(path, self.time, {n: (r.values, r.signals) for n, r in self.signals.items()})
+
+    @classmethod
+    def from_csv(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
+        """Reads a file of `to_csv`, or the log of a robot.
+
+        A row has what is so just before its time: a control that is held between samples is that of
+        the time before, up to this row.
+
+        Args:
+            path: The file, with a line of names and then a line for each time.
+            columns: A column of the file -> its name in the record, "time" or "<signal>.<name>" as
+                in `to_csv`, with or without a unit in brackets; other columns are left out. None if
+                the file has these names itself.
+
+        Raises:
+            ModelError: The file cannot be read, it lacks a column, some entry is not a number, or
+                times do not increase.
+        """
+        time, signals = read_csv(path, columns)
+        return cls(time, {name: Recorded(*given) for name, given in signals.items()})
 
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
@@ -229,7 +240,7 @@ class Record:
         """
         pandas = _needed("pandas", "to_dataframe")
         pairs = [
-            (name, _label(signal))
+            (name, label(signal))
             for name, recorded in self.signals.items()
             for signal in recorded.signals
         ]
@@ -283,10 +294,6 @@ class Record:
 
 RecordAfter = Callable[[float | None], Record]
 """From a time in s, or None, to what a run has recorded later."""
-
-
-def _label(signal: Signal) -> str:
-    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
 
 
 def _needed(module: str, asked: str) -> Any:
