@@ -29,11 +29,11 @@ class Moved(NamedTuple):
     Attributes:
         values: Shape (j, k).
         slopes: Their derivatives with respect to the state at the beginning and to the unknown
-            parameters, shape (j, k, n + p).
+            parameters, shape (j, k, n + p); None where nobody asks for them.
     """
 
     values: FloatArray
-    slopes: FloatArray
+    slopes: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,42 +159,48 @@ class Driven:
         nothing = ca.SX(0, 1)
         return [time, *((nothing, state) if self.period else (state, nothing)), values]
 
-    def _function(self, value: ca.SX, valid: ca.SX) -> Many:
-        """A function with its derivatives with respect to state and unknown parameters."""
+    def _functions(self, value: ca.SX, valid: ca.SX) -> tuple[Many, Many]:
+        """A function, and one with its derivatives with respect to state and unknown parameters."""
         by = ca.vertcat(self._symbols[1], self._symbols[2])
+        shown = ca.densify(value) + 0.0 * valid
         slopes = ca.densify(ca.vec(ca.jacobian(value, by).T))
-        return Many(
-            ca.Function(
-                "driven",
-                self._symbols,
-                ca.cse([ca.densify(value) + 0.0 * valid, slopes]),
-                {"cse": False},
-            )
+        plain, full = (
+            Many(ca.Function("driven", self._symbols, ca.cse(values), {"cse": False}))
+            for values in ([shown], [shown, slopes])
         )
+        return plain, full
 
     @cached_property
-    def _moves(self) -> Many:
+    def _moves(self) -> tuple[Many, Many]:
         """The derivative of the state, or the next state of a discrete plant."""
         compiled, given = self._compiled, self._arguments()
         if not self.period:
-            return self._function(*compiled.rate.call(given))
+            return self._functions(*compiled.rate.call(given))
         (rate,) = compiled.rates
         noise = ca.SX.zeros(compiled.sizes["noise"])
         values, valid = rate.function.call([*given, noise])
         state = ca.SX(self._symbols[1])
         state[list(rate.places)] = values
-        return self._function(state, valid)
+        return self._functions(state, valid)
 
     @cached_property
-    def _shows(self) -> Many:
-        return self._function(*self._compiled.row.call(self._arguments()))
+    def _shows(self) -> tuple[Many, Many]:
+        return self._functions(*self._compiled.row.call(self._arguments()))
 
     def _called(
-        self, function: Many, time: FloatArray, moved: Moved, unknown: FloatArray, u: FloatArray
+        self,
+        functions: tuple[Many, Many],
+        time: FloatArray,
+        moved: Moved,
+        unknown: FloatArray,
+        control: FloatArray,
     ) -> Moved:
         """A function at many moments, with derivatives along those of the state."""
-        count, n = moved.values.shape
-        values, flat = function(time[:, None], moved.values, unknown, u, self.base)
+        plain, full = functions
+        given = time[:, None], moved.values, unknown, control, self.base
+        if moved.slopes is None:
+            return Moved(plain(*given)[0])
+        (count, n), (values, flat) = moved.values.shape, full(*given)
         local = flat.reshape(count, -1, n + unknown.size)
         slopes = np.matmul(local[:, :, :n], moved.slopes)
         slopes[:, :, n:] += local[:, :, n:]
@@ -259,19 +265,23 @@ class Driven:
         unknown: FloatArray,
         controls: Sequence[FloatArray],
     ) -> Moved:
-        values, slopes = moved.values.copy(), moved.slopes.copy()
-        stage, rate, step = moved, moved, (h[:, None], h[:, None, None])
-        for half, weight in zip(HALVES, WEIGHTS, strict=True):
+        stage, rates = moved, list[Moved]()
+        for half in HALVES:
             if half:
-                stage = Moved(
-                    moved.values + half * step[0] * rate.values,
-                    moved.slopes + half * step[1] * rate.slopes,
-                )
+                stage = _ahead(moved, half * h, rates[-1:], (1.0,))
             control = controls[int(2 * half)]
-            rate = self._called(self._moves, time + half * h, stage, unknown, control)
-            values += weight * step[0] * rate.values
-            slopes += weight * step[1] * rate.slopes
-        return Moved(values, slopes)
+            rates.append(self._called(self._moves, time + half * h, stage, unknown, control))
+        return _ahead(moved, h, rates, WEIGHTS)
+
+
+def _ahead(moved: Moved, h: FloatArray, rates: Sequence[Moved], weights: Sequence[float]) -> Moved:
+    """What a step along the weighted sum of rates leads to."""
+    values, slopes = moved
+    for weight, rate in zip(weights, rates, strict=True):
+        values = values + (weight * h)[:, None] * rate.values
+        if slopes is not None and rate.slopes is not None:
+            slopes = slopes + (weight * h)[:, None, None] * rate.slopes
+    return Moved(values, slopes)
 
 
 def holds_control(plant: Plant, wires: Wires) -> bool:

@@ -26,6 +26,9 @@ MOST = 25
 CLOSE = 1e-2
 """A step is the last one with a coupling if it is shorter than this part of the deviations."""
 
+SHORTER = 0.5
+"""With derivatives of before, a step must be shorter than the last one by this factor."""
+
 WEAK = 1e3
 """The deviation of a state that nothing is known about, in its size."""
 
@@ -88,30 +91,43 @@ class Fit:
     def run(self) -> Fitted:
         """Fits.
 
+        Derivatives are computed anew only where steps with old ones do not become shorter, and at
+        the end: they take most of the time.
+
         Raises:
             ModelError: The computed motion leaves the recorded one, or the steps do not come to an
                 end.
         """
+        known: list[Slopes] | None = None
         for coupling in COUPLINGS:
+            before = np.inf
             for _ in range(MOST):
-                slopes, chains = self._chained(coupling)
-                length = self._step(slopes, chains)
+                slopes, chains = self._chained(coupling, known)
+                length, is_new = self._step(slopes, chains), known is None
+                is_last = coupling == COUPLINGS[-1]
+                known = slopes if length < SHORTER * before else None
+                before = length
                 if length < CLOSE:
-                    break
+                    if is_new or not is_last:
+                        break
+                    known = None
             else:
-                if coupling == COUPLINGS[-1]:
+                if is_last:
                     raise ModelError(
                         f"the steps toward the best values have not come to an end after {MOST}: "
                         "the record does not fit this robot, or the values to begin with are far "
                         "off; free fewer parameters first"
                     )
-        return self._fitted(*self._chained(COUPLINGS[-1]))
+        return self._fitted(slopes, chains)
 
-    def _chained(self, coupling: float) -> tuple[list[Slopes], list[Chain]]:
+    def _chained(
+        self, coupling: float, known: Sequence[Slopes] | None
+    ) -> tuple[list[Slopes], list[Chain]]:
         slopes, chains = [], []
         for index, pieces in enumerate(self._pieces):
-            found = pieces.slopes(self._states[index], self._values)
-            is_finite = np.isfinite(found.ends).all()
+            old = None if known is None else known[index]
+            found = pieces.slopes(self._states[index], self._values, old)
+            is_finite = np.isfinite(found.ends).all() and np.isfinite(found.of_ends).all()
             is_measured = np.isfinite(pieces.values)
             if not (is_finite and np.isfinite(found.errors[is_measured]).all()):
                 raise ModelError(

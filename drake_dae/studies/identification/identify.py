@@ -23,6 +23,9 @@ from drake_dae.studies.identification.measured import Channel, measured, measure
 from drake_dae.studies.identification.pieces import Pieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
+BRIEF, LONG = 2000, 4000
+"""Of a record with more rows than the latter, so many are used for a first estimate."""
+
 
 @checked(ModelError)
 def identify(
@@ -76,7 +79,10 @@ def identify(
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([unknown.lowest for unknown in unknowns.all])
-    fitted = Fit(pieces, start, sizes, lowest).run()
+    near = start
+    if any(each.data.times.size > LONG for each in pieces):
+        near = Fit([each.first(BRIEF) for each in pieces], start, sizes, lowest).run().values
+    fitted = Fit(pieces, near, sizes, lowest).run()
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
 
 

@@ -1,6 +1,6 @@
 """A record cut into short pieces, each from a state of its own: multiple shooting."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from drake_dae.arrays import FloatArray
-from drake_dae.studies.identification.driven import Driven
+from drake_dae.studies.identification.driven import Driven, Moved
 from drake_dae.studies.identification.measured import Measured
 
 DURATION, ROWS = 0.01, 10
@@ -127,36 +127,60 @@ class Pieces:
             for k in range(self.length)
         ]
 
-    def slopes(self, states: FloatArray, unknown: FloatArray) -> Slopes:
+    def slopes(
+        self, states: FloatArray, unknown: FloatArray, known: Slopes | None = None
+    ) -> Slopes:
         """All pieces from some states.
 
         Args:
             states: Where they begin, shape (j, n).
             unknown: The unknowns of the plant, then the biases, shape (p,).
+            known: Pieces nearby, whose derivatives are taken; None for new ones.
         """
-        driven, times, (count, n) = self.driven, self.data.times[self.rows], states.shape
-        p = unknown.size
-        of_plant, biases = np.split(unknown, [p - self.num_biases])
-        moved = driven.begun(states)
-        errors = np.full((count, self.length, len(self.data.channels)), np.nan)
-        of_errors = np.zeros((*errors.shape, n + p))
-        size = n + of_plant.size
-        residuals = np.zeros((count, 0)), np.zeros((count, 0, n + p))
+        driven, times = self.driven, self.data.times[self.rows]
+        of_plant, biases = np.split(unknown, [unknown.size - self.num_biases])
+        moved = driven.begun(states) if known is None else Moved(states)
+        shown = list[Moved]()
         for k, controls in enumerate(self._controls):
-            seen = driven.seen(times[:, k], moved, of_plant, self.data.acting[self.rows[:, k]])
-            errors[:, k] = self.values[:, k] - seen.values[:, self._places]
-            of_errors[:, k, :, :size] = -seen.slopes[:, self._places]
-            if k == 0:
-                own = self._residuals
-                residuals = seen.values[:, own], np.zeros((count, own.stop - own.start, n + p))
-                residuals[1][:, :, :size] = seen.slopes[:, own]
+            acting = self.data.acting[self.rows[:, k]]
+            shown.append(driven.seen(times[:, k], moved, of_plant, acting))
             moved = driven.step(times[:, k], times[:, k + 1], moved, of_plant, controls)
-        for column in np.flatnonzero(self.biases >= 0):
-            errors[:, :, column] -= biases[self.biases[column]]
-            of_errors[:, :, column, size + self.biases[column]] = -1.0
-        of_ends = np.zeros((count, n, n + p))
-        of_ends[:, :, :size] = moved.slopes
-        return Slopes(errors, of_errors, moved.values, of_ends, residuals)
+        places, own = self._places, self._residuals
+        errors = self.values - np.stack([each.values[:, places] for each in shown], axis=1)
+        of_column = np.append(biases, 0.0)[self.biases]  # The last one is that of no bias.
+        errors -= of_column
+        residual = shown[0].values[:, own]
+        if known is not None:
+            _, of_errors, _, of_ends, (_, of_residual) = known
+            return Slopes(errors, of_errors, moved.values, of_ends, (residual, of_residual))
+        of_errors = -np.stack([_slopes(each)[:, places] for each in shown], axis=1)
+        of_biases = -np.eye(self.num_biases + 1)[self.biases][:, : self.num_biases]
+        return Slopes(
+            errors,
+            np.concatenate(
+                [of_errors, np.broadcast_to(of_biases, (*errors.shape, self.num_biases))], axis=3
+            ),
+            moved.values,
+            self._padded(_slopes(moved)),
+            (residual, self._padded(_slopes(shown[0])[:, own])),
+        )
+
+    def _padded(self, slopes: FloatArray) -> FloatArray:
+        """Derivatives with respect to biases as well, which are zero."""
+        return np.concatenate([slopes, np.zeros((*slopes.shape[:2], self.num_biases))], axis=2)
+
+    def first(self, count: int) -> "Pieces":
+        """The first rows alone."""
+        given = self.data
+        data = replace(
+            given,
+            times=given.times[:count],
+            acting=given.acting[:count],
+            controls=given.controls[:count],
+            states=given.states[:count],
+            values=given.values[:count],
+        )
+        return replace(self, data=data)
 
     def fine_enough(self, unknown: FloatArray) -> "Pieces":
         """The same with steps so short that the ends of pieces are accurate."""
@@ -165,7 +189,7 @@ class Pieces:
         few = np.unique(np.linspace(0, len(self.rows) - 1, 8).astype(int))
         found, ends = self, self._some_ends(few, unknown)
         while found.parts < MOST_PARTS:
-            finer = Pieces(self.driven, self.data, self.biases, self.num_biases, 2 * found.parts)
+            finer = replace(self, parts=2 * found.parts)
             after = finer._some_ends(few, unknown)
             change = np.abs(after - ends) / self.driven.scale
             if np.isfinite(change).all() and change.max() < ACCURATE:
@@ -177,8 +201,13 @@ class Pieces:
         """The ends of some pieces."""
         of_plant = unknown[: unknown.size - self.num_biases]
         times = self.data.times[self.rows][pieces]
-        moved = self.driven.begun(self.first_states[pieces])
+        moved = Moved(self.first_states[pieces])
         for k, controls in enumerate(self._controls):
             own = [each[pieces] for each in controls]
             moved = self.driven.step(times[:, k], times[:, k + 1], moved, of_plant, own)
         return moved.values
+
+
+def _slopes(moved: Moved) -> FloatArray:
+    assert moved.slopes is not None
+    return moved.slopes
