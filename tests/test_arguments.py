@@ -58,6 +58,8 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
+from drake_dae.studies.identification.identified import Identified, Noise
+from drake_dae.studies.identification.unknowns import Unknown
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
@@ -170,6 +172,17 @@ def scenario() -> Scenario:
 # A value of each type that is fine where nothing else is said.
 SAMPLES: dict[Any, Callable[[], Any]] = {
     TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
+    Unknown: lambda: Unknown("link1.mass", "link1.mass", 0, "kg"),
+    Noise: lambda: Noise("rad", 1e-4, None, 0.1, True),
+    Identified: lambda: Identified(
+        (Unknown("link1.mass", "link1.mass", 0, "kg"),),
+        *np.ones((2, 1)),
+        np.eye(1),
+        np.ones(1),
+        (),
+        {},
+        [],
+    ),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,

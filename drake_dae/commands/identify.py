@@ -11,11 +11,13 @@ from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
-from drake_dae.studies.identification.of_scenario import identify_scenario, recorded_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Identifies what the options name; returns the exit code."""
+    # SciPy's splines take a fifth of a second to load.
+    from drake_dae.studies.identification.of_scenario import identify_scenario, recorded_scenario
+
     columns = None if options.columns is None else _columns(options.columns)
     if len(set(options.records)) < len(options.records):
         raise ModelError("a record is named twice; name each record once")

@@ -10,7 +10,8 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
-from drake_dae.running.rollout.stepping.fused import Called, Fused
+from drake_dae.running.rollout.stepping.called import Called
+from drake_dae.running.rollout.stepping.fused import Fused
 from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
 

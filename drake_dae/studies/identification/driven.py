@@ -202,7 +202,8 @@ class Driven:
             return Moved(plain(*given)[0])
         (count, n), (values, flat) = moved.values.shape, full(*given)
         local = flat.reshape(count, -1, n + unknown.size)
-        slopes = np.matmul(local[:, :, :n], moved.slopes)
+        with np.errstate(all="ignore"):  # The caller sees what is not finite.
+            slopes = np.matmul(local[:, :, :n], moved.slopes)
         slopes[:, :, n:] += local[:, :, n:]
         return Moved(values, slopes)
 

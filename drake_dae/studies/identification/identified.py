@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, listed
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, listed, unknown_name
+from drake_dae.errors import ModelError
 from drake_dae.studies.identification.unknowns import Unknown
 
 NORMAL = 1.96
@@ -30,6 +32,7 @@ STRONG = 0.95
 """Correlations of two unknowns above this are printed."""
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Noise:
     """What is left of some measured columns.
@@ -49,6 +52,7 @@ class Noise:
     is_white: bool
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Identified:
     """Parameters with their uncertainty, from records.
@@ -78,13 +82,29 @@ class Identified:
     noise: Mapping[str, Noise]
     errors: Sequence[FloatArray] = field(repr=False)
 
+    def __post_init__(self) -> None:
+        p = len(self.unknowns)
+        sizes = {"values": (p,), "start": (p,), "covariance": (p, p), "bootstrap": (p,)}
+        for name, shape in sizes.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise ModelError(
+                    f"{name} of {p} parameters must have shape {shape}, got "
+                    f"{np.shape(getattr(self, name))}"
+                )
+
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the parameters."""
         return tuple(unknown.name for unknown in self.unknowns)
 
     def __getitem__(self, name: str) -> float:
-        """The value of a parameter."""
+        """The value of a parameter.
+
+        Raises:
+            ModelError: It was not asked for.
+        """
+        if name not in self.names:
+            raise ModelError(unknown_name("identified parameter", name, self.names))
         return float(self.values[self.names.index(name)])
 
     @property

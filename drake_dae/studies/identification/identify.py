@@ -78,7 +78,7 @@ def identify(
         pieces.append(Pieces(driven, data, biases, len(unknowns.all) - len(unknowns.places)))
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
-    lowest = np.array([unknown.lowest for unknown in unknowns.all])
+    lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
     near = start
     if any(each.data.times.size > LONG for each in pieces):
         near = Fit([each.first(BRIEF) for each in pieces], start, sizes, lowest).run().values

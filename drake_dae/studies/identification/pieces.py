@@ -15,11 +15,15 @@ DURATION, ROWS = 0.01, 10
 """A piece lasts so long in s, and has at least so many rows: in stiff contact a longer one loses
 the contact where states and parameters are wrong."""
 
-ACCURATE = 1e-8
+ACCURATE = 1e-7
 """Steps are halved until the end of a piece changes by less than this, relative to the state."""
 
-MOST_PARTS = 64
-"""A step between two rows is divided into at most so many."""
+SOME = 8
+"""Steps are compared in so many pieces."""
+
+MOST_PARTS, ENOUGH = 64, 8
+"""A step between two rows is divided into at most so many, and what is not finite with the latter
+is not with more."""
 
 
 class Slopes(NamedTuple):
@@ -186,15 +190,18 @@ class Pieces:
         """The same with steps so short that the ends of pieces are accurate."""
         if self.driven.period:
             return self
-        few = np.unique(np.linspace(0, len(self.rows) - 1, 8).astype(int))
+        few = np.unique(np.linspace(0, len(self.rows) - 1, SOME).astype(int))
         found, ends = self, self._some_ends(few, unknown)
         while found.parts < MOST_PARTS:
             finer = replace(self, parts=2 * found.parts)
             after = finer._some_ends(few, unknown)
-            change = np.abs(after - ends) / self.driven.scale
+            sizes = np.maximum(self.driven.scale, np.abs(after).max(axis=0))
+            change = np.abs(after - ends) / sizes
             if np.isfinite(change).all() and change.max() < ACCURATE:
                 return found
             found, ends = finer, after
+            if found.parts >= ENOUGH and not np.isfinite(ends).all():
+                break  # It is not the steps.
         return found
 
     def _some_ends(self, pieces: np.ndarray, unknown: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
@@ -18,6 +19,7 @@ FORCE_BIAS, POSITION_BIAS = "force.bias", "position.bias"
 _ENTRY = re.compile(r"(.+)\[(\d+)\]")
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Unknown:
     """A number that is asked for.
@@ -27,7 +29,7 @@ class Unknown:
         parameter: The name without the entry.
         entry: The entry.
         unit: Its unit.
-        lowest: Its lower bound; -inf for none.
+        lowest: Its lower bound; None for none.
         place: Its place in numeric parameter 0 of the plant; -1 for a bias.
     """
 
@@ -35,7 +37,7 @@ class Unknown:
     parameter: str
     entry: int
     unit: str
-    lowest: float = -np.inf
+    lowest: float | None = None
     place: int = -1
 
 
@@ -127,7 +129,7 @@ def _all(loop: ClosedLoop) -> list[Unknown]:
     found, plant = [], loop.plant
     for parameter in plant.dae.parameters:
         first = plant.dae.parameter_slice(parameter.name).start
-        lowest = 0.0 if parameter.positive or parameter.nonnegative else -np.inf
+        lowest = 0.0 if parameter.positive or parameter.nonnegative else None
         found += [
             Unknown(name, parameter.name, entry, parameter.unit, lowest, first + entry)
             for entry, name in enumerate(_names(parameter.name, parameter.value.size))

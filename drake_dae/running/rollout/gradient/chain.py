@@ -10,8 +10,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Problem, Tableau
+from drake_dae.running.rollout.stepping.called import Called
 from drake_dae.running.rollout.stepping.course import REACHED
-from drake_dae.running.rollout.stepping.fused import Called
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
 
 MOST = 8

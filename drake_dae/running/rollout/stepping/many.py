@@ -10,11 +10,12 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.running.rollout.stepping.called import Called
 
 BLOCK = 512
 """So many moments are computed together: what they need in between stays near the processor."""
 
-FEW = 32
+FEW = 96
 """For fewer moments than this CasADi's interpreter is as fast."""
 
 
@@ -83,6 +84,7 @@ class Many:
             [function.numel_out(i) for i in range(function.n_out())],
         ]
         self._given, self._found = ([np.zeros((k, BLOCK)) for k in each] for each in sizes)
+        self._one = Called(function)
         if known.issuperset(codes):
             self._steps = self._program(codes)
 
@@ -114,11 +116,11 @@ class Many:
         count = max(len(each) for each in arguments if each.ndim == 2)
         if count < FEW or not self._steps:
             rows = [np.broadcast_to(each, (count, each.shape[-1])) for each in arguments]
-            values = [self._function.call(list(moment)) for moment in zip(*rows, strict=True)]
-            return [
-                np.array([value.full()[:, 0] for value in column])
-                for column in zip(*values, strict=True)
-            ]
+            found = [np.empty((count, each.size)) for each in self._one.results]
+            for i in range(count):
+                for column, value in zip(found, self._one(*(row[i] for row in rows)), strict=True):
+                    column[i] = value
+            return found
         parts = [self._block(arguments, i, min(i + BLOCK, count)) for i in range(0, count, BLOCK)]
         return [np.concatenate(values) for values in zip(*parts, strict=True)]
 

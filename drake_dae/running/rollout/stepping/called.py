@@ -1,0 +1,36 @@
+"""A CasADi function on arrays of its own, without conversions."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+
+
+class Called:
+    """A CasADi function that is called on arrays of its own; a column of its is a row of these.
+
+    Args:
+        function: The function; its inputs and outputs are dense.
+
+    Attributes:
+        results: Its outputs, written over by each call, shapes (n,) or (k, n).
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        def array(shape: tuple[int, int]) -> FloatArray:
+            return np.zeros(shape[::-1] if shape[1] > 1 else shape[0])
+
+        self._arrays = [array(function.size_in(i)) for i in range(function.n_in())]
+        self.results = [array(function.size_out(i)) for i in range(function.n_out())]
+        self._buffer, self._evaluate = function.buffer()
+        for index, own in enumerate(self._arrays):
+            self._buffer.set_arg(index, own.reshape(-1).data)
+        for index, own in enumerate(self.results):
+            self._buffer.set_res(index, own.reshape(-1).data)
+
+    def __call__(self, *arguments: FloatArray | float) -> list[FloatArray]:
+        """The outputs."""
+        for array, given in zip(self._arrays, arguments, strict=True):
+            array[...] = given
+        self._evaluate()
+        return self.results
