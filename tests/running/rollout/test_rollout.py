@@ -412,7 +412,7 @@ def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_dome"])
 def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, compiled):
     """Steps of 10 ms by Euler leave them by 1e-5: after one Newton step alone it would be 1e-9."""
