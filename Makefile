@@ -18,6 +18,9 @@ BIN := $(VENV)/bin
 PICTURES := examples/pictures
 HOUSE := $(PICTURES)/house.png
 
+# Tests start some hundred processes, which compile all of the code again where none is kept.
+unexport PYTHONDONTWRITEBYTECODE
+
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 

@@ -6,7 +6,13 @@ import signal
 from collections.abc import Iterator
 
 import pytest
-from problems import PROBLEMS, Problem
+
+# Before NumPy is loaded: matrices here are small, and threads only wait for each other. What the
+# tests start inherits it.
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[threads] = "1"
+
+from problems import PROBLEMS, Problem  # noqa: E402
 
 
 @pytest.fixture(params=PROBLEMS)

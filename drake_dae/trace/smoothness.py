@@ -73,6 +73,8 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
         The first flaw; None if there is none.
     """
     function = ca.Function("f", [variable, other], [expression])
+    if not _may_have_flaw(function):
+        return None
     moving: dict[int, bool] = {}  # Whether an entry of the work vector depends on the variable.
     for i in range(function.n_instructions()):
         operation = function.instruction_id(i)
@@ -92,3 +94,16 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
                 return Flaw(_KINKS[operation])
         moving[function.instruction_output(i)[0]] = moves
     return None
+
+
+def _may_have_flaw(function: ca.Function) -> bool:
+    """Whether it holds an operation or a constant of a flaw; most hold none, and this is quick."""
+    operations = [function.instruction_id(i) for i in range(function.n_instructions())]
+    if not _KINKS.keys().isdisjoint(operations):
+        return True
+    constants = [
+        function.instruction_constant(i)
+        for i, operation in enumerate(operations)
+        if operation == ca.OP_CONST
+    ]
+    return not np.all(np.isfinite(constants))

@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 from campaign import bad_files, bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, REFUSED, RESULT
+from runs import some
 
 FEW, MANY = range(40), range(40, 110)
 FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 48)
 
 
 def each(few, many):
-    """Seeds; those of the second sequence are slow."""
-    return [*few, *(pytest.param(seed, marks=pytest.mark.slow) for seed in many)]
+    """Seeds; those of the second sequence are slow, and two of three of them thorough."""
+    return [*few, *some((pytest.param(seed, marks=pytest.mark.slow) for seed in many), of=3)]
 
 
 @pytest.mark.slow

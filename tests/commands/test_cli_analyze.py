@@ -312,7 +312,13 @@ def test_help_reports_the_exit_codes(capsys):
 
 @pytest.mark.slow
 # That which leaves its wall shall pull at it; its own test says so.
-@pytest.mark.parametrize("name", some(each_scenario(lambda name: name == "wall_bounce")))
+@pytest.mark.parametrize(
+    "name",
+    some(
+        each_scenario(lambda name: name == "wall_bounce"),
+        dear=("wall_flexible_contact", "wall_hydroelastic"),
+    ),
+)
 def test_shipped_scenarios_have_no_problems(name):
     told = find_feasibility(scenario(name))
     assert told.problems == ()

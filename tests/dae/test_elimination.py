@@ -24,7 +24,7 @@ def evaluated(problem: Problem, **expressions: ca.SX) -> TracedFunction:
 
 @pytest.mark.equation(2, 13, 14, 16)
 def test_a_alpha_beta_drift_and_b_are_those_found_by_hand(problem):
-    structure = find_structure(problem.system)
+    structure = problem.structure
     elimination = structure.elimination
     function = evaluated(
         problem,
@@ -81,7 +81,7 @@ def lie_derivatives(expression, field, state, order):
 @pytest.mark.equation(17, 18, 19)
 def test_equations_17_to_19(problem):
     """L_f*^k k_i = L_f^k k_i below r_i, L_f*^k k_i = 0 from r_i on, L_h* L_f*^k k_i = 0 always."""
-    structure = find_structure(problem.system)
+    structure = problem.structure
     elimination, x = structure.elimination, problem.system.state
     lower, vanishing, by_control = (
         [ca.SX(0, 1)],
@@ -111,7 +111,7 @@ def test_equations_17_to_19(problem):
 @pytest.mark.equation(25)
 def test_constraint_inputs_keep_the_constraint(problem):
     """With v = alpha + beta u the r_i-th derivatives of the constraints vanish for every u (25)."""
-    structure = find_structure(problem.system)
+    structure = problem.structure
     system, elimination = problem.system, structure.elimination
     control = ca.SX.sym("u", system.num_controls)
     force = elimination.alpha + ca.mtimes(elimination.beta, control)
@@ -146,7 +146,7 @@ def test_what_cannot_act_is_structurally_zero():
 
 def test_without_constraints_nothing_is_eliminated():
     problem = PROBLEMS["flexible_pendulum"]()
-    elimination = find_structure(problem.system).elimination
+    elimination = problem.structure.elimination
     assert elimination.alpha.shape == (0, 1)
     assert elimination.beta.shape == (0, 1)
     assert ca.is_equal(elimination.f_star, problem.system.f, 1)
@@ -156,7 +156,7 @@ def test_without_constraints_nothing_is_eliminated():
 
 def test_the_pivot_says_where_a_is_singular():
     problem = PROBLEMS["pendulum"]()
-    function = evaluated(problem, pivot=find_structure(problem.system).elimination.pivot)
+    function = evaluated(problem, pivot=problem.structure.elimination.pivot)
     parameters = problem.system.parameter_values
     assert function([0.4, -0.6, 0.0, 0.0], parameters)[0] == 1.0
     assert function(np.zeros(4), parameters)[0] == 0.0

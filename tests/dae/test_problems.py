@@ -251,7 +251,7 @@ def test_hidden_normal_forms_are_of_all_kinds():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(30, 60)))
+@pytest.mark.parametrize("seed", some(range(30, 60), of=4))
 def test_hidden_normal_forms_are_found(seed):
     """As in test_structure.py, with other seeds."""
     hidden = hidden_normal_form(seed)

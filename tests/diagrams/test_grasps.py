@@ -273,7 +273,11 @@ def test_two_arms_carry_a_free_box_with_the_error_by_hand():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "body"),
-    [("three_fingers", "object"), ("biped", "trunk"), ("two_arms_free_box", "object")],
+    [
+        ("three_fingers", "object"),
+        ("biped", "trunk"),
+        pytest.param("two_arms_free_box", "object", marks=pytest.mark.thorough),
+    ],
 )
 def test_what_is_free_moves_in_the_animation(name, body):
     loop, context, record = run_scenario(scenario(name, "duration=0.5"))

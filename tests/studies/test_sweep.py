@@ -37,6 +37,14 @@ def study(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def first_three(tmp_path_factory):
+    """Its first runs, and what their file holds."""
+    file = tmp_path_factory.mktemp("three") / "runs.jsonl"
+    study = dd.sweep(chosen(), VARIATIONS[:3], file, workers=1)
+    return study, file.read_bytes()
+
+
+@pytest.fixture(scope="module")
 def rolled(tmp_path_factory):
     """The same by rollouts."""
     file = tmp_path_factory.mktemp("rolled") / "runs.jsonl"
@@ -66,10 +74,9 @@ def test_the_number_of_processes_changes_nothing(study, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_finished_study_runs_nothing_again(tmp_path):
-    file = tmp_path / "runs.jsonl"
-    first = dd.sweep(chosen(), VARIATIONS[:3], file, workers=1)
-    data = file.read_bytes()
+def test_a_finished_study_runs_nothing_again(first_three, tmp_path):
+    file, (first, data) = tmp_path / "runs.jsonl", first_three
+    file.write_bytes(data)
     assert dd.sweep(chosen(), VARIATIONS[:3], file, workers=1).table() == first.table()
     assert file.read_bytes() == data
     with pytest.raises(ModelError, match=f"3 runs there, {COUNT} here"):
@@ -187,10 +194,9 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("outcome", ["crashed", "timed out"])
-def test_a_run_whose_process_died_is_tried_again_and_no_other(outcome, tmp_path):
-    file = tmp_path / "runs.jsonl"
-    first = dd.sweep(chosen(), VARIATIONS[:3], file, workers=1)
-    data = file.read_text().splitlines()
+def test_a_run_whose_process_died_is_tried_again_and_no_other(outcome, first_three, tmp_path):
+    file, first = tmp_path / "runs.jsonl", first_three[0]
+    data = first_three[1].decode().splitlines()
     (place,) = [i for i, line in enumerate(data) if line.startswith('{"run":1,')]
     died = RunResult(1, Outcome(outcome), "it died")
     data[place] = json.dumps(died.to_dict())

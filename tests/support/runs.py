@@ -1,7 +1,7 @@
 """Scenarios and closed loops, run into records."""
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from functools import cache
 from typing import Any
 
@@ -58,12 +58,13 @@ def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
     ]
 
 
-def some(cases: Iterable[Any], of: int = 2) -> list[ParameterSet]:
-    """Cases of which all but one in so many are thorough: they show the same."""
+def some(cases: Iterable[Any], of: int = 2, dear: Container[Any] = ()) -> list[ParameterSet]:
+    """Cases of which all but one in so many are thorough, and the dear ones: they show the same."""
     found = []
     for i, case in enumerate(cases):
         given = case if isinstance(case, ParameterSet) else pytest.param(case)
-        marks = [*given.marks, *[pytest.mark.thorough] * (i % of > 0)]
+        left_out = i % of > 0 or given.values[0] in dear
+        marks = [*given.marks, *[pytest.mark.thorough] * left_out]
         found.append(pytest.param(*given.values, marks=marks, id=given.id))
     return found
 

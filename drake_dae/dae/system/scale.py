@@ -6,7 +6,7 @@ state relative to a size that changes with its unit.
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from math import factorial, log
+from math import factorial, log, prod
 from typing import NamedTuple
 
 import casadi as ca
@@ -177,6 +177,8 @@ def _terms(
 
     The constant term does not contain the linear terms at the nominal state.
     """
+    if not expression.nnz():
+        return
     symbol, values = parameters
     places: list[tuple[int, tuple[int, ...]]] = [(i, ()) for i in range(expression.numel())]
     derivatives = ca.vec(ca.densify(expression))
@@ -185,12 +187,12 @@ def _terms(
         numbers = function(nominal, values).full().ravel()
         expensive = function.n_instructions() * nominal.size > OPERATIONS
         jacobian = None if order == ORDER or expensive else ca.jacobian(derivatives, state)
-        if order == 0 and jacobian is not None:
+        if order == 0 and jacobian is not None and jacobian.nnz():
             numbers -= _linear_part(jacobian, state, parameters, nominal, numbers)
         for (entry, states), value in zip(places, numbers.tolist(), strict=True):
             if np.isfinite(value) and value != 0.0:
-                equal = np.prod([factorial(count) for count in Counter(states).values()])
-                yield _Term(entry, states, value / float(equal))
+                equal = prod(factorial(count) for count in Counter(states).values())
+                yield _Term(entry, states, value / equal)
         if jacobian is None:
             return
         following, chosen = [], []

@@ -55,7 +55,7 @@ def on_manifold(structure: Structure, x: Array, free: Array, values: Array) -> A
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
     """Central differences of the motion in the coordinates that were chosen, moving or not."""
-    structure = find_structure(problem.system)
+    structure = problem.structure
     random = np.random.default_rng(1)
     x = problem.consistent(random) if moving else structure.states[0]
     u = random.standard_normal(problem.system.num_controls)

@@ -46,7 +46,7 @@ def circle(**parameters: float) -> Manifold:
 @pytest.mark.slow
 @pytest.mark.equation(4, 42)
 def test_residual_and_dimension_are_those_found_by_hand(problem):
-    manifold = find_structure(problem.system).manifold
+    manifold = problem.structure.manifold
     assert manifold.dimension == problem.manifold_dimension
     random = np.random.default_rng(0)
     for _ in range(3):
@@ -63,7 +63,7 @@ def test_residual_and_dimension_are_those_found_by_hand(problem):
 def test_steps_taken_at_once_are_those_of_newtons_method(problem):
     """What a simulation calls, against Newton's method with the factors of LAPACK."""
     random = np.random.default_rng(4)
-    manifold = find_structure(problem.system).manifold
+    manifold = problem.structure.manifold
     parameters, scale = problem.system.parameter_values, problem.system.scale
     for size in (1e-14, 1e-11, 1e-8, 1e-5, 1e-2):
         start = problem.consistent(random)
@@ -84,7 +84,7 @@ def test_steps_taken_at_once_are_those_of_newtons_method(problem):
 
 @pytest.mark.slow
 def test_projection_reaches_the_manifold_to_round_off(problem):
-    manifold = find_structure(problem.system).manifold
+    manifold = problem.structure.manifold
     random = np.random.default_rng(1)
     for size in (1e-9, 1e-6, 1e-3, 1e-1):
         start = problem.consistent(random)
@@ -99,7 +99,7 @@ def test_projection_reaches_the_manifold_to_round_off(problem):
 
 @pytest.mark.slow
 def test_projection_leaves_consistent_states_alone(problem):
-    manifold = find_structure(problem.system).manifold
+    manifold = problem.structure.manifold
     state = manifold.project(problem.consistent(np.random.default_rng(2)))
     again = manifold.project(state)
     np.testing.assert_allclose(again, state, rtol=0, atol=1e-15)
@@ -194,7 +194,7 @@ def test_residual_signals_name_constraints_and_derivatives():
 
 def test_without_constraints_every_state_is_consistent():
     problem = PROBLEMS["cart"]()
-    manifold = find_structure(problem.system).manifold
+    manifold = problem.structure.manifold
     assert manifold.dimension == 2
     assert manifold.residual([1.0, 2.0]).shape == (0,)
     np.testing.assert_array_equal(manifold.project([1.0, 2.0]), [1.0, 2.0])
@@ -286,7 +286,7 @@ def test_a_given_start_is_settled_level_by_level():
 
 def test_settling_reaches_the_manifold(problem):
     """As projection does, also where a level has no states of its own."""
-    structure = find_structure(problem.system)
+    structure = problem.structure
     random = np.random.default_rng(3)
     for state in structure.states[:4]:
         start = state + 1e-3 * structure.scale * random.standard_normal(state.size)

@@ -33,7 +33,7 @@ def starts(problem: Problem) -> np.ndarray:
 @pytest.mark.equation(6, 7, 8, 28, 30, 31, 33)
 def test_the_closed_loop_has_exactly_the_predicted_error(problem):
     """(30), (31) from a start with an error, by an independent integrator and elimination."""
-    law = TrackingLaw(problem.system, poles(-3.0))
+    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     start = problem.consistent(np.random.default_rng(3))
     times = np.linspace(0.0, problem.horizon, 7)
     outputs, _ = closed_loop_outputs(problem, law, start, times)
@@ -56,7 +56,8 @@ def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(proble
 
     A law that finds its control by B(x), or with friction, gives no motion.
     """
-    system, law = problem.system, TrackingLaw(problem.system, poles(-3.0))
+    system = problem.system
+    law = TrackingLaw(system, poles(-3.0), structure=problem.structure)
     motion, elimination = law.trace_motion(), law.structure.elimination
     u = ca.SX.sym("u", system.num_controls)
     if motion is None:
@@ -83,7 +84,7 @@ def test_the_closed_loop_stays_on_the_manifold():
     for name in ("two_link_arm", "third_order", "knife_edge"):
         problem = PROBLEMS[name]()
         start = problem.consistent(np.random.default_rng(3))
-        law = TrackingLaw(problem.system, poles(-3.0))
+        law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
         _, states = closed_loop_outputs(problem, law, start, np.linspace(0.0, 1.0, 3))
         # Tolerances of 1e-11 a step, amplified over 1 s.
         assert np.abs(problem.derivatives(states[-1])).max() < 1e-9
@@ -96,7 +97,9 @@ LAMBDA_2 = np.array([[11.0, 2.0], [-1.0, 9.0]])
 def test_full_gain_matrices():
     """e'' + Lambda_2 e' + Lambda_1 e = 0 (60), against a matrix exponential made here."""
     problem = PROBLEMS["gantry"]()
-    law = TrackingLaw(problem.system, gain_matrices([LAMBDA_1, LAMBDA_2]))
+    law = TrackingLaw(
+        problem.system, gain_matrices([LAMBDA_1, LAMBDA_2]), structure=problem.structure
+    )
     start = problem.consistent(np.random.default_rng(4))
     times = np.linspace(0.0, 1.0, 6)
     outputs, _ = closed_loop_outputs(problem, law, start, times)
@@ -116,7 +119,7 @@ def test_full_gain_matrices():
 def test_repeated_poles_in_closed_form():
     """mu = 4 with one pole -5: e = sum w_j t^j/j! exp(-5 t), w_j the derivatives of e exp(5 t)."""
     problem = PROBLEMS["flexible_pendulum"]()
-    law = TrackingLaw(problem.system, poles(-5.0))
+    law = TrackingLaw(problem.system, poles(-5.0), structure=problem.structure)
     start = problem.consistent(np.random.default_rng(6))
     times = np.linspace(0.0, 2.0, 6)
     outputs, _ = closed_loop_outputs(problem, law, start, times)
@@ -137,7 +140,7 @@ def test_repeated_poles_in_closed_form():
 @pytest.mark.slow
 def test_error_coordinates_are_the_derivatives_of_the_outputs(problem):
     """e_i^(j) = L_f*^j l*_i - r_i^(j), against differences along the closed loop."""
-    law = TrackingLaw(problem.system, poles(-3.0))
+    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     start = problem.consistent(np.random.default_rng(3))
     step = 1e-4
     reference = reference_at(problem, 0.0)
@@ -181,7 +184,7 @@ def test_control_by_hand():
 @pytest.mark.equation(29, 34)
 def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
     """z - r by the model, with the control that the law chose."""
-    law = TrackingLaw(problem.system, poles(-3.0))
+    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     state = problem.consistent(np.random.default_rng(5))
     reference = reference_at(problem, 0.2)
     control, error = law.function(state, reference, law.all_parameters())
@@ -198,7 +201,7 @@ def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
 def test_changed_parameters_need_no_new_trace():
     """The law at other masses and gravity, against the closed form at these."""
     problem = pendulum()
-    law = TrackingLaw(problem.system, poles(-3.0))
+    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     operations = law.function.num_operations
     random = np.random.default_rng(7)
     for mass, length, gravity in random.uniform(0.5, 5.0, (3, 3)):
@@ -232,7 +235,7 @@ def test_gains_are_parameters_of_the_traced_law():
 
 def test_a_singular_b_shows_in_the_pivot():
     problem = PROBLEMS["knife_edge_force"]()
-    law = TrackingLaw(problem.system, poles(-3.0))
+    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     state = problem.consistent(np.random.default_rng(0))
     state[5] = 0.0  # The heading rate, without which the thrust does not act on the force.
     law.control(state, reference_at(problem, 0.0))
@@ -300,7 +303,7 @@ def test_the_structure_must_be_that_of_the_system():
 def test_measured_force_replaces_nothing_when_the_model_is_right():
     """(59): with v = r_2, as the loop has it, the feedback Gbar (v - r_2) vanishes."""
     problem = PROBLEMS["two_link_arm"]()
-    plain = TrackingLaw(problem.system, poles(-3.0))
+    plain = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     measured = TrackingLaw(
         problem.system, poles(-3.0), structure=plain.structure, measured_force=True, force_gain=4.0
     )
@@ -326,7 +329,7 @@ def test_measured_force_replaces_nothing_when_the_model_is_right():
 def test_measured_force_takes_the_place_of_the_models():
     """(71): an output v1 of degree 1 is fed back from the measurement, its gain acts on v1 - r."""
     problem = PROBLEMS["mixed_degrees"]()
-    plain = TrackingLaw(problem.system, poles(-3.0))
+    plain = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
     measured = TrackingLaw(
         problem.system, poles(-3.0), structure=plain.structure, measured_force=True
     )

@@ -1,5 +1,6 @@
 """The laws behind actuation stages: the paper's own formulas, and errors known in advance."""
 
+from itertools import product
 from math import comb
 
 import numpy as np
@@ -257,9 +258,17 @@ def track(name, kind, step, duration):
     return relative, record
 
 
+DEAR = [("seven_joint", kind) for kind in DEGREES if kind not in ("flexible", "flexible motor")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", DEGREES)
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        pytest.param(*case, marks=[pytest.mark.thorough] * (case in DEAR))
+        for case in product(ARMS, DEGREES)
+    ],
+)
 @pytest.mark.equation(72, 73, 82, 83)
 def test_errors_are_their_closed_forms(name, kind):
     """(72)-(73), (82)-(83) and their kin at 1 ms, relative to the errors at the start.

@@ -72,7 +72,7 @@ def assert_same(ours, theirs, tolerance, slack=0):
     ("name", "settings", "seeds"),
     [
         ("two_link_wall", [], ()),
-        pytest.param("seven_joint_wall", [], (), marks=pytest.mark.slow),
+        pytest.param("seven_joint_wall", [], (), marks=[pytest.mark.slow, pytest.mark.thorough]),
         pytest.param(
             "two_link_wall",
             [

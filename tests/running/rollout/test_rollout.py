@@ -104,7 +104,7 @@ def test_equal_fixed_steps_are_equal(name, scheme, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     "name",
     [
@@ -230,7 +230,7 @@ def test_many_runs_are_those_of_one_each(compiled):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     "sensor",
     [
@@ -263,7 +263,7 @@ def test_sensors_measure_as_in_drake(sensor, compiled):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize("case", ["position", "measured", "direct"])
 def test_integrals_are_those_of_drake(case, compiled):
     """To 1e-12 of the largest value, as all that equal steps give.
@@ -307,7 +307,7 @@ def test_integrals_are_those_of_drake(case, compiled):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["integral=[tool.z]"])])
 def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
     """To 1e-12 of the largest value; integrals stand still while a drive is at its limit."""
@@ -412,7 +412,7 @@ def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_dome"])
 def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, compiled):
     """Steps of 10 ms by Euler leave them by 1e-5: after one Newton step alone it would be 1e-9."""
@@ -431,7 +431,7 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     "settings",
     [
@@ -478,7 +478,7 @@ OBSERVED = ["sampling={period: 0.002}", "force_feedback=!MeasuredForce {sample_p
 
 
 @pytest.mark.slow
-@both
+@mostly_compiled
 @pytest.mark.parametrize(
     ("name", "settings"),
     [

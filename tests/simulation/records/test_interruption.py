@@ -36,6 +36,7 @@ def compute(found: Interrupted) -> None:
     assert found.asked
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.parametrize("sent", ENDING_SIGNALS)
 def test_a_signal_within_a_call_of_casadi_is_heard(sent):
     def wait():

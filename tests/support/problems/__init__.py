@@ -5,6 +5,7 @@ derivation in its docstring, and share no code with the library.
 """
 
 from collections.abc import Callable
+from functools import cache
 
 from problems.closed_loop import closed_loop_outputs, integrated, reference_at, wanted_outputs
 from problems.hidden import Hidden, hidden_normal_form
@@ -71,7 +72,7 @@ __all__ = [
 ]
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
-    function.__name__: function
+    function.__name__: cache(function)
     for function in (
         pendulum,
         pendulum_tension,

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 
 Array = np.ndarray
@@ -54,6 +56,11 @@ class Problem:
     horizon: float = 1.5
     source: str = ""
     minimum_phase: bool | None = None
+
+    @cached_property
+    def structure(self) -> Structure:
+        """Found once for all tests of a process."""
+        return find_structure(self.system)
 
     @property
     def manifold_dimension(self) -> int:
