@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Context, OutputPort
+from pydrake.systems.framework import Context, OutputPort, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compile import compile_open
@@ -125,9 +125,9 @@ class Driven:
         return [first + place for place in self.places]
 
     @cached_property
-    def is_held(self) -> bool:
-        """Whether the control is constant between samples."""
-        return bool(self.period) or holds_control(self.loop.plant, Wires.of(self.loop.diagram))
+    def hold(self) -> System | None:
+        """The block that holds the control between samples; None if there is none."""
+        return control_hold(self.loop.plant, Wires.of(self.loop.diagram))
 
     @cached_property
     def names(self) -> Sequence[str]:
@@ -285,14 +285,14 @@ def _ahead(moved: Moved, h: FloatArray, rates: Sequence[Moved], weights: Sequenc
     return Moved(values, slopes)
 
 
-def holds_control(plant: Plant, wires: Wires) -> bool:
-    """Whether a block holds the control of a plant between samples."""
+def control_hold(plant: Plant, wires: Wires) -> System | None:
+    """The block that holds the control of a plant between samples; None if there is none."""
     port = plant, int(plant.GetInputPort("control").get_index())
     while (source := wires.sources.get(port)) is not None:
         system, index = source
         if not system.HasDirectFeedthrough(index):
-            return int(system.num_continuous_states()) == 0
+            return system if not system.num_continuous_states() else None
         if system.num_input_ports() != 1:
-            return False
+            return None
         port = system, 0
-    return False
+    return None

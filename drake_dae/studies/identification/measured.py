@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import OutputPort
+from pydrake.systems.framework import OutputPort, System
 
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
@@ -12,6 +12,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.identification.driven import Driven
+from drake_dae.systems.blocks.traced import Traced
 
 SAME = 1e-3
 """Times that differ by less than this part of a period are one."""
@@ -112,9 +113,11 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
             "driven by all recorded controls"
         )
     controls = np.column_stack([columns[s.name] for s in plant.dae.control_signals])
-    acting = controls
-    if not driven.period and driven.is_held:  # A row has the control of the step that led to it.
-        controls = np.vstack([acting[1:], acting[-1:]])
+    acting, after = controls, np.vstack([controls[1:], controls[-1:]])
+    if driven.hold is not None:
+        # A row of a continuous plant has the control of the step that led to it.
+        is_after = _acts_before(driven.hold, record.time, driven.period) | (not driven.period)
+        controls = np.where(is_after[:, None], after, acting)
     channels, values = _channels(record, loop, title)
     if not channels:
         raise ModelError(
@@ -138,6 +141,22 @@ def _check_steps(record: Record, period: float, title: str) -> None:
                 f"the plant steps by {period:g} s: rows must come at each step, or at each second, "
                 "third, ... one"
             )
+
+
+def _acts_before(hold: System, times: FloatArray, period: float) -> np.ndarray:
+    """At which rows a hold acts just before the step of a discrete plant, by round-off of the time.
+
+    As in Drake, two updates are of one instant if their times are the same to the last bit.
+    """
+    found = np.zeros(times.size, dtype=bool)
+    if not (period and isinstance(hold, Traced)):
+        return found
+    steps = period * np.round(times / period)
+    for update in hold.traced().updates:
+        count = np.round((steps - update.offset) / update.period)
+        moments = update.offset + count * update.period
+        found |= (moments < steps) & (moments > steps - SAME * period)
+    return found
 
 
 def _columns(

@@ -121,7 +121,7 @@ class Pieces:
             count = round(float(times[1] - times[0]) / self.driven.period)
             return [count * [controls[rows[:, k]]] for k in range(self.length)]
         stages = 2 * self.parts + 1
-        if self.driven.is_held:
+        if self.driven.hold is not None:
             return [stages * [controls[rows[:, k]]] for k in range(self.length)]
         smooth = CubicSpline(times, controls)
         shares = np.linspace(0.0, 1.0, stages)
