@@ -33,7 +33,9 @@ def test_phase_keeps_the_rules(name):
     assert phase.margin(going_on, CONTACT_FORCE) > 0.0  # Rule 4.
     assert phase.margin(over, CONTACT_FORCE) <= 0.0
     assert phase.within > going_on.time
-    assert phase.if_late in ("approach", "hold", "stop", "fail")
+    assert phase.chosen("late") == "fail" == phase.chosen("guard")  # Rule 5.
+    assert phase.chosen("lost") == "hold"
+    assert phase.chosen("success") == "next"
     assert phase.awaited(CONTACT_FORCE)
     # Rule 1: what leads from one law to the other says so of both ends.
     assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
