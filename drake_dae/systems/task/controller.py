@@ -28,7 +28,6 @@ from drake_dae.systems.task.progress import Segment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.switch import LawSwitch
 from drake_dae.systems.task.task import Task, check_sampled
-from drake_dae.systems.task.traced import SIGNAL
 from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {
@@ -132,8 +131,8 @@ class TaskController(Diagram, Controller):
         builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
         builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
         builder.ExportInput(self.supervisor.GetInputPort("hold"), "hold")
-        for name in task.signals:
-            builder.ExportInput(self.supervisor.GetInputPort(SIGNAL + name), SIGNAL + name)
+        for port in self.supervisor.signal_ports.values():
+            builder.ExportInput(port, port.get_name())
         switch = builder.AddSystem(LawSwitch(law.system.num_controls))
         in_contact = self.supervisor.GetOutputPort("in_contact")
         builder.Connect(in_contact, switch.GetInputPort("in_contact"))

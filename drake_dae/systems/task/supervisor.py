@@ -10,7 +10,6 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     EventStatus,
-    InputPort,
     LeafSystem,
     State,
     UnrestrictedUpdateEvent,
@@ -24,13 +23,14 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Computation, Guard, Update
+from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import CONTACT, FREE, Cause, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.sight import Sight
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, SEEN, SIGNAL, TracedTask
+from drake_dae.systems.task.traced import EARLY, SEEN, TracedTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -45,7 +45,7 @@ class TaskSupervisor(LeafSystem):
 
     Output ports:
         contact_reference, free_reference: R of the law that acts, zero for the other one.
-        phase: The place of the phase, shape (1,); the number of phases when done or held.
+        phase: The place of the phase, shape (1,); their number when done or held.
         desired_output: The positions, the force and the distance that are wanted, shape (p + 1,);
             zero for the one of the last two that is none now.
         in_contact: 1 where the law in contact acts, shape (1,).
@@ -59,6 +59,9 @@ class TaskSupervisor(LeafSystem):
         place: Which output is the distance of the first, and the force of the second.
         force: Which entry of `measured_force` is the contact's.
         sample_period: When guards are looked at, in s; 0 for at all times.
+
+    Attributes:
+        signal_ports: Name of a signal -> its input port.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -82,12 +85,10 @@ class TaskSupervisor(LeafSystem):
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
-        self._control_port: InputPort | None = None
+        declared, self._control_port = self.DeclareVectorInputPort, None
         if task.watches("control"):
-            self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
-        self._signals = {
-            name: self.DeclareVectorInputPort(SIGNAL + name, 1) for name in task.signals
-        }
+            self._control_port = declared("control", system.num_controls)
+        self.signal_ports = {name: declared(SIGNAL + name, 1) for name in task.signals}
         self.DeclareNumericParameter(BasicVector(system.parameter_values))
         self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
         self._held = self.DeclareDiscreteState(self._traced.size)
@@ -175,8 +176,8 @@ class TaskSupervisor(LeafSystem):
             control = float(np.abs(self._control_port.Eval(context)).max())
         if segment.change.place < len(self._phases):
             name = self._phases[segment.change.place].signal
-            if name and self._signals[name].HasValue(context):
-                signal = float(self._signals[name].Eval(context)[0])
+            if name and self.signal_ports[name].HasValue(context):
+                signal = float(self.signal_ports[name].Eval(context)[0])
         work = self._traced.work_of(context.get_discrete_state(self._held).value())
         gone = float(np.linalg.norm(rates)), float(np.linalg.norm(moved - segment.origin))
         seen = passed, force, distance, rate, float(wanted), away
@@ -285,9 +286,8 @@ class TaskSupervisor(LeafSystem):
         status = EventStatus.Succeeded()
         if after.place is None and after.chosen in (STOP, LEAVE):
             status = EventStatus.ReachedTermination(self, reason)
-        has_failed = outcome != "success"
-        if segment.change.place >= self.task.plan.last:  # It leaves, since one before has failed.
-            has_failed = segment.change.failed
+        leaves = segment.change.place >= self.task.plan.last  # As a phase before has failed or not.
+        has_failed = outcome != "success" or (leaves and segment.change.failed)
         cause = Cause(reason, after.chosen, has_failed)
         return self._plan.following(now, segment, moment, after.place, cause), status
 
@@ -336,7 +336,7 @@ class TaskSupervisor(LeafSystem):
     def traced(self) -> Block:
         period, updates = self._sample_period, tuple[Update, ...]()
         nothing = ca.Function("none", [], [ca.SX.zeros(1)])
-        unwired = ["hold", *(port.get_name() for port in self._signals.values())]
+        unwired = ["hold", *(port.get_name() for port in self.signal_ports.values())]
         if period:
             updates = (Update(self._traced.unchanged(), period, 0.0, True),)
         return Block(

@@ -19,6 +19,7 @@ from drake_dae.systems.blocks.traced import (
     TIME,
     Computation,
 )
+from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
 from drake_dae.systems.task.phases import Moment, Phase
 from drake_dae.systems.task.phases.tally import Tally
@@ -33,9 +34,6 @@ samples that is."""
 
 NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt", "distance", *SEEN)
 """Which numbers a context holds of a task, before base, rate and fade of its present segment."""
-
-SIGNAL = "signal_"
-"""The beginning of the name of an input port for a signal."""
 
 EARLY = 1e-12
 """A margin that is less is over: so zeros are alike whose round-off is not."""

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import casadi as ca
-
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
@@ -49,27 +47,6 @@ class PhaseGuard:
         positive(f"PhaseGuard: most, of the {self.of},", self.most)
         if self.samples < 1:
             raise ModelError(f"PhaseGuard: samples must be 1 or more, got {self.samples}")
-
-    def counted(self, count: float, value: float) -> float:
-        """In how many consecutive samples it has been there, with one more; also an expression.
-
-        Args:
-            count: In how many before.
-            value: What is watched.
-        """
-        found: float = ca.if_else(value >= self.most, count + 1, 0)
-        return found
-
-    def margin(self, count: float, value: float) -> float:
-        """A number that is positive until the guard trips; also an expression.
-
-        Args:
-            count: In how many consecutive samples before it has been at its largest value.
-            value: What is watched.
-        """
-        if self.samples == 1:
-            return self.most - value
-        return self.samples - 0.5 - self.counted(count, value)
 
     def tripped(self, value: float) -> str:
         """Why the phase has failed, in words."""

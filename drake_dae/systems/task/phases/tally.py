@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
+import casadi as ca
+
 from drake_dae.arrays import FloatArray
+from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
 
@@ -35,14 +38,14 @@ class Tally:
         """The margin of each guard of a phase, positive until it trips."""
         counts = self._counts(phase, tally)
         pairs = zip(phase.guards, counts, strict=True)
-        return [guard.margin(count, getattr(now, guard.of)) for guard, count in pairs]
+        return [_margin(guard, count, getattr(now, guard.of)) for guard, count in pairs]
 
     def after(self, phase: Phase, tally: Sequence[float] | FloatArray, now: Moment) -> list[float]:
         """The numbers after a sample in which the phase goes on."""
         counts = self._counts(phase, tally)
         found = [tally[0] + now.force * now.speed * self._period] if self._works else []
         found += [
-            guard.counted(count, getattr(now, guard.of))
+            _counted(guard, count, getattr(now, guard.of))
             for guard, count in zip(phase.guards, counts, strict=True)
             if guard.samples > 1
         ]
@@ -56,3 +59,15 @@ class Tally:
             found.append(tally[place] if counts else 0.0)
             place += counts
         return found
+
+
+def _counted(guard: PhaseGuard, count: float, value: float) -> float:
+    """In how many consecutive samples a value has been at the largest one, with one more."""
+    found: float = ca.if_else(value >= guard.most, count + 1, 0)
+    return found
+
+
+def _margin(guard: PhaseGuard, count: float, value: float) -> float:
+    if guard.samples == 1:
+        return guard.most - value
+    return guard.samples - 0.5 - _counted(guard, count, value)
