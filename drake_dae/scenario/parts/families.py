@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import pydantic
 from casadi import SX
 from numpy.typing import ArrayLike
 
@@ -104,11 +105,14 @@ Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]
+_Guards = Annotated[
+    tuple[Annotated[phases.PhaseGuard, Form()], ...], pydantic.Strict(False)
+]  # In data a tuple is a list.
 _BY_NAME: dict[Any, Any] = {Mapping[str, references.Reference | float]: dict[str, Reference]}
 _PHASE_DATA = {
     float | references.Reference: Reference,
     Mapping[str, float]: dict[str, float],
-    Sequence[phases.PhaseGuard]: list[Annotated[phases.PhaseGuard, Form()]],
+    Sequence[phases.PhaseGuard]: _Guards,
     **_BY_NAME,
 }
 Phase = Annotated[

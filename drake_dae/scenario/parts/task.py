@@ -51,9 +51,6 @@ class ScenarioTask:
             if name not in task.signals:
                 text = unknown_name("phase that waits for the signal", name, task.signals)
                 raise ModelError(f"signals: {text}")
-        for name in task.signals:
-            if name not in self.signals:
-                raise ModelError(f"signals: needed: '{name}', for which a phase waits")
 
     def made(self, force_noise: float = 0.0) -> Task:
         """The task.

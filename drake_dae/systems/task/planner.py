@@ -102,7 +102,7 @@ class Planner:
 
     def motion(self, now: Now) -> tuple[float, float, FloatArray, FloatArray]:
         """The distance and its derivative, then all outputs in m and their derivatives."""
-        values = self.motion_function.evaluate(now.state, now.parameters)[0]
+        values = self.motion_function.evaluate(now.state, now.parameters)[0].copy()
         first, rates = values[2 : 2 + self.moved], values[2 + self.moved :]
         return float(values[0]), float(values[1]), first, rates
 

@@ -63,7 +63,6 @@ class GuardedMove(Phase):
         return {name: speed * part for name, part in self.direction.items()}
 
     def felt(self, contact_force: float) -> float:
-        """The force that ends it, in N."""
         return contact_force if self.force is None else self.force
 
     def needed(self, contact_force: float) -> Mapping[str, float]:

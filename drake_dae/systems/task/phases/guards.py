@@ -29,7 +29,7 @@ class PhaseGuard:
 
     Attributes:
         of: What it watches: "force", "time", "work", "control", "speed" or "travel".
-        most: The largest value, in its unit.
+        most: The largest value, in N, s, J, m/s or m, or in the unit of the control.
         samples: In so many consecutive samples it has to be there, so that noise does not count;
             only a sampled task can count more than one.
 

@@ -121,6 +121,14 @@ class Phase(ABC):
         """How fast the distance falls at last, in m/s."""
         return 0.0
 
+    def felt(self, contact_force: float) -> float:
+        """The force with which it has touched, in N, where it comes with `speed_of_approach`.
+
+        Args:
+            contact_force: As of `margin`.
+        """
+        return contact_force
+
     @property
     def signal(self) -> str:
         """The name of the signal that it waits for; empty if for none."""
