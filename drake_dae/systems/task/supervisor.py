@@ -1,7 +1,6 @@
 """What leads through the phases of a task: guards, changes and references."""
 
 from dataclasses import replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -235,7 +234,7 @@ class TaskSupervisor(LeafSystem):
                 time,
                 self._state_port.Eval(context).copy(),
             )
-        progress = Progress((self._segment(context),), time, time)
+        progress = Progress((self._segment(context),), time - self._sample_period, time)
         self._put(state, progress, np.zeros(len(SEEN)), np.zeros(self._traced.tally.size))
         return EventStatus.Succeeded()
 
@@ -246,6 +245,8 @@ class TaskSupervisor(LeafSystem):
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         progress, time = self.progress(context), context.get_time()
+        if self._sample_period and time == progress.step:
+            return EventStatus.DidNothing()  # A run that goes on begins with the last sample.
         force, seen = self._seen(context), self._sight(context, progress)
         status, found = EventStatus.Succeeded(), progress.segments
         tally, place = np.zeros(self._traced.tally.size), found[-1].change.place
@@ -256,9 +257,8 @@ class TaskSupervisor(LeafSystem):
             before = self._traced.tally_of(context.get_discrete_state(self._held).value())
             after = self._traced.tally.after(self._phases[place], before, seen.moment)
             tally = np.array([float(one) for one in after])
-        known: dict[str, Any] = {"felt": time} if progress.is_felt else {}
-        is_felt = progress.is_felt != seen.turns
-        now = replace(progress, segments=found, step=time, is_felt=is_felt, **known)
+        is_felt, felt = progress.is_felt != seen.turns, time if progress.is_felt else progress.felt
+        now = replace(progress, segments=found, step=time, is_felt=is_felt, felt=felt)
         self._put(state, now, force, tally)
         return status
 
