@@ -1,7 +1,6 @@
 """Default gains of a scenario with Drake's own contact."""
 
 from dataclasses import replace
-from math import hypot
 
 import numpy as np
 
@@ -47,21 +46,19 @@ def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> p
 
 
 def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """The force of the hardest touch, sqrt(F^2 + k v^2 / A) + k v t, also where it is tried again.
+    """The force of the hardest touch, F + v (sqrt(k / A) + k t), also where it is tried again.
 
-    The mass 1 / A at the tool still has the speed v where the force F is felt that ends the phase,
-    and is stopped by the root; the other term is how far the tool goes in the time t until the law
+    The law pushes with the force F that ends the phase from when it is felt; the root stops the
+    mass 1 / A at the tool, and the last term is how far the tool goes in the time t until the law
     reacts.
     """
-    phases = () if task is None else task.made().phases
-    touches = [
-        (hypot(phase.felt(task.contact_force), speed * (stiffness / mobility) ** 0.5), speed, phase)
-        for phase in phases
-        if task is not None and (speed := phase.speed_of_approach)
-    ]
-    if not touches:
+    peaks = []
+    for phase in () if task is None else task.made().phases:
+        if task is not None and (speed := phase.speed_of_approach):
+            added = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
+            peaks.append((phase.felt(task.contact_force) + added, speed, phase.name))
+    if not peaks:
         return ""
-    peaks = [(stop + stiffness * speed * late, speed, phase.name) for stop, speed, phase in touches]
     peak, speed, name = max(peaks)
     which = f" by {name}" if len(peaks) > 1 else ""
     return f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"
