@@ -3,8 +3,20 @@
 from dataclasses import replace
 
 import pytest
+from members import Rise
 
-from drake_dae import Approach, ConstantReference, Dwell, Move, Press, Release, Retreat
+from drake_dae import (
+    Approach,
+    ConstantReference,
+    Dwell,
+    GuardedMove,
+    Move,
+    PhaseGuard,
+    Press,
+    Release,
+    Retreat,
+    Wait,
+)
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Moment
 
@@ -21,6 +33,22 @@ MEMBERS = {
     ),
     "Move": (Move({}, 2.0), Moment(1.9, 20.0, 0.0, 0.0, 20.0), Moment(2.0, 20.0, 0.0, 0.0, 20.0)),
     "Dwell": (Dwell(2.0), Moment(1.9, 0.0, 0.1, 0.0, 0.1), Moment(2.1, 0.0, 0.1, 0.0, 0.1)),
+    "Wait": (
+        Wait("ready"),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal=0.4),
+        Moment(2.0, 20.0, 0.0, 0.0, 20.0, signal=1.0),
+    ),
+    "Wait long": (
+        Wait(duration=2.0),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0),
+        Moment(2.0, 20.0, 0.0, 0.0, 20.0),
+    ),
+    "GuardedMove": (
+        GuardedMove(0.1, force=5.0),
+        Moment(1.0, 4.9, 0.1, -0.02, 0.1, travel=0.09),
+        Moment(1.0, 5.1, 0.0, -0.02, 0.0, travel=0.09),
+    ),
+    "Rise": (Rise(0.5), Moment(0.4, 0.0, 0.1, 0.0, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
     "Release": (Release(), Moment(0.3, 3.0, 0.0, 0.0, 3.0), Moment(0.5, 0.4, 0.0, 0.0, 0.3)),
     "Retreat": (Retreat(0.1), Moment(0.6, 0.0, 0.09, 0.1, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
 }
@@ -42,7 +70,20 @@ def test_phase_keeps_the_rules(name):
     # Rule 2: what approaches has no goal for the distance.
     goals = phase.goals("contact")
     assert set(goals) <= {"contact"}
-    assert not (phase.speed_of_approach and goals)
+    assert not phase.rates("contact") or not goals
+    # What a guard may not end is reached by what ends the phase.
+    assert all(getattr(over, of) >= least for of, least in phase.needed(CONTACT_FORCE).items())
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_phase_takes_a_name_guards_and_successors(name):
+    guards = [PhaseGuard("force", 50.0)]
+    chosen = {"on_success": "done", "on_failure": "leave", "retries": 2, "if_spent": "hold"}
+    phase = replace(MEMBERS[name][0], name="mine", guards=guards, **chosen)
+    assert (phase.name, phase.guards) == ("mine", tuple(guards))
+    assert phase.chosen("success") == "done"
+    assert {phase.chosen(outcome) for outcome in ("guard", "late", "lost")} == {"leave"}
+    assert phase.lateness(MEMBERS[name][1], CONTACT_FORCE).startswith("mine ")
 
 
 def test_a_release_that_has_left_does_not_wait_for_the_force():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import numbers
+from members import Rise
 from numpy.testing import assert_allclose
 from polishing import FAR, OVER, SPEED, run_on, started, task_loop
 
@@ -149,3 +150,14 @@ def test_a_run_that_is_interrupted_goes_on_as_one_that_is_not(tmp_path):
     loop.record(context).save(tmp_path / "record.npz")
     spans = phase_spans(Record.load(tmp_path / "record.npz"))
     assert [span.name for span in spans] == ["Press", "slide", "end"]
+
+
+def test_a_phase_of_a_users_own_has_all_that_the_others_have():
+    """It goes up at 0.05 m/s, but for half of the ramp, until its guard has 20 mm."""
+    rise = Rise(5.0, over=0.1, guards=[PhaseGuard("travel", 0.02)], on_failure="hold")
+    loop, context, changes = ended([rise], FAR, 0.6)
+    assert [change.phase for change in changes] == ["Rise", "held"]
+    assert_allclose(changes[1].time, 0.02 / 0.05 + 0.05, atol=2e-5)
+    record = loop.record(context)
+    row = np.searchsorted(record.time, changes[1].time)
+    assert_allclose(record["controlled_output"][row, 0], 0.32, atol=1e-5)

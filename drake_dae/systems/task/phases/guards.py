@@ -42,8 +42,6 @@ class PhaseGuard:
     samples: int = 1
 
     def __post_init__(self) -> None:
-        if self.of not in UNITS:
-            raise ModelError(f"PhaseGuard: of must be one of {', '.join(UNITS)}, got '{self.of}'")
         positive(f"PhaseGuard: most, of the {self.of},", self.most)
         if self.samples < 1:
             raise ModelError(f"PhaseGuard: samples must be 1 or more, got {self.samples}")
