@@ -161,3 +161,14 @@ def test_a_phase_of_a_users_own_has_all_that_the_others_have():
     record = loop.record(context)
     row = np.searchsorted(record.time, changes[1].time)
     assert_allclose(record["controlled_output"][row, 0], 0.32, atol=1e-5)
+
+
+def test_who_holds_keeps_contact_and_force():
+    """The force has no rate in this law: it stays what it was, to the accuracy of steps."""
+    pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[PhaseGuard("force", 15.0)])
+    loop, context, changes = ended([PRESS, replace(pushed, on_failure="hold")], 0.0, 0.8)
+    assert [change.phase for change in changes] == ["Press", "Move", "held"]
+    record = loop.record(context)
+    after = record.time > changes[-1].time + 1e-6
+    assert_allclose(record["constraint_force"][after, 0], 15.0, atol=1e-6)
+    assert changes[-1].in_contact
