@@ -168,6 +168,7 @@ from .systems.task.phases import PhaseGuard as PhaseGuard
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
+from .systems.task.phases import Search as Search
 from .systems.task.phases import Wait as Wait
 from .systems.task.task import Task as Task
 

@@ -122,6 +122,7 @@ Phase = Annotated[
     | phases.Dwell
     | phases.Wait
     | phases.GuardedMove
+    | phases.Search
     | phases.Release
     | phases.Retreat,
     Choice(_PHASE_DATA),

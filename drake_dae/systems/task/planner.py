@@ -26,7 +26,7 @@ class Goals:
 
     Attributes:
         function: R in s after its begin, zero for outputs that it does not name.
-        named: Which outputs it names.
+        named: Which outputs it names, with references from their origin.
         references: The same as references of all outputs, in their order.
     """
 
@@ -214,7 +214,8 @@ def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
     found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
         references = tuple(in_order(found, names))
-        return Goals(stack_references(references, degrees), named, references)
+        here = () if phase.is_relative else named
+        return Goals(stack_references(references, degrees), here, references)
     except ReferenceSignalError as error:
         raise ModelError(f"{task.plan.where(index)}: {error}") from error
 

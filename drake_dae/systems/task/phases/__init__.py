@@ -4,6 +4,7 @@ from drake_dae.systems.task.phases.guarded import GuardedMove, Wait
 from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.members import Approach, Dwell, Move, Press, Release, Retreat
 from drake_dae.systems.task.phases.phase import Moment, Outcome, Phase
+from drake_dae.systems.task.phases.search import Search
 
 __all__ = [
     "Approach",
@@ -17,5 +18,6 @@ __all__ = [
     "Press",
     "Release",
     "Retreat",
+    "Search",
     "Wait",
 ]

@@ -64,8 +64,9 @@ class Phase(ABC):
 
     1. `begins_in_contact` and `ends_in_contact` say whether the robot touches then; None is as in
        the phase before it in the list. From its begin on the law acts that fits.
-    2. `goals` are references in s after the phase began. All other outputs come to rest where they
-       are, within `over`, but those with `rates`, which go on so fast.
+    2. `goals` are references in s after the phase began, and with `is_relative` from where the
+       outputs would come to rest. All other outputs come to rest where they are, within `over`, but
+       those with `rates`, which go on so fast.
     3. A phase takes over without a bump: its references are those of the phase before, with all
        derivatives that the law has, and lead to the goals within `over`.
     4. `margin` is positive until the phase is over, which is its success. It fails where it is not
@@ -101,6 +102,7 @@ class Phase(ABC):
     begins_in_contact: ClassVar[bool | None] = None
     ends_in_contact: ClassVar[bool | None] = None
     holds_contact: ClassVar[bool] = False
+    is_relative: ClassVar[bool] = False
     # No fields here: phases that wait, and those that hold a contact, have them.
     within = inf
     if_late = if_lost = _NOTHING
