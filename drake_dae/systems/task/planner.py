@@ -58,11 +58,13 @@ class Cause:
         reason: In words.
         chosen: What was chosen to follow: the name of a phase, "next", "stop" and so on.
         failed: Whether the phase before has failed.
+        ends_in_contact: Whether the phase before has ended in contact; None as it was before.
     """
 
     reason: str
     chosen: str = ""
     failed: bool = False
+    ends_in_contact: bool | None = None
 
 
 BEGIN = Cause("the task begins")
@@ -129,9 +131,11 @@ class Planner:
         was, known = before.change.in_contact, before.reference(now.time)
         end = len(self._phases)
         name = HELD if place is None else self._name(place)
-        contact = was if place is None else self._task.contacts[place]
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
+            contact = was if cause.ends_in_contact is None else cause.ends_in_contact
             contact, place = contact and moment.force >= self._task.contact_force, end
+        else:
+            contact = self._task.contacts[place]
         if contact != was:
             old, known = known, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):

@@ -275,20 +275,21 @@ class TaskSupervisor(LeafSystem):
             cause = Cause("the contact is lost at rest", segment.change.chosen, True)
             following = self._plan.following(now, segment, moment, None, cause)
             return following, EventStatus.Succeeded()
-        phase = self._phases[segment.change.place]
-        outcome, reason = seen.outcome(phase, self.task.contact_force)
+        place = segment.change.place
+        outcome, reason = seen.outcome(self._phases[place], self.task.contact_force)
         changes = progress.changes
         entered, chosen = [one.place for one in changes], [one.chosen for one in changes]
-        after = self.task.plan.successor(segment.change.place, outcome, entered, chosen)
+        after = self.task.plan.successor(place, outcome, entered, chosen)
         reason = ", ".join(filter(None, (reason, after.remark)))
         if after.chosen == FAIL:
             raise seen.failure(reason, now.time, now.state)
         status = EventStatus.Succeeded()
         if after.place is None and after.chosen in (STOP, LEAVE):
             status = EventStatus.ReachedTermination(self, reason)
-        leaves = segment.change.place >= self.task.plan.last  # As a phase before has failed or not.
+        leaves = place >= self.task.plan.last  # As a phase before has failed or not.
         has_failed = outcome != "success" or (leaves and segment.change.failed)
-        cause = Cause(reason, after.chosen, has_failed)
+        ends = self.task.plan.ends_in_contact(place) if outcome == "success" else None
+        cause = Cause(reason, after.chosen, has_failed, ends)
         return self._plan.following(now, segment, moment, after.place, cause), status
 
     # What is shown.

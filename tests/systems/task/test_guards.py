@@ -172,3 +172,20 @@ def test_who_holds_keeps_contact_and_force():
     after = record.time > changes[-1].time + 1e-6
     assert_allclose(record["constraint_force"][after, 0], 15.0, atol=1e-6)
     assert changes[-1].in_contact
+
+
+@pytest.mark.parametrize(
+    "phases",
+    [
+        [Approach(0.1, over=0.1, on_success="done", on_failure="leave")],
+        [Approach(0.1, over=0.1), Press(5.0, over=0.05, on_failure="leave")],
+        [Approach(0.1, over=0.1), Press(5.0, over=0.05, on_success="hold", on_failure="leave")],
+    ],
+)
+def test_a_task_that_is_done_in_contact_stays_there(phases):
+    """Also where a phase might have left."""
+    loop, context, changes = ended(phases, 0.005, 0.3)
+    last = changes[-1]
+    assert (last.phase in ("done", "held"), last.in_contact, last.failed) == (True, True, False)
+    record = loop.record(context)
+    assert_allclose(record["constraint_force"][-1, 0], last.force, atol=1e-6)

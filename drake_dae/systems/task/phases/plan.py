@@ -134,7 +134,7 @@ class Plan:
         counts = Counter(entered)
         ends_free = not self.contacts[place]
         if outcome == "success":
-            ends_free = not self._ends_in_contact(place)
+            ends_free = not self.ends_in_contact(place)
         for _ in range(self.last + 1):
             to = self._place(place, word)
             if to is None and word == LEAVE:
@@ -154,7 +154,8 @@ class Plan:
             place, word = to, FAIL if word == APPROACH and phase.retries is None else phase.if_spent
         return Successor(FAIL, None, "; ".join(remarks))
 
-    def _ends_in_contact(self, place: int) -> bool:
+    def ends_in_contact(self, place: int) -> bool:
+        """Whether a phase that succeeds ends in contact."""
         ends = self.phases[place].ends_in_contact
         return self.contacts[place] if ends is None else ends
 
@@ -164,7 +165,7 @@ class Plan:
             words = [phase.chosen(outcome) for outcome in OUTCOMES[1:]]
             if self.contacts[place] and LEAVE in words:
                 return True
-            if self._ends_in_contact(place) and phase.on_success == LEAVE:
+            if self.ends_in_contact(place) and phase.on_success == LEAVE:
                 return True
         return any(self.contacts) and any(phase.if_spent == LEAVE for phase in self.phases)
 
@@ -217,14 +218,14 @@ class Plan:
         after, text = self.phases[to], ""
         is_next = to == place + 1 and outcome == "success" and key == "on_success"
         way = "" if is_next else f", after {self.phases[place].name} by {key}"
-        begins, ends = self.contacts[to], self._ends_in_contact(to)
+        begins, ends = self.contacts[to], self.ends_in_contact(to)
         if outcome == "lost" and begins and ends:
             text = "it begins in contact, which is lost there; choose another one by if_lost"
         elif begins and not (
-            self._ends_in_contact(place) if outcome == "success" else self.contacts[place]
+            self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
         ):
             text = "it begins in contact, where the robot is free; an Approach must lead there"
-        elif outcome == "success" and not begins and self._ends_in_contact(place):
+        elif outcome == "success" and not begins and self.ends_in_contact(place):
             text = "it begins with a free robot, which is in contact; a Release must lead there"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
