@@ -80,15 +80,16 @@ def test_guards_of_force_and_control_trip_at_their_value():
     """At rest u = H - J' F, by MultibodyPlant; fewer newtons take more of it."""
     pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[PhaseGuard("force", 15.0)])
     with pytest.raises(SimulationError, match="Move is ended by a force of 15 N, where its guard"):
-        ended([PRESS, pushed], 0.0, 1.0)
+        ended([PRESS, pushed], 0.0, 1.0, accuracy=1e-6)
     loop = task_loop([PRESS])
     q = loop.diagram.GetOutputPort("state").Eval(started(loop, 0.0))[:2]
     found = numbers("two_link", q, np.zeros(2))
     most = float(np.abs(found.bias - 5.0 * found.constraint_jacobian[0]).max())
     eased = Move({"wall.force": 2.0}, 0.3, over=0.3, guards=[PhaseGuard("control", most)])
-    loop, context, changes = ended([PRESS, replace(eased, on_failure="leave")], 0.0, 2.0)
+    phases = [PRESS, replace(eased, on_failure="leave")]
+    loop, context, changes = ended(phases, 0.0, 2.0, accuracy=1e-6)
     assert [change.phase for change in changes] == ["Press", "Move", "leave", "held"]
-    assert_allclose(changes[2].force, 5.0, atol=1e-5)
+    assert_allclose(changes[2].force, 5.0, atol=1e-4)
     # It has let go, and the run has ended.
     assert changes[-1].time == pytest.approx(loop.record(context).time[-1], abs=1e-6)
     assert changes[-1].time < 2.0
@@ -184,8 +185,8 @@ def test_who_holds_keeps_contact_and_force():
 )
 def test_a_task_that_is_done_in_contact_stays_there(phases):
     """Also where a phase might have left."""
-    loop, context, changes = ended(phases, 0.005, 0.3)
+    loop, context, changes = ended(phases, 0.005, 0.3, accuracy=1e-5)
     last = changes[-1]
     assert (last.phase in ("done", "held"), last.in_contact, last.failed) == (True, True, False)
     record = loop.record(context)
-    assert_allclose(record["constraint_force"][-1, 0], last.force, atol=1e-6)
+    assert_allclose(record["constraint_force"][-1, 0], last.force, atol=1e-3)
