@@ -71,6 +71,10 @@ PRESS = Press(20.0)
     ("phases", "message"),
     [
         ([Approach(on_failure="park")], "1 of the task, Approach: on_failure: no phase 'park'; "),
+        (
+            [Approach(retries=1, if_spent="park")],
+            "1 of the task, Approach: if_spent: no phase 'park'",
+        ),
         ([Approach(name="done")], "phase 1 of the task: 'done' is no name of a phase"),
         ([Approach(name="a"), Press(2.0, name="a")], "more than one phase has the name 'a'"),
         (

@@ -184,6 +184,8 @@ class Plan:
     def _all_from(self, place: int) -> list[tuple[str, int]]:
         """The words and phases that may follow a phase, each checked."""
         phase, found = self.phases[place], list[tuple[str, int]]()
+        if phase.retries is not None:
+            self._check_word(place, "if_spent", phase.if_spent)
         outcomes: list[Outcome] = ["success", "guard", "late"]
         if phase.holds_contact and self.contacts[place]:
             outcomes.append("lost")
@@ -208,10 +210,7 @@ class Plan:
             )
         if word not in (*ENDS, *self._names):
             known = unknown_name("phase", word, self._names)
-            raise ModelError(
-                f"{self.where(place)}: {key}: {known}; and no word for what follows: "
-                f"{', '.join(ENDS)}"
-            )
+            raise ModelError(f"{self.where(place)}: {key}: {known}; or take {', '.join(ENDS)}")
 
     def _check_contact(self, place: int, key: str, outcome: Outcome, to: int) -> None:
         """Refuses a phase that cannot follow another one with its outcome."""
