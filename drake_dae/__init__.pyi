@@ -164,10 +164,14 @@ from .systems.task.controller import TaskController as TaskController
 from .systems.task.open_contact import open_contact as open_contact
 from .systems.task.phases import Approach as Approach
 from .systems.task.phases import Dwell as Dwell
+from .systems.task.phases import GuardedMove as GuardedMove
 from .systems.task.phases import Move as Move
+from .systems.task.phases import PhaseGuard as PhaseGuard
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
+from .systems.task.phases import Search as Search
+from .systems.task.phases import Wait as Wait
 from .systems.task.task import Task as Task
 
 __version__: str

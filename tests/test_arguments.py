@@ -346,6 +346,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "phases": lambda: [dd.Approach()],
     "references of Move": lambda: {"tool.z": 0.3},
     "force of Press": lambda: 20.0,
+    "of": lambda: "force",
+    "outputs of Search": lambda: "tool.yz",
     "task": lambda: dd.Task([dd.Approach()]),
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],

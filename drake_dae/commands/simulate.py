@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from textwrap import fill
@@ -269,13 +269,14 @@ def _write(run: _CommandRun) -> bool:
             [*shortfalls(record, limits), *map(str, behind)],
             limits.pushing,
             changes,
-            is_cut_short=bool(run.failure or stopped) or interrupted,
+            is_cut_short=bool(run.failure or (stopped and changes[-1].failed)) or interrupted,
         )
         verdict = judge(record, predicted, accuracy)
         is_unexplained = verdict.tracking is Tracking.OFF and not reasons
         run.results = {
             "missed": job.outcome is JobOutcome.BAD or is_unexplained,
             "job": job.to_dict(),
+            "phases": [asdict(change) for change in changes],
             **_as_data(run, verdict, reasons),
         }
         if model is not None:

@@ -1,6 +1,6 @@
 """The parts of a closed loop: adding them to a diagram, and checks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -15,13 +15,14 @@ from pydrake.systems.primitives import (
     VectorLogSink,
 )
 
-from drake_dae.dae.references import Reference
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.control.contract import Controller
+from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import ControlHold, Sampling
@@ -72,6 +73,41 @@ def add_exogenous(
     generator.set_name(f"{block.get_name()}_exogenous")
     builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
     return generator
+
+
+def add_signals(
+    builder: DiagramBuilder, controller: Controller, signals: Mapping[str, Reference | float]
+) -> None:
+    """Wires the signals for which a controller waits; the others become inputs of the diagram.
+
+    Args:
+        builder: The builder of the diagram, with the controller in it.
+        controller: The controller.
+        signals: Name -> reference.
+
+    Raises:
+        WiringError: The controller waits for no signal of that name, or it is not one number.
+    """
+    ports = [controller.get_input_port(i) for i in range(controller.num_input_ports())]
+    names = [port.get_name() for port in ports]
+    known = [name.removeprefix(SIGNAL) for name in names if name.startswith(SIGNAL)]
+    for name in signals:
+        if name not in known:
+            raise WiringError(f"{unknown_name('signal', name, known)}, for which a phase waits")
+    for name in known:
+        port = controller.GetInputPort(SIGNAL + name)
+        if name not in signals:
+            builder.ExportInput(port, SIGNAL + name)
+            continue
+        given = signals[name]
+        reference = given if isinstance(given, Reference) else ConstantReference(given)
+        if reference.size != 1:
+            raise WiringError(
+                f"the signal '{name}' is one number, its reference has {reference.size}"
+            )
+        source = builder.AddSystem(ReferenceGenerator([reference], [0]))
+        source.set_name(SIGNAL + name)
+        builder.Connect(source.GetOutputPort("reference"), port)
 
 
 def contact_reference(

@@ -1,7 +1,7 @@
 """The settings of a closed loop besides plant, controller and references."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from numpy.typing import ArrayLike
 
@@ -42,6 +42,9 @@ class LoopSettings:
             `control_limits` as well, these and the limits of forces hold by `FeasibleControl`, and
             the record has its "departure".
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
+        signals: Name -> reference of a signal for which a controller waits, as phases of a task do;
+            it has come where it is above 1/2. One that is not given is an input port signal_<name>
+            of the loop.
         start_time: The start of a run, in s: the zero dynamics are judged at the references then.
     """
 
@@ -54,6 +57,7 @@ class LoopSettings:
     plant_exogenous: Sequence[Reference] | None = None
     governed: MotionLimits | None = None
     tolerances: Tolerances | None = None
+    signals: Mapping[str, Reference | float] = field(default_factory=dict)
     start_time: float = 0.0
 
     def period(self, step: float) -> float:

@@ -20,6 +20,7 @@ from drake_dae.diagrams.parts import (
     add_exogenous,
     add_feasible,
     add_hold,
+    add_signals,
     add_watch,
     check_parts,
     contact_reference,
@@ -198,6 +199,7 @@ def wire_loop(
         if block is not None:
             holds.append(block.GetOutputPort("is_limited"))
     add_hold(builder, controller, holds)
+    add_signals(builder, controller, parts.signals)
 
     # The constraint force goes through its sensor to the blocks that measure it.
     noise = None

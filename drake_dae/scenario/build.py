@@ -146,6 +146,7 @@ def build_loop(
         plant_exogenous=plant_exogenous,
         governed=None if motion is None else motion.governed,
         tolerances=scenario.tolerances,
+        signals={} if task is None else task.signals,
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)

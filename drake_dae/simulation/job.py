@@ -24,6 +24,10 @@ GRACE = 0.1
 """So much later than predicted, as a fraction of the run, it may be."""
 
 
+_MOST_TOLD = 3
+"""So many failures of phases, the last ones, are told of a task that was done."""
+
+
 class JobOutcome(Enum):
     """Whether a run did its job; the values start the sentence."""
 
@@ -137,13 +141,26 @@ def judge_job(
 def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: list[str]) -> bool:
     """Whether a task was still going on."""
     last, count = changes[-1], len({change.place for change in changes})
-    if last.phase == "held":
-        problems.append(f"the task was given up at {last.time:.4g} s: {last.reason}")
+    failures = [
+        change
+        for before, change in zip((None, *changes), changes, strict=False)
+        if change.failed and not (before is not None and before.chosen == "leave")
+    ]
+    if last.phase == "held" and last.failed:
+        why = failures[-1] if failures else last
+        left = ", and has left the contact" if why.chosen == "leave" else ""
+        problems.append(f"the task was given up at {why.time:.4g} s{left}: {why.reason}")
+    elif last.phase == "held":
+        remarks.append(f"the task ended as chosen at {last.time:.4g} s: {last.reason}")
     elif last.phase == "done":
         again = len(changes) - count
         repeated = f", {again} of them again" if again else ""
         ended = f"{len(changes) - 1} phases" if len(changes) > 2 else "1 phase"
         remarks.append(f"the task was done at {last.time:.4g} s, in {ended}{repeated}")
+        remarks += [
+            f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
+            for change in failures[-_MOST_TOLD:]
+        ]
     else:
         remarks.append(
             f"the run ended during phase {last.place + 1}, {last.phase}, which began at "

@@ -2,8 +2,9 @@
 
     python tests/campaign/random_tasks.py --count 1000 --seed 0
 
-Each has to end done, or by the chosen reaction, or with an error of the library. Without pushes and
-payloads the force of the touch has to stay below the expected peak. Returns 1 if one does not.
+Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
+phases and retries allow. Without pushes and payloads the force of every touch has to stay below the
+expected peak. Returns 1 if one does not.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,10 @@ from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
 
-REACTIONS = ("hold", "stop", "fail")
+ENDED = ("done", "held")
+REACTIONS = ("hold", "stop", "fail", "leave")
+DURATIONS = (6.0, 60.0)
+"""In s; a task that has not ended in the first time is run for the second."""
 TEXT = """
 robot: {{file: package://drake_dae_models/two_link_arm.urdf}}
 constraints:
@@ -36,12 +41,13 @@ outputs:
 - {{frame: tool, axes: z}}
 sampling: {{period: 0.001, delay: 0.001}}
 start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
-duration: 6.0
+duration: 6
 plant: {plant}
 force_feedback: !MeasuredForce {sensor}
 {settings}
 task:
   tare_time: {tare}
+  signals: {signals}
 {gains}
   phases:
 {phases}
@@ -79,51 +85,85 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
         settings.append(f"plant_parameters: {{wall.position: [{place}, 0, 0]}}")
     if draw.random() < 0.3:
         settings.append("saturation: true")
-    lost = (*REACTIONS, "approach")
-    speed, late = draw.uniform(0.01, 0.1), draw.choice(REACTIONS)
-    phases = [f"!Approach {{speed: {speed}, over: 0.1, if_late: {late}}}"]
-    ends = f"within: 3, if_late: {draw.choice(REACTIONS)}, if_lost: {draw.choice(lost)}"
-    force, tolerance = draw.uniform(3.0, 40.0), max(1.0, 5.0 * noise)
-    phases.append(f"!Press {{force: {force}, tolerance: {tolerance}, over: 0.3, {ends}}}")
-    for _ in range(draw.randrange(4)):
-        goal, force, if_lost = draw.uniform(0.2, 0.4), draw.uniform(3.0, 40.0), draw.choice(lost)
-        goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
-        move, dwell = f"!Move {{{goals}, if_lost: {if_lost}}}", "!Dwell {duration: 0.3}"
-        phases.append(draw.choice((move, dwell)))
+    lost = (*REACTIONS, "approach", "touch", "away")
+    retries, spent = draw.randrange(3), draw.choice(("away", *REACTIONS))
+    speed, again = draw.uniform(0.01, 0.1), f"retries: {retries}, if_spent: {spent}"
+    late = draw.choice((*REACTIONS, "touch", "away"))
+    touch = f"name: touch, speed: {speed}, over: 0.1, within: 6, if_late: {late}, {again}"
     if draw.random() < 0.5:
-        phases += ["!Release {over: 0.3, within: 3}", "!Retreat {distance: 0.02, tolerance: 2e-3}"]
+        felt = f"distance: {draw.uniform(0.01, 0.08)}, force: {draw.uniform(2.0, 10.0)}"
+        phases = [f"!GuardedMove {{{touch}, {felt}}}"]
+    else:
+        phases = [f"!Approach {{{touch}}}"]
+    ends = f"within: 3, on_failure: {draw.choice(lost)}, if_lost: {draw.choice(lost)}"
+    force, tolerance = draw.uniform(3.0, 40.0), max(1.0, 5.0 * noise)
+    guards = _guards(draw, force)
+    phases.append(f"!Press {{force: {force}, tolerance: {tolerance}, over: 0.3, {ends}, {guards}}}")
+    for _ in range(draw.randrange(4)):
+        goal, force, reaction = draw.uniform(0.2, 0.4), draw.uniform(3.0, 40.0), draw.choice(lost)
+        goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
+        failing = f"on_failure: {reaction}, {_guards(draw, force)}"
+        move, dwell = f"!Move {{{goals}, {failing}}}", "!Dwell {duration: 0.3}"
+        wait = f"!Wait {{for_signal: ready, within: 2, {failing}}}"
+        phases.append(draw.choice((move, dwell, wait)))
+    phases.append("!Release {over: 0.3, within: 3}")
+    phases.append("!Retreat {name: away, distance: 0.02, tolerance: 2e-3, within: 5, retries: 0}")
+    first = draw.uniform(0.0, 3.0)
+    ramp = f"start: [0], end: [1], start_time: {first}, end_time: {first + 0.1}"
+    waits = any(phase.startswith("!Wait") for phase in phases)
     text = TEXT.format(
         plant=plant,
         sensor=sensor,
         settings="\n".join(filter(None, settings)),
         tare=0.1 if bias else draw.choice((0.0, 0.1)),
         gains=gains,
+        signals=f"{{ready: !PointToPoint {{{ramp}}}}}" if waits else "{}",
         phases="\n".join(f"  - {phase}" for phase in phases),
     )
     return text, not moved
 
 
+def _guards(draw: random.Random, force: float) -> str:
+    """Guards of a phase that presses with a force in N."""
+    samples = draw.choice((1, 3, 10))
+    found = [
+        f"{{of: force, most: {force * draw.uniform(1.2, 3.0)}, samples: {samples}}}",
+        f"{{of: time, most: {draw.uniform(0.7, 3.0)}}}",
+        f"{{of: work, most: {draw.uniform(0.5, 5.0)}}}",
+        f"{{of: control, most: {draw.uniform(80.0, 150.0)}, samples: {samples}}}",
+        f"{{of: speed, most: {draw.uniform(0.2, 1.0)}, samples: 2}}",
+        f"{{of: travel, most: {draw.uniform(0.05, 0.3)}}}",
+    ]
+    return f"guards: [{', '.join(draw.sample(found, draw.randrange(3)))}]"
+
+
 def outcome(text: str, is_model: bool, folder: Path) -> str:
-    """How a task ends; "RAW" or "HARD" first where it may not end so."""
+    """How a task ends; "RAW", "HARD" or "HANGS" first where it may not end so."""
     file = folder / "task.yaml"
     file.write_text(text)
     try:
-        completed, loop = build_completed(load_scenario(file))
-        context = start_scenario(completed.scenario, loop)
-        found = roll_scenario(completed.scenario, loop, context)
+        for duration in DURATIONS:
+            completed, loop = build_completed(load_scenario(file, [f"duration={duration}"]))
+            context = start_scenario(completed.scenario, loop)
+            found = roll_scenario(completed.scenario, loop, context)
+            changes = loop.changes(found.context or context)
+            if found.failure is not None or changes[-1].phase in ENDED:
+                break
     except DrakeDaeError as error:
         return f"refused: {error}"
     except Exception as error:
         return f"RAW: {error!r}"
-    changes = loop.changes(found.context or context)
     limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
-    touches = [change.time for change in changes if change.in_contact]
-    if limit and touches and is_model:
+    pairs = pairwise(changes)
+    touches = [after.time for before, after in pairs if after.in_contact > before.in_contact]
+    for touch in touches if limit and is_model else ():
         record = found.record
-        near = np.abs(record.time - touches[0] - 0.02) < 0.03
+        near = np.abs(record.time - touch - 0.02) < 0.03
         peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
         if peak > float(limit[1]):
             return f"HARD: {peak:.3g} N, expected below {limit[1]} N"
+    if found.failure is None and changes[-1].phase not in ENDED:
+        return f"HANGS: {changes[-1]}"
     if found.failure is not None:
         return f"error: {found.failure}"
     return f"{changes[-1].phase}: {changes[-1].reason}" if changes else "no phase"
@@ -140,7 +180,7 @@ def main() -> int:
         for seed in range(options.seed, options.seed + options.count):
             began = time.perf_counter()
             found = outcome(*random_task(random.Random(seed)), Path(folder))
-            bad += (is_bad := found.startswith(("RAW", "HARD")))
+            bad += (is_bad := found.startswith(("RAW", "HARD", "HANGS")))
             kinds[re.sub(r"[-+]?\d[\d.e+-]*", "#", found)[:100]] += 1
             if is_bad or time.perf_counter() - began > 60.0:
                 print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)

@@ -140,8 +140,8 @@ def test_violations_and_early_ends_are_bad():
     assert "broke off at 10 s" in str(judged(run(), is_cut_short=True))
 
 
-def change(time, phase, place, reason):
-    return PhaseChange(time, phase, place, False, reason, 0.0, 0.1, 0.0)
+def change(time, phase, place, reason, chosen="next", failed=False):
+    return PhaseChange(time, phase, place, False, reason, 0.0, 0.1, 0.0, chosen, failed)
 
 
 def test_a_task_is_judged_by_its_end():
@@ -152,7 +152,9 @@ def test_a_task_is_judged_by_its_end():
     assert str(found) == "GOOD: the task was done at 4 s, in 2 phases."
     one = judged(run(), changes=[begin[0], change(4.0, "done", 1, "the end of 4 s")])
     assert str(one) == "GOOD: the task was done at 4 s, in 1 phase."
-    held = judged(run(), changes=[*begin, change(4.0, "held", 2, "the contact was lost")])
+    held = judged(
+        run(), changes=[*begin, change(4.0, "held", 2, "the contact was lost", "hold", True)]
+    )
     assert str(held) == "BAD: the task was given up at 4 s: the contact was lost."
     going_on = judged(run(), changes=begin)
     assert going_on.outcome is JobOutcome.UNDECIDED
@@ -167,6 +169,30 @@ def test_a_task_that_begins_again_says_so():
     ]
     found = str(judged(run(), changes=changes))
     assert found == "GOOD: the task was done at 4 s, in 4 phases, 2 of them again."
+
+
+def test_a_way_that_was_chosen_for_failure_is_a_good_end():
+    begin = change(0.0, "Approach", 0, "the task begins", "")
+    away = change(2.0, "away", 3, "Approach has waited 2 s for a force of 0.5 N", "away", True)
+    found = judged(run(), changes=[begin, away, change(4.0, "done", 4, "a distance")])
+    assert found.outcome is JobOutcome.GOOD
+    assert "done at 4 s, in 2 phases; at 2 s Approach has waited 2 s" in str(found)
+    assert "and away followed, as chosen" in str(found)
+
+
+@pytest.mark.parametrize("failed", [True, False])
+def test_a_task_that_leaves_is_bad_where_a_phase_has_failed(failed):
+    begin = change(0.0, "Press", 0, "the task begins", "")
+    leave = change(2.0, "leave", 1, "Press is ended by a force of 31 N", "leave", failed)
+    held = change(3.0, "held", 2, "after a force of no more than 0.5 N", "stop", failed)
+    found = judged(run(), changes=[begin, leave, held])
+    wanted = (
+        "BAD: the task was given up at 2 s, and has left the contact: Press is ended by a force "
+        "of 31 N."
+    )
+    if not failed:
+        wanted = "GOOD: the task ended as chosen at 3 s: after a force of no more than 0.5 N."
+    assert str(found) == wanted
 
 
 def test_a_run_without_outputs():

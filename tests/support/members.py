@@ -1,4 +1,4 @@
-"""Members of the families of robots that the package does not know: one class each.
+"""Members of families that the package does not know: one class each.
 
 They show what it takes to add one, and keep the contracts as those of the package do.
 """
@@ -16,6 +16,7 @@ from drake_dae.robots.actuation.numbers import diagonal_parameter
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.surfaces.surface import Surface
+from drake_dae.systems.task.phases import Phase
 
 
 @dataclass(frozen=True)
@@ -234,3 +235,21 @@ class Pull(ForceOutput):
 
     def signals(self, constraints):
         return (Signal(f"{self.constraint}.pull", "N"),)
+
+
+@dataclass(frozen=True)
+class Rise(Phase):
+    """The tool goes up at a constant speed for some time, of a robot with the output "tool.z"."""
+
+    duration: float
+    speed: float = 0.05
+    begins_in_contact, ends_in_contact = False, False
+
+    def rates(self, contact_output):
+        return {"tool.z": self.speed}
+
+    def margin(self, now, contact_force):
+        return self.duration - now.time
+
+    def awaited(self, contact_force):
+        return f"{self.duration:g} s of rising"

@@ -46,15 +46,22 @@ def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> p
 
 
 def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """The force of the fastest touch, v (sqrt(k / A) + k t).
+    """The force of the hardest touch, F + v (sqrt(k / A) + k t), also where it is tried again.
 
-    The first term stops the mass 1 / A at the tool; the second is how far the tool goes in the time
-    t until the law reacts.
+    The law pushes with the force F that ends the phase from when it is felt; the root stops the
+    mass 1 / A at the tool, and the last term is how far the tool goes in the time t until the law
+    reacts.
     """
-    speeds = [] if task is None else [phase.speed_of_approach for phase in task.phases]
-    speed = max(speeds, default=0.0)
-    peak = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
-    return f". A touch at {speed:g} m/s is expected to stay below {peak:.3g} N" if speed else ""
+    peaks = []
+    for phase in () if task is None else task.made().phases:
+        if task is not None and (speed := phase.speed_of_approach):
+            added = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
+            peaks.append((phase.felt(task.contact_force) + added, speed, phase.name))
+    if not peaks:
+        return ""
+    peak, speed, name = max(peaks)
+    which = f" by {name}" if len(peaks) > 1 else ""
+    return f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import pydantic
 from casadi import SX
 from numpy.typing import ArrayLike
 
@@ -104,13 +105,27 @@ Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]
+_Guards = Annotated[
+    tuple[Annotated[phases.PhaseGuard, Form()], ...], pydantic.Strict(False)
+]  # In data a tuple is a list.
+_BY_NAME: dict[Any, Any] = {Mapping[str, references.Reference | float]: dict[str, Reference]}
 _PHASE_DATA = {
     float | references.Reference: Reference,
-    Mapping[str, references.Reference | float]: dict[str, Reference],
+    Mapping[str, float]: dict[str, float],
+    Sequence[phases.PhaseGuard]: _Guards,
+    **_BY_NAME,
 }
 Phase = Annotated[
-    phases.Approach | phases.Press | phases.Move | phases.Dwell | phases.Release | phases.Retreat,
+    phases.Approach
+    | phases.Press
+    | phases.Move
+    | phases.Dwell
+    | phases.Wait
+    | phases.GuardedMove
+    | phases.Search
+    | phases.Release
+    | phases.Retreat,
     Choice(_PHASE_DATA),
 ]
-Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase]})]
+Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

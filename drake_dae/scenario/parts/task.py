@@ -1,9 +1,12 @@
 """A task in a scenario: phases in place of references."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated
 
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.references import Reference
+from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.forms import Choice
 from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase
@@ -26,7 +29,9 @@ class ScenarioTask:
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s for which a task that begins free measures the bias of the force
             sensor, before any phase ends; it is subtracted from then on. 0 for no taring.
-        retries: How many times a phase may go back to an approach; then the run ends with an error.
+        retries: How many times a phase may go back by "approach"; then the run ends with an error.
+        signals: Name -> the signal for which a phase waits, over the time of the run; it has come
+            where it is above 1/2.
         gains: The gains of the law of the free robot, with the distance among its outputs; those of
             `gains` if left out.
     """
@@ -37,10 +42,15 @@ class ScenarioTask:
     patience: float = 0.25
     tare_time: float = 0.0
     retries: int = 10
+    signals: Mapping[str, Reference | float] = field(default_factory=dict)
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
-        self.made()
+        task = self.made()
+        for name in self.signals:
+            if name not in task.signals:
+                text = unknown_name("phase that waits for the signal", name, task.signals)
+                raise ModelError(f"signals: {text}")
 
     def made(self, force_noise: float = 0.0) -> Task:
         """The task.

@@ -27,6 +27,9 @@ else:
 Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
 
+SIGNAL = "signal_"
+"""The beginning of the name of an input port for a signal."""
+
 Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
 """Outputs z, what they should be, both of shape (k,), and their names and units."""
 
@@ -40,9 +43,10 @@ class Controller(System):
 
     1. Inputs. The input port `estimated_state` is x, shape (n,). Further input ports, if needed:
        `reference` (R of its `law`), `measured_force` (all constraint forces), `exogenous` (as of a
-       `Plant`), and `hold` (one entry for each integral of `law`, which is not updated while it is
-       not 0). One that plans its references itself has the output port `contact_reference` for an
-       observer, and `tared_force` where it corrects the measured force.
+       `Plant`), `hold` (one entry for each integral of `law`, which is not updated while it is not
+       0), and signal_<name> for each signal for which it waits. One that plans its references
+       itself has the output port `contact_reference` for an observer, and `tared_force` where it
+       corrects the measured force.
     2. Outputs. The output port `control` is u, shape (p,). `further_signals` are the other output
        ports in a record, with names and units; `shown` are those that a loop exports without
        recording them.

@@ -27,7 +27,7 @@ from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import Segment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.switch import LawSwitch
-from drake_dae.systems.task.task import Task
+from drake_dae.systems.task.task import Task, check_sampled
 from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {
@@ -71,6 +71,8 @@ class TaskController(Diagram, Controller):
         exogenous: Of an observer: the disturbance, and coefficients of friction; if the laws have
             them.
         hold: Where it is not 0, no integral is updated, shape (1,); may be without a wire.
+        signal_<name>: For which phases wait, shape (1,); it has come where it is above 1/2. May be
+            without a wire.
 
     Output ports:
         control: u, shape (p,).
@@ -114,14 +116,7 @@ class TaskController(Diagram, Controller):
         sample_period: float = 0.0,
     ) -> None:
         super().__init__()
-        if not (np.isfinite(sample_period) and sample_period >= 0.0):
-            raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
-        for name in ("force_noise", "tare_time"):
-            if getattr(task, name) and not sample_period:
-                raise ModelError(
-                    f"{name}: noise and bias of a force are found in samples, and this task acts "
-                    "continuously; leave it out, or give a sample_period (in a scenario: sampling)"
-                )
+        check_sampled(task, sample_period)
         self.task, self.law, self.free_law = task, law, free_law
         self.sample_period = sample_period
         self.place, self.force = opened_contact(law, free_law)
@@ -136,6 +131,8 @@ class TaskController(Diagram, Controller):
         builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
         builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
         builder.ExportInput(self.supervisor.GetInputPort("hold"), "hold")
+        for port in self.supervisor.signal_ports.values():
+            builder.ExportInput(port, port.get_name())
         switch = builder.AddSystem(LawSwitch(law.system.num_controls))
         in_contact = self.supervisor.GetOutputPort("in_contact")
         builder.Connect(in_contact, switch.GetInputPort("in_contact"))
@@ -171,6 +168,9 @@ class TaskController(Diagram, Controller):
             added.append(controller)
         self.free_controller, self.controller = added
         builder.ExportOutput(switch.GetOutputPort("control"), "control")
+        if task.watches("control"):
+            watching = self.supervisor.GetInputPort("control")
+            builder.Connect(switch.GetOutputPort("control"), watching)
         names = ["phase", "desired_output", "contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
@@ -242,7 +242,7 @@ class TaskController(Diagram, Controller):
     @property
     def phase_signals(self) -> tuple[Signal, ...]:
         """The names of the phases as a record has them: "1 Approach", "2 Press", ..., "end"."""
-        names = [phase.name for phase in self.task.phases]
+        names = [phase.name for phase in self.task.plan.phases]
         return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal("end"))
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.references import ConstantReference, Reference, stack_references
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -26,7 +26,7 @@ class Goals:
 
     Attributes:
         function: R in s after its begin, zero for outputs that it does not name.
-        named: Which outputs it names.
+        named: Which outputs it names, with references from their origin.
         references: The same as references of all outputs, in their order.
     """
 
@@ -50,6 +50,26 @@ class Now:
     parameters: FloatArray
 
 
+@dataclass(frozen=True)
+class Cause:
+    """Why a phase begins.
+
+    Attributes:
+        reason: In words.
+        chosen: What was chosen to follow: the name of a phase, "next", "stop" and so on.
+        failed: Whether the phase before has failed.
+        ends_in_contact: Whether the phase before has ended in contact; None as it was before.
+    """
+
+    reason: str
+    chosen: str = ""
+    failed: bool = False
+    ends_in_contact: bool | None = None
+
+
+BEGIN = Cause("the task begins")
+
+
 class Planner:
     """Makes the references of each phase of a task.
 
@@ -60,7 +80,9 @@ class Planner:
 
     Attributes:
         goals: What each phase wants.
-        distance_function: (x, parameters) -> the distance and its derivative, by the model.
+        motion_function: (x, parameters) -> the distance and its derivative, by the model, then all
+            outputs in m with the distance, then their derivatives.
+        moved: How many outputs in m there are.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -68,28 +90,34 @@ class Planner:
 
     def __init__(self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], place: int) -> None:
         self._task, self._laws, self._place = task, laws, place
-        pairs = enumerate(task.contacts[:-1])
+        self._phases = task.plan.phases
+        pairs = list(enumerate(task.contacts[:-1]))
         self.goals = [_goals(task, index, laws[contact], place) for index, contact in pairs]
+        self._rates = [_rates(task, index, laws[contact], place) for index, contact in pairs]
         self._nothing = [_no_goals(law) for law in laws]
         free = laws[FREE]
-        distance = ca.vertcat(*free.structure.output_chains[place][:2])
-        self.distance_function = free.system.trace("distance", {"value": distance})
+        chains = free.structure.output_chains
+        moved = [chains[i] for i, one in enumerate(free.system.output_signals) if one.unit == "m"]
+        rows = [*chains[place][:2], *(one[0] for one in moved), *(one[1] for one in moved)]
+        self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
+        self.moved = len(moved)
 
-    def distance(self, now: Now) -> tuple[float, float]:
-        """The distance and its derivative, by the model."""
-        distance, rate = self.distance_function.evaluate(now.state, now.parameters)[0]
-        return float(distance), float(rate)
+    def motion(self, now: Now) -> tuple[float, float, FloatArray, FloatArray]:
+        """The distance and its derivative, then all outputs in m and their derivatives."""
+        values = self.motion_function.evaluate(now.state, now.parameters)[0].copy()
+        first, rates = values[2 : 2 + self.moved], values[2 + self.moved :]
+        return float(values[0]), float(values[1]), first, rates
 
     def first(self, now: Now) -> Segment:
         """The references of the first phase, which begin as the outputs are."""
         contact = self._task.contacts[0]
         force = self._task.contact_force if contact else 0.0
-        moment = Moment(0.0, force, *self.distance(now), 0.0)
+        moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
         present = self._met(now, contact, moment)
-        return self._started(now, 0, self._name(0), contact, "the task begins", moment, present)
+        return self._started(now, 0, self._name(0), contact, BEGIN, moment, present)
 
     def following(
-        self, now: Now, before: Segment, moment: Moment, place: int | None, reason: str
+        self, now: Now, before: Segment, moment: Moment, place: int | None, cause: Cause
     ) -> Segment:
         """The references from now on, which begin as those before are.
 
@@ -98,21 +126,23 @@ class Planner:
             before: The references before.
             moment: What is measured.
             place: The phase that begins, their number after the last one; None to rest for good.
-            reason: Why.
+            cause: Why.
         """
         was, known = before.change.in_contact, before.reference(now.time)
-        end = len(self._task.phases)
+        end = len(self._phases)
         name = HELD if place is None else self._name(place)
-        contact = was if place is None else self._task.contacts[place]
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
+            contact = was if cause.ends_in_contact is None else cause.ends_in_contact
             contact, place = contact and moment.force >= self._task.contact_force, end
+        else:
+            contact = self._task.contacts[place]
         if contact != was:
             old, known = known, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):
                 if i != self._place:
                     size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
                     known[first : first + size] = old[start : start + size]
-        return self._started(now, place, name, contact, reason, moment, known)
+        return self._started(now, place, name, contact, cause, moment, known)
 
     def _started(
         self,
@@ -120,26 +150,30 @@ class Planner:
         place: int,
         name: str,
         contact: bool,
-        reason: str,
+        cause: Cause,
         moment: Moment,
         present: FloatArray,
     ) -> Segment:
-        law, phases = self._laws[contact], self._task.phases
+        law, phases = self._laws[contact], self._phases
         rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
         if place < len(phases):
-            rate[self._place] = -phases[place].speed_of_approach
-            over, goals = phases[place].over, self.goals[place]
+            over, goals, rate = phases[place].over, self.goals[place], self._rates[place]
         change = PhaseChange(
             time=float(now.time),
             phase=name,
             place=place,
             in_contact=bool(contact),
-            reason=reason,
+            reason=cause.reason,
             force=float(moment.force),
             distance=float(moment.distance),
             distance_rate=float(moment.rate),
+            chosen=cause.chosen,
+            failed=cause.failed,
         )
-        return Segment.begin(change, law.layout, goals.function, goals.named, rate, present, over)
+        origin = self.motion(now)[2]
+        return Segment.begin(
+            change, law.layout, goals.function, goals.named, rate, present, over, origin
+        )
 
     def _met(self, now: Now, contact: bool, moment: Moment) -> FloatArray:
         """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives.
@@ -155,8 +189,7 @@ class Planner:
         return found
 
     def _name(self, place: int) -> str:
-        phases = self._task.phases
-        return phases[place].name if place < len(phases) else DONE
+        return self._phases[place].name if place < len(self._phases) else DONE
 
 
 def _integral_places(law: TrackingLaw) -> list[int]:
@@ -172,24 +205,41 @@ def _integral_places(law: TrackingLaw) -> list[int]:
 
 def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
     """The references of a phase."""
-    phase = task.phases[index]
+    phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
     found, degrees = [], law.degrees
     for name, reference in phase.goals(names[place]).items():
         try:
             found.append(assigned(name, reference, names, degrees))
         except ReferenceSignalError as error:
-            raise ModelError(
-                f"phase {index + 1} of the task, {phase.name}: reference '{name}': {error}"
-            ) from error
+            raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
     named = tuple(i for one in found for i in one.places)
     rest = [name for i, name in enumerate(names) if i not in named]
     found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
         references = tuple(in_order(found, names))
-        return Goals(stack_references(references, degrees), named, references)
+        here = () if phase.is_relative else named
+        return Goals(stack_references(references, degrees), here, references)
     except ReferenceSignalError as error:
-        raise ModelError(f"phase {index + 1} of the task, {phase.name}: {error}") from error
+        raise ModelError(f"{task.plan.where(index)}: {error}") from error
+
+
+def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
+    """How fast the outputs of a phase go at last, shape (p,)."""
+    signals, found = law.system.output_signals, np.zeros(len(law.degrees))
+    names = [signal.name for signal in signals]
+    for name, rate in task.plan.phases[index].rates(names[place]).items():
+        if name not in names:
+            text = unknown_name("output", name, names)
+            raise ModelError(f"{task.plan.where(index)}: direction: {text}")
+        if signals[names.index(name)].unit != "m":
+            unit = signals[names.index(name)].unit or "1"
+            raise ModelError(
+                f"{task.plan.where(index)}: direction: '{name}' is in {unit}, and a move goes "
+                "along outputs in m"
+            )
+        found[names.index(name)] = rate
+    return found
 
 
 def _no_goals(law: TrackingLaw) -> Goals:

@@ -29,6 +29,7 @@ class Segment:
         base, rate: Where and how fast the others go at last, shape (p,).
         faded: The factors of the polynomials that take over, see `fade`.
         over: How long they last, in s.
+        origin: All outputs in m, with the distance, when it began.
     """
 
     change: PhaseChange
@@ -38,6 +39,7 @@ class Segment:
     rate: FloatArray
     faded: FloatArray
     over: float
+    origin: FloatArray
 
     @classmethod
     def begin(
@@ -49,6 +51,7 @@ class Segment:
         rate: FloatArray,
         present: FloatArray,
         over: float,
+        origin: FloatArray,
     ) -> "Segment":
         """The references that begin with present values and derivatives.
 
@@ -60,6 +63,7 @@ class Segment:
             rate: How fast the other outputs go at last, shape (p,).
             present: R at the begin.
             over: How long it takes, in s.
+            origin: The outputs in m at the begin.
         """
         lowest = layout.lowest
         has_rate = np.array(layout.degrees) > 0
@@ -69,7 +73,7 @@ class Segment:
         base[list(named)] = 0.0
         rate = rate.copy()
         rate[list(named)] = 0.0
-        found = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over)
+        found = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over, origin)
         offset = present - found._goal(0.0)
         return replace(found, faded=fade(offset, layout.degrees, over))
 

@@ -1,8 +1,6 @@
 """What leads through the phases of a task: guards, changes and references."""
 
 from dataclasses import replace
-from itertools import pairwise
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,15 +16,18 @@ from pydrake.systems.framework import (
     WitnessFunctionDirection,
 )
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Computation, Guard, Update
+from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
+from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
+from drake_dae.systems.task.planner import CONTACT, FREE, Cause, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
+from drake_dae.systems.task.sight import Sight
 from drake_dae.systems.task.task import Task
 from drake_dae.systems.task.traced import EARLY, SEEN, TracedTask
 
@@ -38,10 +39,12 @@ class TaskSupervisor(LeafSystem):
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,).
         hold: Where it is not 0, the law's integrals stand still, shape (1,); 0 without a wire.
+        control: u, shape (p,); where a guard watches it.
+        signal_<name>: Those for which phases wait, shape (1,); 0 without a wire.
 
     Output ports:
         contact_reference, free_reference: R of the law that acts, zero for the other one.
-        phase: The place of the phase, shape (1,); the number of phases when done or held.
+        phase: The place of the phase, shape (1,); their number when done or held.
         desired_output: The positions, the force and the distance that are wanted, shape (p + 1,);
             zero for the one of the last two that is none now.
         in_contact: 1 where the law in contact acts, shape (1,).
@@ -55,6 +58,9 @@ class TaskSupervisor(LeafSystem):
         place: Which output is the distance of the first, and the force of the second.
         force: Which entry of `measured_force` is the contact's.
         sample_period: When guards are looked at, in s; 0 for at all times.
+
+    Attributes:
+        signal_ports: Name of a signal -> its input port.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -72,15 +78,17 @@ class TaskSupervisor(LeafSystem):
         self.set_name("task")
         self._sample_period = sample_period
         self.task, self._laws, self._place, self._force = task, laws, place, force
-        self._plan = plan = Planner(task, laws, place)
-        tares = task.tare_samples(sample_period)
-        self._traced = TracedTask(task, laws, place, force, plan, num_forces, tares)
-        self._state_port = self.DeclareVectorInputPort(
-            "estimated_state", laws[FREE].system.num_states
-        )
+        self._phases, self._plan = task.plan.phases, Planner(task, laws, place)
+        self._traced = TracedTask(task, laws, place, force, self._plan, num_forces, sample_period)
+        system = laws[FREE].system
+        self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
-        self.DeclareNumericParameter(BasicVector(laws[FREE].system.parameter_values))
+        declared, self._control_port = self.DeclareVectorInputPort, None
+        if task.watches("control"):
+            self._control_port = declared("control", system.num_controls)
+        self.signal_ports = {name: declared(SIGNAL + name, 1) for name in task.signals}
+        self.DeclareNumericParameter(BasicVector(system.parameter_values))
         self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
         self._held = self.DeclareDiscreteState(self._traced.size)
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
@@ -159,41 +167,52 @@ class TaskSupervisor(LeafSystem):
     def _moment(self, context: Context, segment: Segment) -> Moment:
         time = context.get_time()
         force = float(self._seen(context)[0])
-        distance, rate = self._plan.distance(self._now(context))
+        distance, rate, moved, rates = self._plan.motion(self._now(context))
         wanted = segment.reference(time)[segment.layout.lowest[self._place]]
         passed, away = time - segment.change.time, distance - segment.change.distance
-        return Moment(passed, force, distance, rate, float(wanted), away)
+        control, signal = 0.0, 0.0
+        if self._control_port is not None:
+            control = float(np.abs(self._control_port.Eval(context)).max())
+        if segment.change.place < len(self._phases):
+            name = self._phases[segment.change.place].signal
+            if name and self.signal_ports[name].HasValue(context):
+                signal = float(self.signal_ports[name].Eval(context)[0])
+        work = self._traced.work_of(context.get_discrete_state(self._held).value())
+        gone = float(np.linalg.norm(rates)), float(np.linalg.norm(moved - segment.origin))
+        seen = passed, force, distance, rate, float(wanted), away
+        return Moment(*seen, *gone, work, control, signal)
 
     def _seen(self, context: Context) -> FloatArray:
         """What is seen of the force with the present sample: see `SEEN`."""
         held = context.get_discrete_state(self._held).value()
         return self._traced.seen(held, float(self._force_port.Eval(context)[self._force]))
 
-    def _margins(
-        self, context: Context, progress: Progress, segment: Segment
-    ) -> tuple[Moment, FloatArray]:
-        """What is seen, and how far the phase is from its end, from a lost contact, from late.
-
-        Last comes how far the contact is from being felt, or from being felt no more.
-        """
-        task, moment, over = self.task, self._moment(context, segment), self._is_over(segment)
+    def _sight(self, context: Context, progress: Progress) -> Sight:
+        task, segment = self.task, progress.segments[-1]
+        moment, over = self._moment(context, segment), self._is_over(segment)
         excess, lost, end, late = moment.force - task.contact_force, np.inf, np.inf, np.inf
-        phase = None if over else task.phases[segment.change.place]
-        if (phase is None or phase.if_lost) and segment.change.in_contact and not progress.is_felt:
+        phase = None if over else self._phases[segment.change.place]
+        holds = phase is None or phase.holds_contact
+        if holds and segment.change.in_contact and not progress.is_felt:
             lost = task.patience - (context.get_time() - progress.felt)
+        held = context.get_discrete_state(self._held).value()
+        guards = np.full(1, np.inf)
         if phase is not None:
             late = float(phase.remaining(moment))
-            if not self._traced.tares(context.get_discrete_state(self._held).value()):
-                end = phase.margin(moment, task.contact_force)
+            if not self._traced.tares(held):
+                end = float(phase.margin(moment, task.contact_force))
+            tally = self._traced.tally_of(held)
+            found = self._traced.tally.margins(phase, tally, moment)
+            guards = np.array([np.inf, *map(float, found)])[-max(len(found), 1) :]
         felt = excess if progress.is_felt else -excess
-        return moment, np.array([end, lost, late, felt])
+        return Sight(moment, guards, np.array([np.min(guards), end, lost, late, felt]))
 
     def _guard(self, context: Context) -> float:
         """Positive while the phase goes on: Drake seeks where that ends."""
         progress = self.progress(context)
         if not progress.segments:
             return 1.0
-        _, margins = self._margins(context, progress, progress.segments[-1])
+        margins = self._sight(context, progress).margins
         # A little early: Drake's Simulator ends the process where it finds a zero at the very end
         # of a step at which a sample is due.
         least = float(np.min(margins)) - EARLY
@@ -202,7 +221,7 @@ class TaskSupervisor(LeafSystem):
         return 1.0 if least <= 0.0 and context.get_time() == progress.step else least
 
     def _is_over(self, segment: Segment) -> bool:
-        return segment.change.place >= len(self.task.phases)
+        return segment.change.place >= len(self._phases)
 
     def _begin(self, context: Context, state: State) -> EventStatus:
         if self.progress(context).segments:
@@ -215,7 +234,8 @@ class TaskSupervisor(LeafSystem):
                 time,
                 self._state_port.Eval(context).copy(),
             )
-        self._put(state, Progress((self._segment(context),), time, time), np.zeros(len(SEEN)))
+        progress = Progress((self._segment(context),), time - self._sample_period, time)
+        self._put(state, progress, np.zeros(len(SEEN)), np.zeros(self._traced.tally.size))
         return EventStatus.Succeeded()
 
     def _at_guard(
@@ -225,60 +245,52 @@ class TaskSupervisor(LeafSystem):
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         progress, time = self.progress(context), context.get_time()
-        segment, seen = progress.segments[-1], self._seen(context)
-        moment, margins = self._margins(context, progress, segment)
+        if self._sample_period and time == progress.step:
+            return EventStatus.DidNothing()  # A run that goes on begins with the last sample.
+        force, seen = self._seen(context), self._sight(context, progress)
         status, found = EventStatus.Succeeded(), progress.segments
-        if np.any(margins[:-1] <= 2.0 * EARLY):
-            following, status = self._changed(context, segment, moment, margins)
+        tally, place = np.zeros(self._traced.tally.size), found[-1].change.place
+        if seen.ends:
+            following, status = self._changed(context, progress, seen)
             found = (*found, following)
-        known: dict[str, Any] = {"felt": time} if progress.is_felt else {}
-        is_felt = progress.is_felt != bool(margins[-1] <= 2.0 * EARLY)
-        after = replace(progress, segments=found, step=time, is_felt=is_felt, **known)
-        self._put(state, after, seen)
+        elif tally.size and place < len(self._phases):
+            before = self._traced.tally_of(context.get_discrete_state(self._held).value())
+            after = self._traced.tally.after(self._phases[place], before, seen.moment)
+            tally = np.array([float(one) for one in after])
+        is_felt, felt = progress.is_felt != seen.turns, time if progress.is_felt else progress.felt
+        now = replace(progress, segments=found, step=time, is_felt=is_felt, felt=felt)
+        self._put(state, now, force, tally)
         return status
 
-    def _put(self, state: State, progress: Progress, seen: FloatArray) -> None:
+    def _put(self, state: State, progress: Progress, seen: FloatArray, tally: FloatArray) -> None:
         state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
-        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, seen))
+        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, seen, tally))
 
     def _changed(
-        self, context: Context, segment: Segment, moment: Moment, margins: FloatArray
+        self, context: Context, progress: Progress, seen: Sight
     ) -> tuple[Segment, EventStatus]:
         """What follows where a phase has ended."""
-        task, place, now = self.task, segment.change.place, self._now(context)
+        segment, now, moment = progress.segments[-1], self._now(context), seen.moment
         if self._is_over(segment):
-            reason = "the contact is lost at rest"
-            return self._plan.following(now, segment, moment, None, reason), EventStatus.Succeeded()
-        phase, status = task.phases[place], EventStatus.Succeeded()
-        awaited = phase.awaited(task.contact_force)
-        if margins[0] <= 2.0 * EARLY:
-            following = self._plan.following(now, segment, moment, place + 1, f"after {awaited}")
-            return following, status
-        if margins[1] <= 2.0 * EARLY:
-            reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
-        else:
-            reaction, reason = phase.if_late, phase.lateness(moment, task.contact_force)
-        places = [one.change.place for one in self.progress(context).segments]
-        tried = sum(after <= before for before, after in pairwise(places))
-        if reaction == "approach" and tried >= task.retries:
-            reaction, reason = "fail", f"{reason}, after {tried} retries"
-        if reaction == "fail":
-            raise self._failed(context, reason, moment)
-        if reaction == "stop":
+            cause = Cause("the contact is lost at rest", segment.change.chosen, True)
+            following = self._plan.following(now, segment, moment, None, cause)
+            return following, EventStatus.Succeeded()
+        place = segment.change.place
+        outcome, reason = seen.outcome(self._phases[place], self.task.contact_force)
+        changes = progress.changes
+        entered, chosen = [one.place for one in changes], [one.chosen for one in changes]
+        after = self.task.plan.successor(place, outcome, entered, chosen)
+        reason = ", ".join(filter(None, (reason, after.remark)))
+        if after.chosen == FAIL:
+            raise seen.failure(reason, now.time, now.state)
+        status = EventStatus.Succeeded()
+        if after.place is None and after.chosen in (STOP, LEAVE):
             status = EventStatus.ReachedTermination(self, reason)
-        again = task.last_approach(place) if reaction == "approach" else None
-        return self._plan.following(now, segment, moment, again, reason), status
-
-    def _failed(self, context: Context, reason: str, moment: Moment) -> SimulationError:
-        time, state = context.get_time(), self._state_port.Eval(context)
-        return SimulationError(
-            f"{self.get_name()}: {reason}, at t = {time:.6g} s, with a force of {moment.force:.4g} "
-            f"N at a distance of {moment.distance:.4g} m (by the law's model) that changes by "
-            f"{moment.rate:.3g} m/s, state {show(state)}. Give the phase more time or another "
-            "goal, look where the surface is, or choose what follows by if_late and if_lost",
-            time,
-            state.copy(),
-        )
+        leaves = place >= self.task.plan.last  # As a phase before has failed or not.
+        has_failed = outcome != "success" or (leaves and segment.change.failed)
+        ends = self.task.plan.ends_in_contact(place) if outcome == "success" else None
+        cause = Cause(reason, after.chosen, has_failed, ends)
+        return self._plan.following(now, segment, moment, after.place, cause), status
 
     # What is shown.
 
@@ -324,6 +336,8 @@ class TaskSupervisor(LeafSystem):
 
     def traced(self) -> Block:
         period, updates = self._sample_period, tuple[Update, ...]()
+        nothing = ca.Function("none", [], [ca.SX.zeros(1)])
+        unwired = ["hold", *(port.get_name() for port in self.signal_ports.values())]
         if period:
             updates = (Update(self._traced.unchanged(), period, 0.0, True),)
         return Block(
@@ -331,6 +345,6 @@ class TaskSupervisor(LeafSystem):
             self._traced.computations(),
             updates,
             guard=Guard(self._traced.guard(), self._advance, bool(period)),
-            unwired={"hold": Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",))},
+            unwired={name: Computation(nothing, (), (name,)) for name in unwired},
             ports={"phase": (Signal("phase"),)},
         )

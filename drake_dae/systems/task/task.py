@@ -1,13 +1,15 @@
 """A task: phases in an order that makes sense."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import ceil, inf
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.task.phases.guards import Watched
+from drake_dae.systems.task.phases.plan import Plan, check_guards, named
 
 _STEADY = 6.0
 """`contact_force` is at least so many standard deviations of the filtered noise, so that one sample
@@ -20,12 +22,13 @@ _SLOWEST = 10.0
 @checked(ModelError)
 @dataclass(frozen=True)
 class Task:
-    """Phases, one after the other; after the last one the robot rests where it is.
+    """Phases, one after the other or as they choose; after the last one the robot rests.
 
     If it rests in contact and the contact is lost, the law of the free robot keeps it at rest.
 
     Attributes:
-        phases: The phases. Where the first one begins in contact, it does so with `contact_force`.
+        phases: The phases, each with a name of its own. Where the first one begins in contact, it
+            does so with `contact_force`.
         contact_force: A force that is less than this, in N, is none: with it the robot has
             touched, and below it it has let go.
         patience: How long the force of a contact that shall hold may be none before the contact is
@@ -36,11 +39,13 @@ class Task:
         tare_time: The time in s at the begin of a task that begins free, in which the mean of the
             measured force is taken as the sensor's bias. No phase ends before it is over; then the
             bias is subtracted for guards, laws and observers. 0 for no taring.
-        retries: How many times a task may go back to an Approach; then the run ends with an error.
+        retries: How many times a task may go back by "approach"; then the run ends with an error.
+        plan: What follows what.
 
     Raises:
-        ModelError: There are no phases, one begins in contact where that before does not end so, or
-            the other way round, or a number makes no sense.
+        ModelError: There are no phases; one begins in contact where that before does not end so, or
+            the other way round; what shall follow is no phase, or may go on without an end; a guard
+            trips before its phase can be over; or a number makes no sense.
     """
 
     phases: Sequence[Phase]
@@ -49,6 +54,7 @@ class Task:
     force_noise: float = 0.0
     tare_time: float = 0.0
     retries: int = 10
+    plan: Plan = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
@@ -67,28 +73,13 @@ class Task:
         object.__setattr__(self, "phases", tuple(self.phases))
         if not self.phases:
             raise ModelError("a task needs phases, such as Approach(0.05), Press(20.0), Release()")
-        left = self.phases[0].begins_in_contact
-        if self.tare_time and left:
+        if self.tare_time and self.phases[0].begins_in_contact:
             raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
-        for index, phase in enumerate(self.phases):
-            where = f"phase {index + 1} of the task, {phase.name}"
-            if phase.begins_in_contact and not left:
-                raise ModelError(
-                    f"{where}: it begins in contact, where the robot is free; an Approach must "
-                    "lead there"
-                )
-            if phase.begins_in_contact is False and left:
-                raise ModelError(
-                    f"{where}: it begins with a free robot, which is in contact; a Release must "
-                    "lead there"
-                )
-            left = left if phase.ends_in_contact is None else phase.ends_in_contact
-            for key in ("if_late", "if_lost"):
-                if getattr(phase, key) == "approach" and self.last_approach(index) is None:
-                    raise ModelError(
-                        f"{where}: {key}: approach goes back to an Approach, and there is none "
-                        "before it"
-                    )
+        phases = named(self.phases)
+        check_guards(phases, self.contact_force)
+        plan = Plan(phases, self.retries)
+        object.__setattr__(self, "phases", phases)
+        object.__setattr__(self, "plan", plan)
 
     @property
     def force_gain(self) -> float:
@@ -124,20 +115,16 @@ class Task:
     @property
     def contacts(self) -> tuple[bool, ...]:
         """Whether each phase begins in contact, and whether the robot rests so at the end."""
-        found, left = [], False
-        for phase in self.phases:
-            begins = phase.begins_in_contact
-            found.append(left if begins is None else begins)
-            left = found[-1] if phase.ends_in_contact is None else phase.ends_in_contact
-        return (*found, left)
+        return self.plan.contacts
 
-    def last_approach(self, index: int) -> int | None:
-        """The place of the last phase up to one that leads into contact; None if there is none."""
-        for place in range(index, -1, -1):
-            phase = self.phases[place]
-            if phase.ends_in_contact and not phase.begins_in_contact:
-                return place
-        return None
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The names of the signals for which it waits."""
+        return tuple(dict.fromkeys(phase.signal for phase in self.phases if phase.signal))
+
+    def watches(self, of: Watched) -> bool:
+        """Whether a guard of a phase watches something."""
+        return any(guard.of == of for phase in self.phases for guard in phase.guards)
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
@@ -148,3 +135,33 @@ class Task:
             f"{index + 1}. {phase.name}, until {phase.awaited(self.contact_force)}"
             for index, phase in enumerate(self.phases)
         )
+
+
+def check_sampled(task: Task, sample_period: float) -> None:
+    """Refuses what a task without samples cannot do.
+
+    Args:
+        task: The task.
+        sample_period: In s; 0 for none.
+
+    Raises:
+        ModelError: The period is none, or there are no samples and the task needs them.
+    """
+    if not 0.0 <= sample_period < inf:
+        raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
+    if sample_period:
+        return
+    found = {
+        "force_noise": (task.force_noise, "noise and bias of a force are found in samples"),
+        "tare_time": (task.tare_time, "noise and bias of a force are found in samples"),
+    }
+    for index, phase in enumerate(task.phases):
+        for guard in phase.guards:
+            where = f"phase {index + 1} of the task, {phase.name}: guard of the {guard.of}"
+            found[where] = (guard.of == "work" or guard.samples > 1, "it counts in samples")
+    for name, (is_needed, why) in found.items():
+        if is_needed:
+            raise ModelError(
+                f"{name}: {why}, and this task acts continuously; leave it out, or give a "
+                "sample_period (in a scenario: sampling)"
+            )

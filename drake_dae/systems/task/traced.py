@@ -1,6 +1,7 @@
 """What a task computes, as traced functions of the numbers of its present segment."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import casadi as ca
@@ -18,8 +19,10 @@ from drake_dae.systems.blocks.traced import (
     TIME,
     Computation,
 )
+from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
-from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.phases import Moment, Phase
+from drake_dae.systems.task.phases.tally import Tally
 from drake_dae.systems.task.planner import CONTACT, FREE, Planner
 from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
@@ -43,10 +46,11 @@ class TracedTask:
         task, laws, place, force: As of the supervisor.
         plan: What makes its references.
         num_forces: How many constraint forces are measured.
-        tares: Of how many samples the bias of the force is the mean; 0 for no taring.
+        sample_period: When guards are looked at, in s; 0 for at all times.
 
     Attributes:
         size: How many numbers there are.
+        tally: What is counted for the guards.
     """
 
     def __init__(
@@ -57,17 +61,22 @@ class TracedTask:
         force: int,
         plan: Planner,
         num_forces: int,
-        tares: int,
+        sample_period: float,
     ) -> None:
         self._task, self._laws, self._place, self._plan = task, laws, place, plan
-        self._tares = tares
+        self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
+        self.tally = Tally(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
-        ends = np.cumsum([len(NAMES), count, count, rows * self._shape[1]]).tolist()
+        sizes = [len(NAMES), count, count, rows * self._shape[1], plan.moved, self.tally.size]
+        ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
         self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
-        self._base, self._rate, fade = (self._held[a:b] for a, b in pairwise(ends))
+        self._tallied = slice(ends[-2], ends[-1])
+        self._base, self._rate, fade, self._origin, self._counts = (
+            self._held[a:b] for a, b in pairwise(ends)
+        )
         self._faded = ca.reshape(fade, *self._shape)
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
@@ -103,12 +112,20 @@ class TracedTask:
         """Whether the bias of the force is still being found."""
         return bool(held[NAMES.index("count")] < self._tares - 0.5)
 
+    def tally_of(self, held: FloatArray) -> FloatArray:
+        """What has been counted for the guards; see `Tally`."""
+        return held[self._tallied]
+
+    def work_of(self, held: FloatArray) -> float:
+        """The work of the contact force since the phase began, in J; 0 where no guard needs it."""
+        return float(self.tally.work(self.tally_of(held)))
+
     @property
     def _places(self) -> list[int]:
         return [NAMES.index(name) for name in SEEN]
 
-    def numbers(self, progress: Progress, seen: FloatArray) -> FloatArray:
-        """The numbers of a task that is so far, with what is seen of the force; see `SEEN`."""
+    def numbers(self, progress: Progress, seen: FloatArray, tally: FloatArray) -> FloatArray:
+        """The numbers of a task that is so far, with what is seen of the force and counted."""
         found = np.zeros(self.size)
         if not progress.segments:
             return found
@@ -126,6 +143,8 @@ class TracedTask:
             *segment.base,
             *segment.rate,
             *faded.ravel(order="F"),
+            *segment.origin,
+            *tally,
         ]
         found[:] = parts
         return found
@@ -137,7 +156,7 @@ class TracedTask:
 
     def _in_phase(self, values: Callable[[int], ca.SX], otherwise: ca.SX) -> ca.SX:
         """What a function of the phase gives in that which goes on; else after the last."""
-        place, count = self._named["place"], len(self._task.phases)
+        place, count = self._named["place"], len(self._phases)
         found = ca.if_else(place > count - 0.5, otherwise, 0)
         for i in range(count):
             found += ca.if_else(ca.fabs(place - i) < 0.5, values(i), 0)
@@ -206,8 +225,49 @@ class TracedTask:
         """What is held after a sample at which nothing changes."""
         held = ca.SX(self._held)
         held[self._places] = self._seen
-        function = ca.Function("held", [self._held, self._forces], [held])
-        return Computation(function, (HELD, "measured_force"), (HELD,))
+        if not self.tally.size:
+            function = ca.Function("held", [self._held, self._forces], [held])
+            return Computation(function, (HELD, "measured_force"), (HELD,))
+        moment, inputs, sources = self._sight()
+        counts = self._counted()
+
+        def after(index: int) -> ca.SX:
+            return ca.vertcat(*self.tally.after(self._phases[index], counts, moment))
+
+        held[self._tallied] = self._in_phase(after, ca.SX.zeros(self.tally.size))
+        return Computation(ca.Function("held", inputs, [held]), sources, (HELD,))
+
+    def _counted(self) -> list[ca.SX]:
+        return [self._counts[i] for i in range(self.tally.size)]
+
+    def _sight(self) -> tuple[Moment, list[ca.SX], tuple[str, ...]]:
+        """What guards see, without a signal, and what that is computed from."""
+        named, law, moved = self._named, self._laws[FREE], self._plan.moved
+        x, parameters = law.system.state, law.system.parameter_symbol
+        motion = self._plan.motion_function.function.call([x, parameters])[0]
+        first, rates = motion[2 : 2 + moved], motion[2 + moved :]
+        lowest = [
+            self._reference(which)[int(law.layout.lowest[self._place])]
+            for which, law in ((FREE, self._laws[FREE]), (CONTACT, self._laws[CONTACT]))
+        ]
+        inputs = [self._time, self._held, x, self._forces, parameters]
+        sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
+        if self._task.watches("control"):
+            u = ca.SX.sym("control", law.system.num_controls)
+            inputs, sources, control = [*inputs, u], [*sources, "control"], ca.norm_inf(u)
+        moment = Moment(
+            self._time - named["start"],
+            self._force,
+            motion[0],
+            motion[1],
+            lowest[0] + lowest[1],
+            motion[0] - named["distance"],
+            speed=ca.norm_2(rates),
+            travel=ca.norm_2(first - self._origin),
+            work=self.tally.work(self._counted()),
+            control=control,
+        )
+        return moment, inputs, tuple(sources)
 
     def guard(self) -> Computation:
         """The margins of a phase, as those of the supervisor.
@@ -215,39 +275,40 @@ class TracedTask:
         Raises:
             ModelError: A phase computes its margin from numbers alone.
         """
-        named, task, law = self._named, self._task, self._laws[FREE]
-        x, parameters = law.system.state, law.system.parameter_symbol
-        distances = self._plan.distance_function.function.call([x, parameters])[0]
-        lowest = [
-            self._reference(which)[int(law.layout.lowest[self._place])]
-            for which, law in ((FREE, self._laws[FREE]), (CONTACT, self._laws[CONTACT]))
-        ]
-        passed, tares = self._time - named["start"], named["count"] < self._tares - 0.5
+        named, task = self._named, self._task
+        moment, inputs, sources = self._sight()
+        signals = {name: ca.SX.sym(name) for name in task.signals}
+        counts, tares = self._counted(), named["count"] < self._tares - 0.5
         excess = self._force - task.contact_force
-        wanted, away = lowest[0] + lowest[1], distances[0] - named["distance"]
-        moment = Moment(passed, self._force, distances[0], distances[1], wanted, away)
 
         waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
         felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
 
         def margins(index: int) -> ca.SX:
-            phase = task.phases[index]
-            try:
-                end = ca.SX(phase.margin(moment, task.contact_force))
-                late = ca.fmin(ca.SX(phase.remaining(moment)), 1e9)
-            except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
-                raise ModelError(
-                    f"the margin of {phase.name} takes numbers alone, so that a rollout does not "
-                    "know it: take ca.fmax, ca.fmin and abs in its place; or run it by simulate"
-                ) from error
+            phase = self._phases[index]
+            now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
+            end, late = self._ends(phase, now)
+            guards = [ca.fmin(one, 1e9) for one in self.tally.margins(phase, counts, now)]
             if self._tares:
                 end = ca.if_else(tares, 1, end)
-            return ca.vertcat(end, lost if phase.if_lost else 1, late, felt)
+            trips = ca.mmin(ca.vertcat(1e9, *guards))
+            return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)
 
-        found = self._in_phase(margins, ca.vertcat(1, lost, 1, felt))
-        inputs = [self._time, self._held, x, self._forces, parameters]
+        found = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
         none = ca.SX(0, 1)
+        inputs = [*inputs, *signals.values()]
+        sources = (*sources, *(SIGNAL + name for name in signals))
         function = ca.Function("guard", inputs, [ca.densify(found - EARLY), none, none])
-        sources = (TIME, HELD, "estimated_state", "measured_force", PARAMETERS)
         return Computation(function, sources, (MARGINS, GAPS, RATES))
+
+    def _ends(self, phase: Phase, now: Moment) -> tuple[ca.SX, ca.SX]:
+        """The margins of a phase to its end and to being late."""
+        try:
+            end = ca.SX(phase.margin(now, self._task.contact_force))
+            return end, ca.fmin(ca.SX(phase.remaining(now)), 1e9)
+        except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
+            raise ModelError(
+                f"the margin of {phase.name} takes numbers alone, so that a rollout does not "
+                "know it: take ca.fmax, ca.fmin and abs in its place; or run it by simulate"
+            ) from error

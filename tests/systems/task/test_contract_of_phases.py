@@ -3,8 +3,21 @@
 from dataclasses import replace
 
 import pytest
+from members import Rise
 
-from drake_dae import Approach, ConstantReference, Dwell, Move, Press, Release, Retreat
+from drake_dae import (
+    Approach,
+    ConstantReference,
+    Dwell,
+    GuardedMove,
+    Move,
+    PhaseGuard,
+    Press,
+    Release,
+    Retreat,
+    Search,
+    Wait,
+)
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Moment
 
@@ -21,6 +34,27 @@ MEMBERS = {
     ),
     "Move": (Move({}, 2.0), Moment(1.9, 20.0, 0.0, 0.0, 20.0), Moment(2.0, 20.0, 0.0, 0.0, 20.0)),
     "Dwell": (Dwell(2.0), Moment(1.9, 0.0, 0.1, 0.0, 0.1), Moment(2.1, 0.0, 0.1, 0.0, 0.1)),
+    "Wait": (
+        Wait("ready"),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal=0.4),
+        Moment(2.0, 20.0, 0.0, 0.0, 20.0, signal=1.0),
+    ),
+    "Wait long": (
+        Wait(duration=2.0),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0),
+        Moment(2.0, 20.0, 0.0, 0.0, 20.0),
+    ),
+    "GuardedMove": (
+        GuardedMove(0.1, force=5.0),
+        Moment(1.0, 4.9, 0.1, -0.02, 0.1, travel=0.09),
+        Moment(1.0, 5.1, 0.0, -0.02, 0.0, travel=0.09),
+    ),
+    "Search": (
+        Search("tool.yz", 0.01, depth=0.002),
+        Moment(1.0, 5.0, -0.0019, 0.0, 5.0, away=-0.0019),
+        Moment(1.0, 5.0, -0.0021, 0.0, 5.0, away=-0.0021),
+    ),
+    "Rise": (Rise(0.5), Moment(0.4, 0.0, 0.1, 0.0, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
     "Release": (Release(), Moment(0.3, 3.0, 0.0, 0.0, 3.0), Moment(0.5, 0.4, 0.0, 0.0, 0.3)),
     "Retreat": (Retreat(0.1), Moment(0.6, 0.0, 0.09, 0.1, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
 }
@@ -33,14 +67,29 @@ def test_phase_keeps_the_rules(name):
     assert phase.margin(going_on, CONTACT_FORCE) > 0.0  # Rule 4.
     assert phase.margin(over, CONTACT_FORCE) <= 0.0
     assert phase.within > going_on.time
-    assert phase.if_late in ("approach", "hold", "stop", "fail")
+    assert phase.chosen("late") == "fail" == phase.chosen("guard")  # Rule 5.
+    assert phase.chosen("lost") == "hold"
+    assert phase.chosen("success") == "next"
     assert phase.awaited(CONTACT_FORCE)
     # Rule 1: what leads from one law to the other says so of both ends.
     assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
     # Rule 2: what approaches has no goal for the distance.
     goals = phase.goals("contact")
-    assert set(goals) <= {"contact"}
-    assert not (phase.speed_of_approach and goals)
+    assert set(goals) <= {"contact"} or phase.is_relative
+    assert not phase.rates("contact") or not goals
+    # What a guard may not end is reached by what ends the phase.
+    assert all(getattr(over, of) >= least for of, least in phase.needed(CONTACT_FORCE).items())
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_phase_takes_a_name_guards_and_successors(name):
+    guards = [PhaseGuard("force", 50.0)]
+    chosen = {"on_success": "done", "on_failure": "leave", "retries": 2, "if_spent": "hold"}
+    phase = replace(MEMBERS[name][0], name="mine", guards=guards, **chosen)
+    assert (phase.name, phase.guards) == ("mine", tuple(guards))
+    assert phase.chosen("success") == "done"
+    assert {phase.chosen(outcome) for outcome in ("guard", "late", "lost")} == {"leave"}
+    assert phase.lateness(MEMBERS[name][1], CONTACT_FORCE).startswith("mine ")
 
 
 def test_a_release_that_has_left_does_not_wait_for_the_force():

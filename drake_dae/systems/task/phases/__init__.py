@@ -1,0 +1,23 @@
+"""The phases of a task, what each wants, and what ends it."""
+
+from drake_dae.systems.task.phases.guarded import GuardedMove, Wait
+from drake_dae.systems.task.phases.guards import PhaseGuard
+from drake_dae.systems.task.phases.members import Approach, Dwell, Move, Press, Release, Retreat
+from drake_dae.systems.task.phases.phase import Moment, Outcome, Phase
+from drake_dae.systems.task.phases.search import Search
+
+__all__ = [
+    "Approach",
+    "Dwell",
+    "GuardedMove",
+    "Moment",
+    "Move",
+    "Outcome",
+    "Phase",
+    "PhaseGuard",
+    "Press",
+    "Release",
+    "Retreat",
+    "Search",
+    "Wait",
+]

@@ -1,0 +1,308 @@
+"""What follows what in a task, and the check that every way through it ends."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from drake_dae.arrays import unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases.members import Release
+from drake_dae.systems.task.phases.phase import (
+    APPROACH,
+    DONE,
+    ENDS,
+    FAIL,
+    LEAVE,
+    NEXT,
+    STOP,
+    Outcome,
+    Phase,
+)
+
+OUTCOMES: tuple[Outcome, ...] = ("success", "guard", "late", "lost")
+
+_TAKEN = (*ENDS, "held", "end")
+"""Words that are no names of phases."""
+
+
+@dataclass(frozen=True)
+class Successor:
+    """What follows a phase.
+
+    Attributes:
+        chosen: The word that led there: the name of a phase, "next", "stop" and so on.
+        place: The phase that begins; the number of phases where the task is done, None where the
+            robot rests for another reason.
+        remark: What is to be told of it: "retry 1 of 2"; empty for nothing.
+    """
+
+    chosen: str
+    place: int | None
+    remark: str = ""
+
+
+def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
+    """The phases with a name each: those that have the name of their class are numbered.
+
+    Raises:
+        ModelError: Two have one name, or a name is a word of another meaning.
+    """
+    owns = [type(phase).__name__ for phase in phases]
+    given = [phase.name or own for phase, own in zip(phases, owns, strict=True)]
+    chosen = [name for name, own in zip(given, owns, strict=True) if name != own]
+    found = list[Phase]()
+    for index, (phase, name, own) in enumerate(zip(phases, given, owns, strict=True)):
+        where, number = f"phase {index + 1} of the task", 1
+        if name in _TAKEN or name != name.strip():
+            raise ModelError(f"{where}: '{name}' is no name of a phase; give it another one")
+        if chosen.count(name) > 1:
+            raise ModelError(f"{where}: more than one phase has the name '{name}'")
+        taken = {*chosen, *(each.name for each in found)}
+        if given[index] == own:
+            while name in taken:
+                number += 1
+                name = f"{own} {number}"
+        found.append(phase if phase.name == name else replace(phase, name=name))
+    return tuple(found)
+
+
+def contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
+    """Whether each phase begins in contact; last whether the last one ends so."""
+    found, left = [], False
+    for phase in phases:
+        begins = phase.begins_in_contact
+        found.append(left if begins is None else begins)
+        left = found[-1] if phase.ends_in_contact is None else phase.ends_in_contact
+    return (*found, left)
+
+
+class Plan:
+    """What follows what in a task.
+
+    Args:
+        phases: The phases, each with a name of its own.
+        retries: How often a task may go back to an approach.
+
+    Attributes:
+        phases: The same, and last the Release of what leaves, where something may.
+        contacts: Whether each phase begins in contact; last whether the last one ends so.
+        last: The number of phases that were given.
+
+    Raises:
+        ModelError: What shall follow is no phase; a phase begins in contact where the robot is
+            free, or the other way round; none leads to a phase; or phases may follow each other
+            without an end.
+    """
+
+    def __init__(self, phases: Sequence[Phase], retries: int) -> None:
+        self._names = [phase.name for phase in phases]
+        self._retries, self.last = retries, len(phases)
+        self.phases: tuple[Phase, ...] = tuple(phases)
+        self.contacts = contacts_of(phases)
+        if self._leaves():
+            self.phases = (*phases, Release(name=LEAVE, on_success=STOP, on_failure=STOP))
+            self.contacts = (*self.contacts[:-1], True, False)
+        self._edges = {place: self._all_from(place) for place in range(self.last)}
+        self._check_reached()
+        self._check_ends()
+
+    def where(self, place: int) -> str:
+        """A phase, for messages."""
+        name = self.phases[place].name
+        return f"phase {place + 1} of the task, {name}"
+
+    def last_approach(self, index: int) -> int | None:
+        """The place of the last phase up to one that leads into contact; None if there is none."""
+        for place in range(index, -1, -1):
+            phase = self.phases[place]
+            if phase.ends_in_contact and not phase.begins_in_contact:
+                return place
+        return None
+
+    def successor(
+        self, place: int, outcome: Outcome, entered: Sequence[int], chosen: Sequence[str]
+    ) -> Successor:
+        """What follows where a phase ends.
+
+        Args:
+            place: The phase.
+            outcome: How it ends.
+            entered: The places of all phases that began, in order.
+            chosen: The words that led to these.
+        """
+        word, remarks = self.phases[place].chosen(outcome), list[str]()
+        counts = Counter(entered)
+        ends_free = not self.contacts[place]
+        if outcome == "success":
+            ends_free = not self.ends_in_contact(place)
+        for _ in range(self.last + 1):
+            to = self._place(place, word)
+            if to is None and word == LEAVE:
+                to = None if ends_free else self.last
+            if to is None or to >= self.last:
+                return Successor(word, to, "; ".join(remarks))
+            phase, most = self.phases[to], self.phases[to].retries
+            count = counts[to]
+            if most is None and word == APPROACH:
+                count, most = 1 + sum(one == APPROACH for one in chosen), self._retries
+            if most is None or count <= most:
+                if count and most is not None:
+                    remarks.append(f"retry {count} of {most}")
+                return Successor(word, to, "; ".join(remarks))
+            times = f"after {most} " + ("retry" if most == 1 else "retries")
+            remarks.append(times if word == APPROACH else f"{phase.name} is not entered {times}")
+            place, word = to, FAIL if word == APPROACH and phase.retries is None else phase.if_spent
+        return Successor(FAIL, None, "; ".join(remarks))
+
+    def ends_in_contact(self, place: int) -> bool:
+        """Whether a phase that succeeds ends in contact."""
+        ends = self.phases[place].ends_in_contact
+        return self.contacts[place] if ends is None else ends
+
+    def _leaves(self) -> bool:
+        """Whether a phase in contact may lead to "leave"."""
+        for place, phase in enumerate(self.phases):
+            words = [phase.chosen(outcome) for outcome in OUTCOMES[1:]]
+            if self.contacts[place] and LEAVE in words:
+                return True
+            if self.ends_in_contact(place) and phase.on_success == LEAVE:
+                return True
+        return any(self.contacts) and any(phase.if_spent == LEAVE for phase in self.phases)
+
+    def _place(self, place: int, word: str) -> int | None:
+        """The phase that a word means, seen from a phase; None for none."""
+        if word == NEXT:
+            return place + 1 if place + 1 < self.last else len(self.phases)
+        if word == DONE:
+            return len(self.phases)
+        if word == APPROACH:
+            return self.last_approach(place)
+        return self._names.index(word) if word in self._names else None
+
+    # The checks.
+
+    def _all_from(self, place: int) -> list[tuple[str, int]]:
+        """The words and phases that may follow a phase, each checked."""
+        phase, found = self.phases[place], list[tuple[str, int]]()
+        if phase.retries is not None:
+            self._check_word(place, "if_spent", phase.if_spent)
+        outcomes: list[Outcome] = ["success", "guard", "late"]
+        if phase.holds_contact and self.contacts[place]:
+            outcomes.append("lost")
+        for outcome in outcomes:
+            at, key, word, tried = place, phase.key_of(outcome), phase.chosen(outcome), set[int]()
+            self._check_word(place, key, word)
+            while (to := self._place(at, word)) is not None and to < self.last:
+                self._check_contact(place, key, outcome, to)
+                found.append((word, to))
+                if to in tried or self.phases[to].retries is None:
+                    break
+                tried.add(to)
+                at, key, word = to, "if_spent", self.phases[to].if_spent
+                self._check_word(at, key, word)
+        return found
+
+    def _check_word(self, place: int, key: str, word: str) -> None:
+        if word == APPROACH and self.last_approach(place) is None:
+            raise ModelError(
+                f"{self.where(place)}: {key}: approach goes back to an Approach, and there is none "
+                "before it"
+            )
+        if word not in (*ENDS, *self._names):
+            known = unknown_name("phase", word, self._names)
+            raise ModelError(f"{self.where(place)}: {key}: {known}; or take {', '.join(ENDS)}")
+
+    def _check_contact(self, place: int, key: str, outcome: Outcome, to: int) -> None:
+        """Refuses a phase that cannot follow another one with its outcome."""
+        after, text = self.phases[to], ""
+        is_next = to == place + 1 and outcome == "success" and key == "on_success"
+        way = "" if is_next else f", after {self.phases[place].name} by {key}"
+        begins, ends = self.contacts[to], self.ends_in_contact(to)
+        if outcome == "lost" and begins and ends:
+            text = "it begins in contact, which is lost there; choose another one by if_lost"
+        elif begins and not (
+            self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
+        ):
+            text = "it begins in contact, where the robot is free; an Approach must lead there"
+        elif outcome == "success" and not begins and self.ends_in_contact(place):
+            text = "it begins with a free robot, which is in contact; a Release must lead there"
+        if text:
+            raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
+
+    def _check_reached(self) -> None:
+        reached, left = {0}, [0]
+        while left:
+            after = {to for _, to in self._edges[left.pop()]} - reached
+            reached |= after
+            left += after
+        for place in range(self.last):
+            if place not in reached:
+                raise ModelError(
+                    f"{self.where(place)}: no phase leads to it; name it in an on_success or "
+                    "on_failure, or leave it out"
+                )
+
+    def _check_ends(self) -> None:
+        """Refuses ways that lead back to where they were and are not counted.
+
+        What is counted are the phases with `retries`, and all goings back by "approach". A phase
+        with a count that is spent passes on to what follows in its place.
+        """
+
+        def counts(word: str, to: int) -> bool:
+            return word == APPROACH and self.phases[to].retries is None
+
+        ways = {
+            place: [to for word, to in edges if not counts(word, to)]
+            for place, edges in self._edges.items()
+        }
+        for place, phase in enumerate(self.phases[: self.last]):
+            if phase.retries is not None:
+                word, spent = phase.if_spent, self._place(place, phase.if_spent)
+                ways[place] = [] if spent is None or counts(word, spent) else [spent]
+        done = set[int]()
+
+        def follow(place: int, before: tuple[int, ...]) -> None:
+            if place in before:
+                names = [self.phases[i].name for i in before[before.index(place) :]]
+                words = (
+                    f"{', '.join(names[:-1])} and {names[-1]} lead back to {names[0]}"
+                    if names[1:]
+                    else f"{names[0]} leads back to itself"
+                )
+                raise ModelError(
+                    f"the task may not end: {words}, as often as it comes; give {names[0]} a count "
+                    "of retries"
+                )
+            if place in done:
+                return
+            for to in ways.get(place, ()):
+                follow(to, (*before, place))
+            done.add(place)
+
+        for place in range(self.last):
+            follow(place, ())
+
+
+def check_guards(phases: Sequence[Phase], contact_force: float) -> None:
+    """Refuses guards that trip before their phase can be over.
+
+    Raises:
+        ModelError: One does, two watch the same, or a move ends by less than the contact's force.
+    """
+    for index, phase in enumerate(phases):
+        where, needed = f"phase {index + 1} of the task, {phase.name}", phase.needed(contact_force)
+        if needed.get("force", contact_force) < contact_force and not phase.begins_in_contact:
+            raise ModelError(
+                f"{where}: force: {needed['force']:g} N is less than the contact_force of "
+                f"{contact_force:g} N, which counts as no force"
+            )
+        watched = [guard.of for guard in phase.guards]
+        for number, guard in enumerate(phase.guards):
+            if guard.of in watched[:number]:
+                raise ModelError(f"{where}: two guards watch the {guard.of}; leave one out")
+            if guard.most <= needed.get(guard.of, 0.0):
+                raise ModelError(
+                    f"{where}: its guard ends it at a {guard.of} of {guard.most:g}, and it needs "
+                    f"{needed[guard.of]:g} to succeed; give more"
+                )

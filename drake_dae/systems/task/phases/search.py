@@ -1,0 +1,79 @@
+"""A search along a spiral, in contact."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import casadi as ca
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive
+from drake_dae.dae.references import PathLimits, Reference, SpiralReference
+from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases.phase import Moment, Phase
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Search(Phase):
+    """The tool slides outward along a spiral around where it is, until it falls into something.
+
+    It presses on with the force that there is. It succeeds where the distance by the law's model
+    has fallen by a depth, as in a hole or beyond an edge with a ground below it; it fails where the
+    spiral ends. A surface that is tilted against the model falls, too: the depth has to be more
+    than the radius times the tilt.
+
+    Attributes:
+        outputs: The two outputs along the surface, in m: "tool.yz" for example.
+        radius: The radius at which the search ends, in m.
+        depth: By so much the distance falls, in m.
+        pitch: The distance between neighbouring turns, in m.
+        speed: The largest speed, in m/s.
+        acceleration: The largest acceleration, in m/s^2.
+        over: How long the references before take to become those of this phase, in s.
+        within: How long the phase may last, in s.
+        if_late: What follows where the spiral has ended; as on_failure if left out.
+        if_lost: What follows where the contact is lost; as on_failure if left out.
+    """
+
+    outputs: str
+    radius: float
+    depth: float = 0.002
+    pitch: float = 0.002
+    speed: float = 0.02
+    acceleration: float = 0.5
+    within: float = field(default=60.0, kw_only=True)
+    if_late: str | None = field(default=None, kw_only=True)
+    if_lost: str | None = field(default=None, kw_only=True)
+    begins_in_contact, ends_in_contact, holds_contact = True, True, True
+    is_relative = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("radius", "depth", "pitch", "speed", "acceleration"):
+            positive(f"Search: {name}", getattr(self, name))
+
+    @cached_property
+    def spiral(self) -> SpiralReference:
+        """The way of the tool from where it begins."""
+        limits = PathLimits(self.speed, self.acceleration)
+        return SpiralReference([0.0, 0.0], 0.0, self.radius, self.pitch, limits)
+
+    def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
+        return {self.outputs: self.spiral}
+
+    def margin(self, now: Moment, contact_force: float) -> float:
+        return self.depth + now.away
+
+    def remaining(self, now: Moment) -> float:
+        end = self.spiral.travel.duration + self.over - now.time
+        found: float = ca.fmin(super().remaining(now), end)
+        return found
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        if now.time >= self.within:
+            return super().lateness(now, contact_force)
+        return f"{self.name} has come to {self.radius:g} m without {self.awaited(contact_force)}"
+
+    def awaited(self, contact_force: float) -> str:
+        return f"a fall of {self.depth:g} m"

@@ -1,0 +1,72 @@
+"""What decides whether a phase goes on, and how it has ended."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.errors import SimulationError
+from drake_dae.systems.task.phases import Moment, Outcome, Phase
+from drake_dae.systems.task.traced import EARLY
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What decides whether a phase goes on.
+
+    Attributes:
+        moment: What is measured.
+        guards: How far each guard of the phase is from its end; infinite without any.
+        margins: How far the phase is from a guard, from its end, from a lost contact, from late;
+            last how far the contact is from being felt, or from being felt no more.
+    """
+
+    moment: Moment
+    guards: FloatArray
+    margins: FloatArray
+
+    @property
+    def ends(self) -> bool:
+        """Whether the phase is over."""
+        return bool(np.any(self.margins[:-1] <= 2.0 * EARLY))
+
+    @property
+    def turns(self) -> bool:
+        """Whether the contact begins to be felt, or to be felt no more."""
+        return bool(self.margins[-1] <= 2.0 * EARLY)
+
+    def outcome(self, phase: Phase, contact_force: float) -> tuple[Outcome, str]:
+        """How a phase has ended, and why.
+
+        Args:
+            phase: The phase.
+            contact_force: A force that is less than this, in N, is none.
+        """
+        ended = self.margins <= 2.0 * EARLY
+        if ended[0]:
+            guard = phase.guards[int(np.argmax(self.guards <= 2.0 * EARLY))]
+            value = float(getattr(self.moment, guard.of))
+            return "guard", f"{phase.name} is ended by {guard.tripped(value)}"
+        if ended[1]:
+            return "success", f"after {phase.awaited(contact_force)}"
+        if ended[2]:
+            return "lost", f"the contact of {phase.name} is lost"
+        return "late", phase.lateness(self.moment, contact_force)
+
+    def failure(self, reason: str, time: float, state: FloatArray) -> SimulationError:
+        """The error of a task that ends by "fail".
+
+        Args:
+            reason: Why it does.
+            time: In s.
+            state: x, shape (n,).
+        """
+        moment = self.moment
+        return SimulationError(
+            f"task: {reason}, at t = {time:.6g} s, with a force of {moment.force:.4g} "
+            f"N at a distance of {moment.distance:.4g} m (by the law's model) that changes by "
+            f"{moment.rate:.3g} m/s, state {show(state)}. Give the phase more time or another "
+            "goal, look where the surface is, or choose what follows by on_failure",
+            time,
+            state.copy(),
+        )

@@ -1,0 +1,183 @@
+"""Guards, signals and chosen successors of tasks in scenarios: told, judged, rolled and swept."""
+
+import json
+
+import numpy as np
+import pytest
+from arms import numbers
+from numpy.testing import assert_allclose
+from runs import scenario
+
+from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
+from drake_dae.cli import main
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.build import build_completed
+from drake_dae.simulation.records.phases import phase_spans
+
+# At rest 20 mm before the wall, which opens and closes without bouncing.
+SHORT = """
+robot: {file: package://drake_dae_models/two_link_arm.urdf}
+constraints:
+- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+outputs:
+- {frame: tool, axes: z}
+gains: {all: [-25]}
+sampling: {period: 0.002}
+plant: !Unilateral {restitution: {wall: 0.0}}
+integrator: {integration_scheme: runge_kutta3, max_step_size: 0.002, use_error_control: false}
+task:
+  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
+  phases:
+  - !GuardedMove {name: feel, distance: 0.05, speed: 0.1, over: 0.1, on_failure: away}
+  - !Press
+    force: 10
+    over: 0.1
+    on_failure: away
+    if_lost: stop
+    guards: [{of: force, most: 40, samples: 2}, {of: control, most: 200}]
+  - !Release {over: 0.1}
+  - !Retreat {name: away, distance: 0.03, over: 0.1}
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
+duration: 1.0
+"""
+BARE = ["--rollout", "--json", "--check", "--set", "write={plots: false, animation: false}"]
+
+
+TOLERANT = "task.phases.1.tolerance=3"
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+def told(file, tmp_path, capsys, *settings):
+    """The exit code, what JSON has, and the summary."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    code = main(["simulate", str(file), *BARE, *words, "--out", str(tmp_path / "run")])
+    found = json.loads(capsys.readouterr().out)
+    return code, found, (tmp_path / "run" / "summary.txt").read_text()
+
+
+def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys):
+    """The guard has it at 9 N; pressing to 10 N takes 0.1 s. The record is read again."""
+    guards = ["task.phases.1.guards.0={of: force, most: 9, samples: 2}", TOLERANT]
+    code, found, text = told(file, tmp_path, capsys, *guards)
+    assert (code, found["job"]["outcome"]) == (0, "good")
+    press, away = found["phases"][1:3]
+    assert (press["phase"], away["phase"], away["failed"]) == ("Press", "away", True)
+    assert away["reason"].startswith("Press is ended by a force of 9.")
+    assert away["reason"].endswith("where its guard has 9 N, in 2 samples")
+    story = " ".join(text.split("\n\n")[0].split())
+    assert story.startswith("GOOD: the task was done at")
+    assert f"{away['reason']}, and away followed, as chosen." in story
+    assert f"\n{away['time']:.6g} s: away, Press is ended by" in text
+    record = Record.load(tmp_path / "run" / "record.npz")
+    assert [one.name for one in phase_spans(record)] == ["feel", "Press", "away", "end"]
+
+
+def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
+    guards = ["task.phases.1.guards.0.most=9", "task.phases.1.on_failure=leave", TOLERANT]
+    code, found, text = told(file, tmp_path, capsys, *guards)
+    assert (code, found["job"]["outcome"]) == (2, "bad")
+    assert [one["phase"] for one in found["phases"]] == ["feel", "Press", "leave", "held"]
+    story = " ".join(text.split("\n\n")[0].split())
+    assert ", and has left the contact: Press is ended by a force of 9" in story
+    assert found["phases"][-1]["force"] <= 0.5
+    # By an error it fails, too.
+    words = ["task.phases.1.guards.0={of: time, most: 0.2}", "task.phases.1.tolerance=1e-12"]
+    words.append("task.phases.1.on_failure=fail")
+    given = [word for setting in words for word in ("--set", setting)]
+    assert main(["simulate", str(file), *BARE, *given, "--out", str(tmp_path / "b")]) == 1
+    assert "Press is ended by a time of 0.2 s, where its guard has 0.2 s" in capsys.readouterr().err
+
+
+def test_a_task_that_leaves_as_chosen_for_success_is_good(file, tmp_path, capsys):
+    """The run ends before its time, and that is no fault."""
+    phases = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 5, on_success: leave}]"
+    code, found, text = told(file, tmp_path, capsys, phases, "duration=2")
+    assert (code, found["job"]["outcome"]) == (0, "good")
+    assert [one["phase"] for one in found["phases"]] == ["Approach", "Press", "leave", "held"]
+    assert text.startswith("GOOD: the task ended as chosen at ")
+    assert found["simulated_time"] < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_sweep_varies_a_guard(file, tmp_path):
+    """Each run is that of its scenario alone; 9 N of 10 N are too few."""
+    key = "task.phases.1.guards.0.most"
+    chosen = load_scenario(file, ["task.phases.1.tolerance=3", "duration=0.46"])
+    variations = grid_variations({key: [9.0, 40.0]})
+    study = sweep(chosen, variations, tmp_path / "runs.jsonl", workers=1, rollout=True)
+    held, pressed = study.values("largest wall.force [N]")
+    assert 9.0 < held < 9.5
+    assert_allclose(pressed, 10.0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("task.phases.0.on_failure=park", "task: phase 1 of the task, feel: on_failure: no phase"),
+        (
+            "task.phases.1.guards.0.of=heat",
+            r"task\.phases\.1\.guards\.0\.of: expected one of",
+        ),
+        ("task.phases.1.guards.0.most=-1", r"task\.phases\.1\.guards\.0: PhaseGuard: most, of the"),
+        ("task.phases.0.speed=0", r"task\.phases\.0: GuardedMove: speed must be positive"),
+        (
+            "task.phases.3=!Wait {name: away, for_signal: go}",
+            r"task\.signals\.go: needed: a phase waits for it",
+        ),
+        ("task.signals={go: 1}", "signals: no phase that waits for the signal 'go'"),
+        (
+            "task.phases.0.direction={tool.x: 1}",
+            "phase 1 of the task, feel: direction: no out",
+        ),
+        ("sampling=null", "guard of the force: it counts in samples, .*in a scenario: sampling"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_its_key(file, change, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(load_scenario(file, [change]))
+
+
+@pytest.mark.slow
+def test_the_shipped_task_tells_its_story(tmp_path, capsys):
+    """15 mm do not reach the wall, and it tries again; the touch stays below what was told."""
+    code, found, text = told("wall_guarded", tmp_path, capsys, "duration=4.5")
+    assert (code, found["job"]["outcome"]) == (0, "good")
+    names = [one["phase"] for one in found["phases"]]
+    assert names == ["feel", "feel", "Press", "Wait", "slide", "Release", "Retreat", "done"]
+    assert found["phases"][1]["reason"] == (
+        "feel has moved 0.015 m without a force of 2 N, retry 1 of 2"
+    )
+    # At constant speed but for the begin, half of whose time it loses; samples of 1 ms.
+    assert_allclose(found["phases"][1]["time"], 0.015 / 0.03 + 0.1, atol=1.1e-3)
+    assert_allclose(found["phases"][2]["time"], 0.028 / 0.03 + 0.1, atol=3e-3)
+    record = Record.load(tmp_path / "run" / "record.npz")
+    near = record.time < 1.1
+    peak = np.max(record["constraint_force"][near, 0])
+    q, v = np.split(record["state"][np.argmax(~near)], 2)
+    arm = numbers("two_link", q, v)
+    jacobian = arm.constraint_jacobian[0]
+    mass = 1.0 / (jacobian @ np.linalg.solve(arm.mass, jacobian))
+    alone = 0.03 * np.sqrt(1e5 * mass)
+    expected = 2.0 + alone + 1e5 * 0.03 * 0.002
+    assert 0.5 * alone < peak < expected
+    limit = float(text.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
+    # The expectation is made where the law has the wall, 8 mm before.
+    assert_allclose(limit, expected, rtol=0.02)
+
+
+def test_the_hardest_touch_is_told_with_its_phase():
+    phases = (
+        "task.phases=[!GuardedMove {distance: 0.1, speed: 0.02, force: 30}, !Press {force: 15}, "
+        "!Release {}, !Retreat {distance: 0.01}, !Approach {speed: 0.03}]"
+    )
+    completed, _ = build_completed(scenario("wall_guarded", phases, "task.signals={}"))
+    (note,) = [one for one in completed.notes if "A touch" in one]
+    # 30 + 13 + 4 N, and 0.5 + 19.6 + 6 N.
+    assert "A touch by GuardedMove at 0.02 m/s is expected to stay below 47" in note

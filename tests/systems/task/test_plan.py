@@ -1,0 +1,155 @@
+"""What follows what in a task: names, successors, counts, and plans that are refused."""
+
+import pytest
+from polishing import laws
+
+from drake_dae import (
+    Approach,
+    Dwell,
+    GuardedMove,
+    Move,
+    PhaseGuard,
+    Press,
+    Release,
+    Retreat,
+    Task,
+    TaskController,
+    Wait,
+)
+from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases.plan import Successor
+
+TOUCH, AWAY = Approach(name="touch", retries=2, if_spent="away"), Retreat(0.1, name="away")
+
+
+def after(task, place, outcome, *before):
+    """What follows a phase after phases that began before it, each by its name or by "next"."""
+    return task.plan.successor(place, outcome, [0, *before, place], ["", *["touch"] * len(before)])
+
+
+def test_phases_have_the_names_of_their_classes_with_numbers():
+    task = Task(
+        [Approach(), Move({}, 1.0), Move({}, 1.0, name="Move 2"), Dwell(1.0), Move({}, 1.0)]
+    )
+    names = [phase.name for phase in task.phases]
+    assert names == ["Approach", "Move", "Move 2", "Dwell", "Move 3"]
+    assert [phase.name for phase in Task(task.phases).phases] == names
+    assert "3. Move 2, until the end of 1 s" in str(task)
+
+
+def test_successors_are_those_that_were_chosen():
+    task = Task([TOUCH, Press(20.0, on_failure="away", if_lost="touch"), Release(), AWAY])
+    assert after(task, 0, "success") == Successor("next", 1)
+    assert after(task, 0, "late") == Successor("fail", None)
+    assert after(task, 1, "guard") == after(task, 1, "late") == Successor("away", 3)
+    assert after(task, 2, "success") == Successor("next", 3)
+    assert after(task, 3, "success") == Successor("next", 4)  # Done.
+    assert task.contacts == (False, True, True, False, False)
+
+
+def test_a_phase_is_entered_again_so_often_and_no_more():
+    task = Task([TOUCH, Press(20.0, on_failure="away", if_lost="touch"), Release(), AWAY])
+    assert after(task, 1, "lost") == Successor("touch", 0, "retry 1 of 2")
+    assert after(task, 1, "lost", 1, 0) == Successor("touch", 0, "retry 2 of 2")
+    spent = "touch is not entered after 2 retries"
+    assert after(task, 1, "lost", 1, 0, 1, 0) == Successor("away", 3, spent)
+
+
+def test_who_leaves_releases_first_where_it_touches():
+    task = Task([Approach(if_late="leave"), Press(20.0, on_failure="leave")])
+    assert after(task, 0, "late") == Successor("leave", None)
+    assert after(task, 1, "guard") == Successor("leave", 2)
+    assert after(task, 1, "success") == Successor("next", 3)
+    assert after(task, 2, "success") == after(task, 2, "late") == Successor("stop", None)
+    assert [phase.name for phase in task.plan.phases] == ["Approach", "Press", "leave"]
+
+
+PRESS = Press(20.0)
+
+
+@pytest.mark.parametrize(
+    ("phases", "message"),
+    [
+        ([Approach(on_failure="park")], "1 of the task, Approach: on_failure: no phase 'park'; "),
+        (
+            [Approach(retries=1, if_spent="park")],
+            "1 of the task, Approach: if_spent: no phase 'park'",
+        ),
+        ([Approach(name="done")], "phase 1 of the task: 'done' is no name of a phase"),
+        ([Approach(name="a"), Press(2.0, name="a")], "more than one phase has the name 'a'"),
+        (
+            [Approach(on_failure="Press"), PRESS],
+            "phase 2 of the task, Press, after Approach by on_failure: it begins in contact, where "
+            "the robot is free; an Approach must lead there",
+        ),
+        (
+            [Approach(), Press(20.0, on_success="away"), Release(), AWAY],
+            "phase 4 of the task, away, after Press by on_success: it begins with a free robot, "
+            "which is in contact; a Release must lead there",
+        ),
+        (
+            [Approach(), PRESS, Dwell(1.0, on_failure="Press")],
+            "Press, after Dwell by on_failure: it begins in contact, which is lost there; choose "
+            "another one by if_lost",
+        ),
+        (
+            [Approach(), Press(20.0, on_failure="Press", if_lost="hold")],
+            "the task may not end: Press leads back to itself, as often as it comes; give Press a "
+            "count of retries",
+        ),
+        (
+            [Approach(), PRESS, Release(on_success="Approach")],
+            "Approach, Press and Release lead back to Approach",
+        ),
+        (
+            [TOUCH, PRESS, Release(), Retreat(0.1, name="away", on_success="touch")],
+            "touch and away lead back to touch",
+        ),
+        ([Approach(on_success="done"), PRESS], "2 of the task, Press: no phase leads to it"),
+        (
+            [Approach(), Press(20.0, guards=[PhaseGuard("force", 10.0)])],
+            "phase 2 of the task, Press: its guard ends it at a force of 10, and it needs 19 to "
+            "succeed; give more",
+        ),
+        ([Dwell(2.0, guards=[PhaseGuard("time", 1.0)])], "at a time of 1, and it needs 2 to"),
+        (
+            [Approach(guards=[PhaseGuard("speed", 1.0), PhaseGuard("speed", 2.0)])],
+            "two guards watch the speed; leave one out",
+        ),
+        ([GuardedMove(0.1, force=0.2)], "force: 0.2 N is less than the contact_force of 0.5 N"),
+    ],
+)
+def test_plans_that_make_no_sense_are_refused(phases, message):
+    with pytest.raises(ModelError) as caught:
+        Task(phases)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PhaseGuard("heat", 1.0), "PhaseGuard: of must be"),
+        (lambda: PhaseGuard("force", 0.0), "most, of the force, must be positive"),
+        (lambda: PhaseGuard("force", 1.0, samples=0), "samples must be 1 or more, got 0"),
+        (lambda: Approach(retries=-1), "Approach: retries must be 0 or more, got -1"),
+        (lambda: Approach(on_failure="approach"), "on_failure: 'approach' would go on as before"),
+        (lambda: GuardedMove(0.0), "GuardedMove: distance must be positive"),
+        (lambda: GuardedMove(0.1, direction={"a": 0.0}), "all of its components are 0"),
+        (lambda: Wait(), "Wait: give the signal for which it waits"),
+        (
+            lambda: TaskController(Task([GuardedMove(0.1, direction={"wall": 1.0})]), *laws()),
+            "phase 1 of the task, GuardedMove: direction: no output 'wall'",
+        ),
+        (
+            lambda: TaskController(
+                Task([Approach(guards=[PhaseGuard("speed", 1.0, samples=2)])]), *laws()
+            ),
+            "guard of the speed: it counts in samples, and this task acts continuously",
+        ),
+    ],
+)
+def test_wrong_guards_and_moves_are_refused(make, message):
+    with pytest.raises(ModelError) as caught:
+        make()
+    assert message in str(caught.value)
