@@ -295,8 +295,8 @@ def _add_identify(commands: Any) -> None:
         action="append",
         required=True,
         metavar="NAMES",
-        help="parameters of the plant, as tool.mass,wall.position[0],plant.friction, and force.bias"
-        " or position.bias of sensors; may be repeated",
+        help="parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
+        "position.bias, force.delay and position.delay of sensors; may be repeated",
     )
     found.add_argument(
         "--scenario", help="that of the plant (default: the one in the first record)"

@@ -127,9 +127,7 @@ class Fit:
         for index, pieces in enumerate(self._pieces):
             old = None if known is None else known[index]
             found = pieces.slopes(self._states[index], self._values, old)
-            is_finite = np.isfinite(found.ends).all() and np.isfinite(found.of_ends).all()
-            is_measured = np.isfinite(pieces.values)
-            if not (is_finite and np.isfinite(found.errors[is_measured]).all()):
+            if not found.is_finite:
                 raise ModelError(
                     "the motion that is computed with these parameters leaves the recorded one: "
                     "the record is that of another robot or run, or the values to begin with are "

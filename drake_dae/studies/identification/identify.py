@@ -19,7 +19,7 @@ from drake_dae.studies.identification.identified import (
     Noise,
     resampled,
 )
-from drake_dae.studies.identification.measured import Channel, measured, measured_ports
+from drake_dae.studies.identification.measured import SAME, Channel, measured, measured_ports
 from drake_dae.studies.identification.pieces import Pieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
@@ -57,7 +57,8 @@ def identify(
         records: The records, by name or in a list: of this plant under any law, with the signals
             "control" and "state" (or the encoders'), and "constraint_force" or "measured_force".
         free: Names of the plant's parameters, such as "tool.mass", "wall.position[0]" or
-            "plant.stiffness"; "force.bias" and "position.bias" are what sensors add.
+            "plant.stiffness"; "force.bias" and "position.bias" are what sensors add, "force.delay"
+            and "position.delay" by how much later they measure, in s.
 
     Raises:
         ModelError: There is no such parameter, a record does not fit the plant, the plant is of
@@ -74,8 +75,10 @@ def identify(
     pieces = []
     for title, record in named.items():
         data = measured(record, driven, title)
-        biases = unknowns.biases(data.channels)
-        pieces.append(Pieces(driven, data, biases, len(unknowns.all) - len(unknowns.places)))
+        biases, delays = unknowns.of_sensors(data.channels)
+        if (delays >= 0).any():
+            _check_even(data.times, title)
+        pieces.append(Pieces(driven, data, biases, unknowns.num_sensed, delays=delays))
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
@@ -84,6 +87,16 @@ def identify(
         near = Fit([each.first(BRIEF) for each in pieces], start, sizes, lowest).run().values
     fitted = Fit(pieces, near, sizes, lowest).run()
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
+
+
+def _check_even(times: FloatArray, title: str) -> None:
+    """Refuses rows that are not equally far from each other, for delays."""
+    steps = np.diff(times)
+    if np.ptp(steps[:-1]) > SAME * np.median(steps):
+        raise ModelError(
+            f"a delay is found from rows at equal steps, and {title} has steps of "
+            f"{steps.min():.4g} to {steps.max():.4g} s; record it with fixed steps or at samples"
+        )
 
 
 def _numbered(records: Sequence[Record]) -> dict[str, Record]:

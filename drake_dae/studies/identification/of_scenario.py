@@ -14,7 +14,12 @@ from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.identification.identified import Identified
 from drake_dae.studies.identification.identify import identify
-from drake_dae.studies.identification.unknowns import FORCE_BIAS, POSITION_BIAS
+from drake_dae.studies.identification.unknowns import (
+    FORCE_BIAS,
+    FORCE_DELAY,
+    POSITION_BIAS,
+    POSITION_DELAY,
+)
 
 
 def recorded_scenario(records: Mapping[str, Record]) -> Scenario:
@@ -48,8 +53,8 @@ def identify_scenario(
         free: As of `identify`.
 
     Returns:
-        The result, and the scenario whose plant and sensors have the values that were found, those
-        that are not determined excepted.
+        The result, and the scenario whose plant and sensors have the values that were found, except
+        for those that are not determined, and for delays, which no sensor of a scenario has.
 
     Raises:
         ModelError: As of `identify`.
@@ -86,6 +91,8 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
             if unknown.parameter == name
         ]
         value = all_entries[0] if len(all_entries) == 1 else all_entries
+        if name in (FORCE_DELAY, POSITION_DELAY):
+            continue  # No sensor of a scenario has one.
         if name in payloads:
             changes[f"plant_payloads.{payloads[name]}.mass"] = value
         elif name == FORCE_BIAS:

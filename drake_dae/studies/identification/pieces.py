@@ -35,6 +35,7 @@ class Slopes(NamedTuple):
         ends: The states at the ends, shape (j, n).
         of_ends: Their derivatives, shape (j, n, n + p).
         residuals: Constraints at the beginning, and their derivatives: (j, m), (j, m, n + p).
+        is_finite: Whether everything that was computed is.
     """
 
     errors: FloatArray
@@ -42,6 +43,7 @@ class Slopes(NamedTuple):
     ends: FloatArray
     of_ends: FloatArray
     residuals: tuple[FloatArray, FloatArray]
+    is_finite: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +53,18 @@ class Pieces:
     Attributes:
         driven: The plant.
         data: The record.
-        biases: For each column the unknown that it has as bias, counted after those of the plant;
-            -1 for none.
-        num_biases: How many of these there are.
+        biases: For each column the unknown of sensors that is its bias; -1 for none.
+        num_sensed: The number of unknowns of sensors, which come after those of the plant.
         parts: How many steps of a continuous plant are made between two rows.
+        delays: For each column the unknown that is its delay, as `biases`; None for none at all.
     """
 
     driven: Driven
     data: Measured
     biases: np.ndarray
-    num_biases: int
+    num_sensed: int
     parts: int = 1
+    delays: np.ndarray | None = None
 
     @cached_property
     def length(self) -> int:
@@ -92,12 +95,14 @@ class Pieces:
     @cached_property
     def values(self) -> FloatArray:
         """The measured columns less known biases, shape (j, k, c); nan behind the last row."""
-        known = np.array([channel.bias for channel in self.data.channels])
-        found: FloatArray = (self.data.values - np.where(self.biases < 0, known, 0.0))[
-            self.rows[:, :-1]
-        ]
+        found: FloatArray = self._measured[self.rows[:, :-1]]
         found[~self._is_own] = np.nan
         return found
+
+    @cached_property
+    def _measured(self) -> FloatArray:
+        known = np.array([channel.bias for channel in self.data.channels])
+        return self.data.values - np.where(self.biases < 0, known, 0.0)
 
     @cached_property
     def _places(self) -> np.ndarray:
@@ -142,7 +147,7 @@ class Pieces:
             known: Pieces nearby, whose derivatives are taken; None for new ones.
         """
         driven, times = self.driven, self.data.times[self.rows]
-        of_plant, biases = np.split(unknown, [unknown.size - self.num_biases])
+        of_plant, sensed = np.split(unknown, [unknown.size - self.num_sensed])
         moved = driven.begun(states) if known is None else Moved(states)
         shown = list[Moved]()
         for k, controls in enumerate(self._controls):
@@ -150,28 +155,67 @@ class Pieces:
             shown.append(driven.seen(times[:, k], moved, of_plant, acting))
             moved = driven.step(times[:, k], times[:, k + 1], moved, of_plant, controls)
         places, own = self._places, self._residuals
-        errors = self.values - np.stack([each.values[:, places] for each in shown], axis=1)
-        of_column = np.append(biases, 0.0)[self.biases]  # The last one is that of no bias.
-        errors -= of_column
+        computed = np.stack([each.values[:, places] for each in shown], axis=1)
+        is_finite = bool(np.isfinite(computed).all() and np.isfinite(moved.values).all())
+        delayed, rates = self._delayed(computed, sensed)
+        of_column = np.append(sensed, 0.0)[self.biases]  # The last one is that of no bias.
+        errors = self._later(sensed) - delayed - of_column
         residual = shown[0].values[:, own]
         if known is not None:
-            _, of_errors, _, of_ends, (_, of_residual) = known
-            return Slopes(errors, of_errors, moved.values, of_ends, (residual, of_residual))
-        of_errors = -np.stack([_slopes(each)[:, places] for each in shown], axis=1)
-        of_biases = -np.eye(self.num_biases + 1)[self.biases][:, : self.num_biases]
-        return Slopes(
-            errors,
-            np.concatenate(
-                [of_errors, np.broadcast_to(of_biases, (*errors.shape, self.num_biases))], axis=3
-            ),
-            moved.values,
-            self._padded(_slopes(moved)),
-            (residual, self._padded(_slopes(shown[0])[:, own])),
-        )
+            of_errors, of_ends, of_residual = known.of_errors, known.of_ends, known.residuals[1]
+        else:
+            of_computed = np.stack([_slopes(each)[:, places] for each in shown], axis=1)
+            of_errors = -np.concatenate([of_computed, self._of_sensed(rates)], axis=3)
+            of_ends = self._padded(_slopes(moved))
+            of_residual = self._padded(_slopes(shown[0])[:, own])
+            is_finite = is_finite and bool(np.isfinite(of_errors).all())
+        residuals = residual, of_residual
+        return Slopes(errors, of_errors, moved.values, of_ends, residuals, is_finite)
+
+    def _shifts(self, sensed: FloatArray) -> tuple[np.ndarray, FloatArray]:
+        """The delay of each column as a number of rows and a rest in s."""
+        if self.delays is None:
+            return np.zeros(len(self.biases), dtype=int), np.zeros(len(self.biases))
+        delays = np.append(sensed, 0.0)[self.delays]
+        step = float(np.median(np.diff(self.data.times)))
+        rows = np.round(delays / step)
+        return rows.astype(int), delays - rows * step
+
+    def _later(self, sensed: FloatArray) -> FloatArray:
+        """The measured columns, each by its delay later."""
+        found, (rows, _) = self.values.copy(), self._shifts(sensed)
+        for column in np.flatnonzero(rows):
+            places = self.rows[:, :-1] + rows[column]
+            is_there = (places >= 0) & (places < self.data.times.size) & self._is_own
+            raw = self._measured[np.clip(places, 0, self.data.times.size - 1), column]
+            found[:, :, column] = np.where(is_there, raw, np.nan)
+        return found
+
+    def _delayed(self, computed: FloatArray, sensed: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Computed columns, earlier by what delays leave of whole rows, and minus their rates."""
+        found, rates, (_, rests) = computed.copy(), np.zeros_like(computed), self._shifts(sensed)
+        step = float(np.median(np.diff(self.data.times)))
+        for column in np.flatnonzero([] if self.delays is None else self.delays >= 0):
+            rate = np.gradient(computed[:, :, column], step, axis=1, edge_order=2)
+            second = np.gradient(rate, step, axis=1, edge_order=2)
+            rest = rests[column]
+            found[:, :, column] += rest * (rest / 2.0 * second - rate)
+            rates[:, :, column] = rest * second - rate
+        return found, rates
+
+    def _of_sensed(self, rates: FloatArray) -> FloatArray:
+        """The derivatives of the computed columns with respect to the unknowns of sensors."""
+        found = np.zeros((*rates.shape, self.num_sensed))
+        for column, bias in enumerate(self.biases):
+            if bias >= 0:
+                found[:, :, column, bias] = 1.0
+            if self.delays is not None and self.delays[column] >= 0:
+                found[:, :, column, self.delays[column]] = rates[:, :, column]
+        return found
 
     def _padded(self, slopes: FloatArray) -> FloatArray:
         """Derivatives with respect to biases as well, which are zero."""
-        return np.concatenate([slopes, np.zeros((*slopes.shape[:2], self.num_biases))], axis=2)
+        return np.concatenate([slopes, np.zeros((*slopes.shape[:2], self.num_sensed))], axis=2)
 
     def first(self, count: int) -> "Pieces":
         """The first rows alone."""
@@ -206,7 +250,7 @@ class Pieces:
 
     def _some_ends(self, pieces: np.ndarray, unknown: FloatArray) -> FloatArray:
         """The ends of some pieces."""
-        of_plant = unknown[: unknown.size - self.num_biases]
+        of_plant = unknown[: unknown.size - self.num_sensed]
         times = self.data.times[self.rows][pieces]
         moved = Moved(self.first_states[pieces])
         for k, controls in enumerate(self._controls):

@@ -16,6 +16,9 @@ from drake_dae.studies.identification.measured import Channel
 FORCE_BIAS, POSITION_BIAS = "force.bias", "position.bias"
 """What sensors add to forces and to positions."""
 
+FORCE_DELAY, POSITION_DELAY = "force.delay", "position.delay"
+"""By how much later forces and positions are measured, in s: the same for all of them."""
+
 _ENTRY = re.compile(r"(.+)\[(\d+)\]")
 
 
@@ -30,7 +33,7 @@ class Unknown:
         entry: The entry.
         unit: Its unit.
         lowest: Its lower bound; None for none.
-        place: Its place in numeric parameter 0 of the plant; -1 for a bias.
+        place: Its place in numeric parameter 0 of the plant; -1 for one of a sensor.
     """
 
     name: str
@@ -58,7 +61,7 @@ class Unknowns:
         Args:
             loop: The loop.
             free: Names of the plant's parameters, "link1.mass"; entries, "wall.position[0]"; and
-                FORCE_BIAS and POSITION_BIAS.
+                FORCE_BIAS, POSITION_BIAS, FORCE_DELAY and POSITION_DELAY.
 
         Raises:
             ModelError: There is no such parameter or entry, it is named twice, or it moves.
@@ -100,28 +103,40 @@ class Unknowns:
         """The places of those of the plant."""
         return [one.place for one in self.all if one.place >= 0]
 
-    def biases(self, channels: Sequence[Channel]) -> np.ndarray:
-        """For each measured column the bias that it has, counted from 0; -1 for none.
+    @property
+    def num_sensed(self) -> int:
+        """How many of them are of sensors; they come last."""
+        return len(self.all) - len(self.places)
+
+    def of_sensors(self, channels: Sequence[Channel]) -> tuple[np.ndarray, np.ndarray]:
+        """For each measured column the bias and the delay that it has, counted from 0; -1 for none.
 
         Raises:
-            ModelError: A bias is asked for of a column that is not measured.
+            ModelError: One is asked for of what is not measured.
         """
-        own = [one for one in self.all if one.place < 0]
-        found = np.full(len(channels), -1)
-        for number, unknown in enumerate(own):
-            is_force = unknown.parameter == FORCE_BIAS
-            for column, channel in enumerate(channels):
-                if (channel.port != "state") == is_force and channel.place == unknown.entry:
-                    found[column] = number
-            if number not in found:
-                raise ModelError(f"the records do not measure what '{unknown.name}' is added to")
-        return found
+        biases, delays = np.full(len(channels), -1), np.full(len(channels), -1)
+        for number, unknown in enumerate(self.all[len(self.places) :]):
+            is_force = unknown.parameter in (FORCE_BIAS, FORCE_DELAY)
+            is_delay = unknown.parameter in (FORCE_DELAY, POSITION_DELAY)
+            own = [
+                column
+                for column, channel in enumerate(channels)
+                if (channel.port != "state") == is_force
+                and (is_delay or channel.place == unknown.entry)
+            ]
+            if not own:
+                raise ModelError(f"the records do not measure what '{unknown.name}' belongs to")
+            (delays if is_delay else biases)[own] = number
+        return biases, delays
 
     def start(self, nominal: FloatArray, channels: Sequence[Channel]) -> FloatArray:
         """The values to begin with: those of the plant, and the known biases."""
-        places = self.biases(channels)
-        known = [channels[int(np.argmax(places == i))].bias for i in range(int(places.max()) + 1)]
-        return np.concatenate([nominal, known])
+        biases, _ = self.of_sensors(channels)
+        sensed = np.zeros(self.num_sensed)
+        for channel, bias in zip(channels, biases.tolist(), strict=True):
+            if bias >= 0:
+                sensed[bias] = channel.bias
+        return np.concatenate([nominal, sensed])
 
 
 def _all(loop: ClosedLoop) -> list[Unknown]:
@@ -147,6 +162,7 @@ def _all(loop: ClosedLoop) -> list[Unknown]:
             )
             if name == FORCE_BIAS or "/s" not in signal.unit
         ]
+    found += [Unknown(name, name, 0, "s") for name in (FORCE_DELAY, POSITION_DELAY)]
     return found
 
 

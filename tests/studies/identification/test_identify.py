@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from runs import scenario
+from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from drake_dae import Record, build_scenario
@@ -232,6 +233,32 @@ def test_biases_of_sensors_are_found():
     free = ["force.bias", "position.bias[1]"]
     found = identify(loop, context, [replace(record, signals=signals)], free)
     np.testing.assert_allclose(found.values, [2.0, 3e-3], rtol=1e-4)
+
+
+def test_delays_of_sensors_are_found():
+    loop, context, record = run_of((("link2.mass", 6.3),), *WALL)
+    signals, later = dict(record.signals), {"state": 3.4e-3, "constraint_force": 1.3e-3}
+    for name, delay in later.items():
+        old = signals[name]
+        # Exact to 1e-9: cubics through rows each millisecond.
+        values = CubicSpline(record.time, old.values)(record.time - delay)
+        signals[name] = Recorded(values, old.signals)
+    late = replace(record, signals=signals).after(0.01)
+    free = ["position.delay", "force.delay", "link2.mass"]
+    found = identify(loop, context, [late], free)
+    # What is left of a delay within a row is taken to second order: 1e-10 s^3 are left, times a
+    # third derivative.
+    assert found["position.delay"] == pytest.approx(3.4e-3, abs=1e-6)
+    assert found["force.delay"] == pytest.approx(1.3e-3, abs=1e-5)
+    assert found["link2.mass"] == pytest.approx(6.3, rel=1e-4)
+
+
+def test_a_delay_needs_even_rows():
+    loop, context, record = run_of((), *WALL)
+    rows = np.r_[0:30, 31:200]
+    signals = {n: Recorded(r.values[rows], r.signals) for n, r in record.signals.items()}
+    with pytest.raises(ModelError, match="rows at equal steps"):
+        identify(loop, context, [Record(record.time[rows], signals)], ["force.delay"])
 
 
 def test_two_records_know_more_than_one():
