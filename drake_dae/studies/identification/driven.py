@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, OutputPort, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compile import compile_open
+from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
@@ -73,7 +74,7 @@ class Driven:
             raise ModelError(f"{plant.dae.name}: a plant that samples cannot be identified")
 
     @cached_property
-    def _compiled(self):  # type: ignore[no-untyped-def]
+    def _compiled(self) -> CompiledDiagram:
         plant, sensor = self.loop.plant, self.loop.sensor
         free = [plant.GetInputPort("control")]
         if sensor is not None and sensor.HasInputPort("noise"):

@@ -1,7 +1,8 @@
 """What a record says of a plant: controls, measured outputs, and a first guess of the states."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from pydrake.systems.framework import OutputPort, System
@@ -70,6 +71,17 @@ class Measured:
     values: FloatArray
     channels: Sequence[Channel]
 
+    def first(self, count: int) -> Self:
+        """The first rows alone."""
+        return replace(
+            self,
+            times=self.times[:count],
+            acting=self.acting[:count],
+            controls=self.controls[:count],
+            states=self.states[:count],
+            values=self.values[:count],
+        )
+
 
 def measured_ports(loop: ClosedLoop) -> dict[str, OutputPort]:
     """Name -> an output port of the plant, or of a sensor with a state, that a record may measure.
@@ -125,7 +137,14 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
             f"('constraint_force' or 'measured_force'); it has {listed(record.signals)}"
         )
     states = _first_states(record, driven, channels, values, title)
-    return Measured(record.time, acting, controls, states, np.column_stack(values), channels)
+    found = Measured(record.time, acting, controls, states, np.column_stack(values), channels)
+    ends_whole = not driven.period or _is_whole(float(np.diff(record.time)[-1]), driven.period)
+    return found if ends_whole else found.first(record.time.size - 1)
+
+
+def _is_whole(duration: float, period: float) -> bool:
+    """Whether a duration is that of whole steps; that of the end of a run may not be."""
+    return abs(duration / period - round(duration / period)) <= SAME
 
 
 def _check_steps(record: Record, period: float, title: str) -> None:

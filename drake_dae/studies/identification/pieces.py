@@ -219,16 +219,7 @@ class Pieces:
 
     def first(self, count: int) -> "Pieces":
         """The first rows alone."""
-        given = self.data
-        data = replace(
-            given,
-            times=given.times[:count],
-            acting=given.acting[:count],
-            controls=given.controls[:count],
-            states=given.states[:count],
-            values=given.values[:count],
-        )
-        return replace(self, data=data)
+        return replace(self, data=self.data.first(count))
 
     def fine_enough(self, unknown: FloatArray) -> "Pieces":
         """The same with steps so short that the ends of pieces are accurate."""

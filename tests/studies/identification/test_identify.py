@@ -329,6 +329,13 @@ def test_a_record_that_does_not_fit_is_refused(kind):
         identify(loop, context, [change(record)], ["link2.mass"])
 
 
+def test_a_run_that_ends_within_a_step_of_its_plant_is_understood():
+    ends = (*COMPLIANT[:1], "duration=0.3004", *COMPLIANT[2:])
+    loop, context, record = run_of((("link2.mass", 6.6),), *ends)
+    assert np.diff(record.time)[-1] == pytest.approx(0.0004)
+    assert identify(loop, context, [record], ["link2.mass"])["link2.mass"] == pytest.approx(6.6)
+
+
 def test_rows_between_the_steps_of_a_plant_are_refused():
     loop, context, record = run_of((), *COMPLIANT)
     other = Record(1.3 * record.time, record.signals)
