@@ -34,6 +34,7 @@ CLAIMS = {
     "unicycle": (1e-12,),
     "quadruple_tank": (1e-12, 1e-12),
     "own_diagram": (1e-9,),
+    "identified_plants": (0.01, 0.05, 0.12),
 }
 
 
