@@ -28,6 +28,9 @@ are not white."""
 LARGER = 1.5
 """A deviation of the bootstrap that is larger by this factor is remarked."""
 
+ALIKE = 1.25
+"""What is left is called other than the stated noise where it differs by more than this factor."""
+
 STRONG = 0.95
 """Correlations of two unknowns above this are printed."""
 
@@ -156,6 +159,12 @@ class Identified:
         ]
         for name, noise in self.noise.items():
             stated = "" if noise.stated is None else f" ({noise.stated:.2g} is stated)"
+            ratio = noise.deviation / noise.stated if noise.stated else 1.0
+            if not 1.0 / ALIKE < ratio < ALIKE:
+                found.append(
+                    f"What is left of {name} is {ratio:.2g} times the noise that is stated: "
+                    + ("the model lacks something." if ratio > 1.0 else "the sensor is better.")
+                )
             kind = "white" if noise.is_white else "not white"
             found.append(
                 f"Left of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()

@@ -1,5 +1,6 @@
 """Parameters from records: against the truth, finite differences and other least squares."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -221,6 +222,19 @@ def test_what_a_record_does_not_determine_is_told_by_name():
     assert found["wall.position[0]"] == pytest.approx(found.start[0], abs=1e-6)
     assert "not determined" in found.text()
     assert found.to_dict()["parameters"]["wall.position[1]"]["interval"] is None
+
+
+def test_what_is_left_is_compared_with_the_noise_that_is_stated():
+    settings = (*SAMPLED, "encoders={position_noise: 1e-4}")
+    loop, context, record = run_of((), *settings)
+    text = identify(loop, context, [record], ["link2.mass"]).text()
+    assert "times the noise that is stated" not in text
+    less = noisy(record, 3, [("estimated_state", slice(0, 2), 2e-4)])
+    text = identify(loop, context, [less], ["link2.mass"]).text()
+    # sqrt(1 + 4) = 2.24 times, from 800 values within 2.5 %
+    found = re.search(r"What is left of estimated_state is (\S+) times the noise", text)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(2.24, rel=0.1)
 
 
 def test_biases_of_sensors_are_found():
