@@ -46,6 +46,7 @@ class Noise:
         stated: The deviation that the sensor is said to have; None if nobody said.
         correlation: The largest correlation of an error with the next one, by its absolute value.
         is_white: Whether that is what white noise has.
+        is_least: Whether there is no noise, and what is left is that of computing.
     """
 
     unit: str
@@ -53,6 +54,7 @@ class Noise:
     stated: float | None
     correlation: float
     is_white: bool
+    is_least: bool = False
 
 
 @checked(ModelError)
@@ -160,17 +162,20 @@ class Identified:
         for name, noise in self.noise.items():
             stated = "" if noise.stated is None else f" ({noise.stated:.2g} is stated)"
             ratio = noise.deviation / noise.stated if noise.stated else 1.0
-            if not 1.0 / ALIKE < ratio < ALIKE:
+            if not (1.0 / ALIKE < ratio < ALIKE or noise.is_least):
                 found.append(
                     f"What is left of {name} is {ratio:.2g} times the noise that is stated: "
                     + ("the model lacks something." if ratio > 1.0 else "the sensor is better.")
                 )
-            kind = "white" if noise.is_white else "not white"
+            kind = f"{'' if noise.is_white else 'not '}white"
+            kind += f" (correlation with the next one {noise.correlation:.2g})"
+            if noise.is_least:
+                kind = "what computing leaves: there is no noise"
             found.append(
                 f"Left of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
-                + f"{stated}, {kind} (correlation with the next one {noise.correlation:.2g})."
+                + f"{stated}, {kind}."
             )
-        if any(not noise.is_white for noise in self.noise.values()):
+        if any(not (noise.is_white or noise.is_least) for noise in self.noise.values()):
             found.append(
                 "Where errors are not white the intervals are too short: the model lacks something "
                 "(a free parameter, friction, a bias), or sensors round."

@@ -136,11 +136,14 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
     one_of = dict[tuple[str, str], Channel]()
     least = dict[tuple[str, str], float]()
     for each, errors in zip(pieces, fitted.errors, strict=True):
-        for channel, column in zip(each.data.channels, errors.T, strict=True):
+        measured_columns = each.data.values.T
+        for channel, column, values in zip(
+            each.data.channels, errors.T, measured_columns, strict=True
+        ):
             own = column[np.isfinite(column)]
             groups.setdefault(channel.group, []).append(own)
             one_of[channel.group] = channel
-            spread = float(np.nanstd(each.data.values))
+            spread = float(np.nanstd(values))
             least[channel.group] = max(SMALLEST * spread, least.get(channel.group, 0.0))
     found, signals = {}, [signal for signal, _ in groups]
     for (signal, unit), columns in groups.items():
@@ -148,10 +151,10 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         largest = max(correlations, key=abs)
         deviation = float(np.sqrt(np.mean(np.square(np.concatenate(columns)))))
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
-        is_white = abs(largest) < limit or deviation < least[signal, unit]
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
         stated = _stated(loop, one_of[signal, unit])
-        found[name] = Noise(unit, deviation, stated, largest, is_white)
+        is_white, is_least = bool(abs(largest) < limit), deviation < least[signal, unit]
+        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
     return found
 
 
