@@ -146,9 +146,10 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
         for before, change in zip((None, *changes), changes, strict=False)
         if change.failed and not (before is not None and before.chosen == "leave")
     ]
-    if last.phase == "held" and last.failed:
+    leaves = last.failed and last.chosen == "leave" and last.phase != "done"
+    if leaves or (last.phase == "held" and last.failed):
         why = failures[-1] if failures else last
-        left = ", and has left the contact" if why.chosen == "leave" else ""
+        left = ", and has left the contact" if why.chosen == "leave" and not leaves else ""
         problems.append(f"the task was given up at {why.time:.4g} s{left}: {why.reason}")
     elif last.phase == "held":
         remarks.append(f"the task ended as chosen at {last.time:.4g} s: {last.reason}")

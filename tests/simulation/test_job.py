@@ -193,6 +193,9 @@ def test_a_task_that_leaves_is_bad_where_a_phase_has_failed(failed):
     if not failed:
         wanted = "GOOD: the task ended as chosen at 3 s: after a force of no more than 0.5 N."
     assert str(found) == wanted
+    # A run that ends meanwhile cannot become good any more.
+    cut = judged(run(), changes=[begin, leave])
+    assert cut.outcome is (JobOutcome.BAD if failed else JobOutcome.UNDECIDED)
 
 
 def test_a_run_without_outputs():
