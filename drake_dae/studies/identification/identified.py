@@ -223,7 +223,8 @@ def undetermined_names(
 ) -> tuple[tuple[str, ...], ...]:
     """The parameters of each direction that is not determined, by name."""
     return tuple(
-        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE)) for column in undetermined.T
+        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE).tolist())
+        for column in undetermined.T
     )
 
 
