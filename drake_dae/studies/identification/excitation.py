@@ -11,9 +11,9 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.studies.identification.promised import Promised
+from drake_dae.studies.identification.promised import Criterion, Promised
 
-_MEANING = {
+_MEANING: Mapping[Criterion, str] = {
     "D": "D, the geometric mean of relative deviations along the axes of their ellipsoid",
     "A": "A, the root mean square of relative deviations",
 }
@@ -40,7 +40,7 @@ class Excitation:
     choice: Mapping[str, float]
     before: Promised
     after: Promised
-    criterion: str
+    criterion: Criterion
     runs: int
     refused: Mapping[str, int]
     problems: tuple[str, ...] = ()

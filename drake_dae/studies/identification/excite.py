@@ -4,7 +4,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -18,7 +18,7 @@ from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 from drake_dae.studies.identification.excitation import Excitation
-from drake_dae.studies.identification.promised import Trial, Trials
+from drake_dae.studies.identification.promised import Criterion, Trial, Trials
 
 SPREAD = 0.4
 """This part of the runs is spread over the ranges; the others go on from the best of them."""
@@ -47,7 +47,7 @@ def excite(
     free: Sequence[str],
     *,
     noise: Mapping[str, float] | None = None,
-    criterion: Literal["D", "A"] = "D",
+    criterion: Criterion = "D",
     runs: int = 100,
     seed: int = 0,
     progress: bool = False,
@@ -145,7 +145,7 @@ class _Best:
     def __init__(
         self,
         trials: Trials,
-        criterion: str,
+        criterion: Criterion,
         keys: Sequence[str],
         ends: tuple[FloatArray, FloatArray],
         runs: int,
@@ -196,7 +196,7 @@ def _search(cost: Callable[[FloatArray], float], count: int, runs: int, seed: in
         place, step = found.x, FIRST_STEP * random.uniform(0.2, 1.0)
 
 
-def _cost(trial: Trial, criterion: str) -> float:
+def _cost(trial: Trial, criterion: Criterion) -> float:
     """What is to be small: the logarithm of the criterion, and more with problems."""
     if trial.problems or trial.promised is None:
         return REFUSED * (1 + len(trial.problems))

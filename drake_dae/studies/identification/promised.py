@@ -4,7 +4,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -35,6 +35,9 @@ from drake_dae.studies.structures import study_data
 LEAST = 1e-24
 """The least information about a direction of the unknowns over their sizes: with less it counts as
 this, so that designs without any information can be compared."""
+
+Criterion = Literal["D", "A"]
+"""What is to be small: the volume of the ellipsoid of relative errors, or their sum of squares."""
 
 _FREE_OF_PLANT = ("description", "duration", "references", "tolerances", "write")
 """Keys of a scenario that change nothing in its plant and sensors."""
@@ -93,8 +96,8 @@ class Promised:
         """(tr(C) / p)^(1/2): the root mean square of the deviations over the sizes."""
         return float(np.sqrt(np.mean(1.0 / self.strengths)))
 
-    def size(self, criterion: str) -> float:
-        """The number that is to be small, by the name of a criterion: "D" or "A"."""
+    def size(self, criterion: Criterion) -> float:
+        """The number that is to be small, by the name of a criterion."""
         return self.d_size if criterion == "D" else self.a_size
 
 
