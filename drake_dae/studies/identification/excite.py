@@ -107,7 +107,7 @@ def excite(
         _search(lambda place: best.cost(place, bar), len(keys), runs, seed)
     if best.trial.problems or best.trial.promised is None:
         raise ModelError(
-            f"no run of {best.made} keeps all limits: each {_most(best.refused)}; give other "
+            f"no run of {best.made} keeps all limits ({_most(best.refused)}); give other "
             "ranges, or a scenario that keeps them"
         )
     return Excitation(
@@ -227,4 +227,4 @@ def _noise(given: Mapping[str, float]) -> Mapping[str, float]:
 
 
 def _most(refused: Counter[str]) -> str:
-    return listed(f"{kind} ({count} times)" for kind, count in refused.most_common())[1:-1]
+    return listed(f"{kind}: {count}" for kind, count in refused.most_common())[1:-1]

@@ -145,7 +145,8 @@ class Trials:
             judge_all: Whether the information of a run with problems is of interest.
 
         Raises:
-            ModelError: The noise of a measurement is not stated.
+            ModelError: With `judge_all` alone: a parameter is not one, or the noise of a
+                measurement is not stated.
         """
         try:
             data = study_data(self._base, dict(changes), True)
@@ -163,7 +164,9 @@ class Trials:
             return Trial(problems)
         try:
             return Trial(problems, self._promised(data, loop, context, found.record))
-        except np.linalg.LinAlgError as error:
+        except (ModelError, np.linalg.LinAlgError) as error:
+            if judge_all and isinstance(error, ModelError):
+                raise
             return Trial({"has no finite information": str(error)})
 
     def _promised(
