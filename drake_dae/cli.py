@@ -31,6 +31,16 @@ sixth of a short run.
 """
 
 
+_MODULES = {
+    "schema": "keys",
+    "print": "keys",
+    "cache": "keys",
+    "render": "plot",
+    "excite": "identify",
+}
+"""The modules of commands that have none of their own."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
@@ -98,7 +108,7 @@ def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
     A signal waits meanwhile: Drake's modules would convert it to an ImportError.
     """
     with ending_signals(interruption := Interruption()):
-        module = {"schema": "keys", "print": "keys", "render": "plot"}.get(command, command)
+        module = _MODULES.get(command, command)
         run_command: Callable[[argparse.Namespace], int] = import_module(
             f"drake_dae.commands.{module}"
         ).run_command

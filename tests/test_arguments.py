@@ -183,6 +183,12 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
         {},
         [],
     ),
+    dd.Promised: lambda: dd.Promised(
+        (Unknown("link1.mass", "link1.mass", 0, "kg"),), np.ones(1), np.eye(1), (), np.ones(1)
+    ),
+    dd.Excitation: lambda: dd.Excitation(
+        scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
+    ),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,

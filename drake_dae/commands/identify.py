@@ -1,20 +1,33 @@
-"""`drake-dae identify`: parameters of a plant from records."""
+"""`drake-dae identify` and `excite`: parameters of a plant from records, and motions for these."""
 
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from drake_dae.arrays import number_in
 from drake_dae.commands.run_folder import MARK, load_run, stage
 from drake_dae.errors import ModelError
 from drake_dae.files import read_text
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
+from drake_dae.studies.variations import parse_ranges
+
+if TYPE_CHECKING:
+    from drake_dae.studies.identification.excitation import Excitation
+    from drake_dae.studies.identification.identified import Identified
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Identifies what the options name; returns the exit code."""
+    """Identifies or excites what the options name; returns the exit code."""
+    return _excite(options) if options.command == "excite" else _identify(options)
+
+
+def _identify(options: argparse.Namespace) -> int:
+    """Identifies parameters."""
     # SciPy's splines take a fifth of a second to load.
     from drake_dae.studies.identification.of_scenario import identify_scenario, recorded_scenario
 
@@ -28,19 +41,66 @@ def run_command(options: argparse.Namespace) -> int:
         scenario = recorded_scenario(records)
     else:
         scenario = load_scenario(find_scenario(options.scenario), options.settings)
-    free = [name for text in options.free for name in text.split(",") if name]
-    found, identified = identify_scenario(scenario, records, free)
+    found, identified = identify_scenario(scenario, records, _listed(options.free))
+    _tell(found, identified, options)
+    return 0
+
+
+def _excite(options: argparse.Namespace) -> int:
+    """Finds a motion and a force; returns the exit code, after a signal that of this."""
+    # It loads SciPy's optimizers.
+    from drake_dae.studies.identification.excite import excite
+
+    scenario = load_scenario(find_scenario(options.scenario), options.settings)
+    found = excite(
+        scenario,
+        parse_ranges(options.vary, scenario),
+        _listed(options.free),
+        noise=_noise(options.noise),
+        criterion=options.criterion,
+        runs=options.runs,
+        seed=options.seed,
+        progress=True,
+    )
+    _tell(found, found.scenario, options)
+    return 0 if found.interrupted is None else 128 + found.interrupted
+
+
+def _tell(
+    found: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
+) -> None:
+    """Writes the scenario and prints the result."""
     path: Path | None = options.out
     if path is not None:
         with stage(path.parent, path.name) as place:
-            save_scenario(identified, place / path.name, MARK)
+            save_scenario(scenario, place / path.name, MARK)
     if options.json:
         print(json.dumps(found.to_dict(), indent=2))
-        return 0
+        return
     print(found.text())
     if path is not None:
         print(f"the scenario with these values is written to {path}")
-    return 0
+
+
+def _listed(texts: list[str]) -> list[str]:
+    """Names that commas separate."""
+    return [name for text in texts for name in text.split(",") if name]
+
+
+def _noise(texts: list[str]) -> dict[str, float]:
+    """The deviations of sensors.
+
+    Raises:
+        ModelError: An option is no name with a number.
+    """
+    found = dict[str, float]()
+    for text in _listed(texts):
+        name, _, number = text.partition("=")
+        value = number_in(number)
+        if value is None:
+            raise ModelError(f"--noise takes position=1e-5,force=0.3, got '{text}'")
+        found[name] = value
+    return found
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:

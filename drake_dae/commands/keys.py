@@ -1,16 +1,21 @@
-"""`drake-dae print`, `keys` and `schema`: a shipped scenario, and the keys of all."""
+"""`drake-dae print`, `keys`, `schema` and `cache`: a scenario, the keys of all, machine code."""
 
 import argparse
 import json
 
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import MachineCodeError, ScenarioError
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.trace.cache import cache_folder, clear, contents
+from drake_dae.trace.compiler import find_compiler
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Prints what the options name; returns the exit code."""
     if options.command == "print":
         print(_scenario(options), end="")
+        return 0
+    if options.command == "cache":
+        _cache(options.clear)
         return 0
     # The keys take most of a second to load.
     from drake_dae.scenario.manual.page import keys_page
@@ -33,3 +38,19 @@ def _scenario(options: argparse.Namespace) -> str:
         return path.read_text("utf-8")
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
+
+
+def _cache(is_cleared: bool) -> None:
+    """Shows the machine code in the cache and the compiler, or removes the former."""
+    files = contents()
+    size = sum(path.stat().st_size for path in files if path.is_file())
+    what = f"{len(files)} files, {size / 1e6:.1f} MB"
+    if is_cleared:
+        clear()
+        print(f"removed from {cache_folder()}: {what}")
+        return
+    print(f"cache     {cache_folder()}: {what}")
+    try:
+        print(f"compiler  {' '.join(find_compiler().command)}")
+    except MachineCodeError as error:
+        print(f"compiler  none: {error}")

@@ -1,17 +1,19 @@
 """The command line: commands, options and their help texts."""
 
 import argparse
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import drake_dae
-from drake_dae.arrays import number_in
+from drake_dae.commands.options_of_studies import (
+    add_excite,
+    add_identify,
+    add_json,
+    add_sweep,
+    path_option,
+)
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
-
-TIME_LIMIT = 3600.0
-"""The default time limit of a run of a sweep, in s."""
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -30,7 +32,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
     listed = commands.add_parser("list", help="list the shipped scenarios")
-    _add_json(listed, "print names and descriptions as JSON")
+    add_json(listed, "print names and descriptions as JSON")
     shown = commands.add_parser(
         "print", help=("print a shipped scenario, as the beginning of your own")
     )
@@ -71,7 +73,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         ),
     )
     run.add_argument(
-        "--out", type=_path, help="folder for the results (default: runs/<scenario>-<time>)"
+        "--out", type=path_option, help="folder for the results (default: runs/<scenario>-<time>)"
     )
     run.add_argument(
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
@@ -97,9 +99,9 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     run.add_argument(
         "--check", action="store_true", help="exit code 2 for a run that missed its task"
     )
-    _add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
+    add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
     shown = commands.add_parser("play", help="play the animation of a run in the browser")
-    shown.add_argument("folder", type=_path, help="the folder of the run")
+    shown.add_argument("folder", type=path_option, help="the folder of the run")
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -111,9 +113,10 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
         "error",
     )
-    _add_json(examine, "print JSON")
-    _add_sweep(commands, named)
-    _add_identify(commands)
+    add_json(examine, "print JSON")
+    add_sweep(commands, named)
+    add_identify(commands)
+    add_excite(commands, named)
     _add_new(commands)
     written = commands.add_parser(
         "export",
@@ -129,9 +132,11 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     written.add_argument("--format", choices=("c", "fmu", "wasm"), default="c", help="(default: c)")
     written.add_argument(
-        "--out", type=_path, help="folder for the files (default: <scenario>_<format>, _c99 for c)"
+        "--out",
+        type=path_option,
+        help="folder for the files (default: <scenario>_<format>, _c99 for c)",
     )
-    _add_json(written, "print the names of the files as JSON")
+    add_json(written, "print the names of the files as JSON")
     film = commands.add_parser(
         "render",
         help="render a run into a GIF or a strip of pictures",
@@ -140,10 +145,12 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
             "It needs no screen and no browser."
         ),
     )
-    film.add_argument("folder", type=_path, help="the folder of a run, as runs/seven_joint_wall")
+    film.add_argument(
+        "folder", type=path_option, help="the folder of a run, as runs/seven_joint_wall"
+    )
     film.add_argument(
         "--out",
-        type=_path,
+        type=path_option,
         help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
     )
     drawn = commands.add_parser(
@@ -153,7 +160,11 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "the errors as predicted beside those measured, into one picture.",
     )
     drawn.add_argument(
-        "runs", nargs="+", type=_path, metavar="RUN", help="a folder of a run, or a record.npz"
+        "runs",
+        nargs="+",
+        type=path_option,
+        metavar="RUN",
+        help="a folder of a run, or a record.npz",
     )
     drawn.add_argument(
         "--signals",
@@ -168,7 +179,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     drawn.add_argument(
         "--out",
-        type=_path,
+        type=path_option,
         default=Path("plot.png"),
         metavar="FILE",
         help="a .png, .pdf or .svg (default: plot.png)",
@@ -209,139 +220,5 @@ def _add_new(commands: Any) -> None:
         ),
     )
     begin.add_argument(
-        "--out", type=_path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
-    )
-
-
-def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
-    study = commands.add_parser(
-        "sweep",
-        parents=[named],
-        help="run a scenario many times with other values",
-        description=(
-            "Runs a scenario once for every combination of the values of some keys, on "
-            "all cores, and writes a table with figures of each run, a summary and "
-            "plots. If it is killed, the same command continues it."
-        ),
-        epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
-        "slow: the same command tries that run again; with --check 2 if a run did not finish",
-    )
-    study.add_argument(
-        "--vary",
-        action="append",
-        required=True,
-        metavar="KEY=VALUES",
-        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
-        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
-        '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
-        '"force_feedback.seed=1..20:20"; may be repeated',
-    )
-    chosen = study.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--random",
-        type=_whole,
-        metavar="COUNT",
-        help=(
-            "number of runs with random values, uniformly distributed in their ranges, instead "
-            "of a grid"
-        ),
-    )
-    chosen.add_argument(
-        "--together",
-        action="store_true",
-        help="the first values of all keys, then the second ones, instead of a grid",
-    )
-    study.add_argument("--seed", type=_whole, default=0, help="of the random values (default: 0)")
-    study.add_argument(
-        "--rollout",
-        action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function, as `simulate "
-        "--rollout` does: many times as fast",
-    )
-    study.add_argument(
-        "--workers", type=_whole, metavar="COUNT", help="how many processes (default: one per core)"
-    )
-    study.add_argument(
-        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
-    )
-    study.add_argument(
-        "--time-limit",
-        type=_seconds,
-        default=TIME_LIMIT,
-        metavar="SECONDS",
-        help="how long a run may take by the clock, building included, until its process is ended "
-        f"and it counts as timed out (default: {TIME_LIMIT:g}; on a cluster there is none)",
-    )
-    study.add_argument("--check", action="store_true", help="exit code 2 if a run did not finish")
-    _add_json(study, "print outcomes and figures as JSON, and all else on stderr")
-    study.add_argument(
-        "--out", type=_path, help="folder for the results (default: runs/<scenario>-sweep)"
-    )
-
-
-def _add_identify(commands: Any) -> None:
-    found = commands.add_parser(
-        "identify",
-        help="find masses, friction, stiffness, places and biases from records",
-        description="Finds parameters of the plant of a scenario from records of it, with 95 % "
-        "intervals, what the records do not determine, and what is left of each measurement. The "
-        "plant alone is driven by the recorded controls; contacts stay closed or are compliant.",
-    )
-    found.add_argument(
-        "records", nargs="+", type=_path, metavar="RECORD", help="a run's folder, .npz, or a .csv"
-    )
-    found.add_argument(
-        "--free",
-        action="append",
-        required=True,
-        metavar="NAMES",
-        help="parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
-        "position.bias, force.delay and position.delay of sensors; may be repeated",
-    )
-    found.add_argument(
-        "--scenario", help="that of the plant (default: the one in the first record)"
-    )
-    found.add_argument(
-        "--set",
-        dest="settings",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="change the scenario that --scenario names; may be repeated",
-    )
-    found.add_argument(
-        "--columns",
-        type=_path,
-        metavar="FILE",
-        help='of a .csv: a YAML file with lines "column: control.joint1_motor"',
-    )
-    found.add_argument("--out", type=_path, metavar="FILE", help="a scenario with these values")
-    _add_json(found, "print the values as JSON")
-
-
-def _path(text: str) -> Path:
-    """A path of the command line; "", as from an unset variable of the shell, is refused."""
-    if not text:
-        raise argparse.ArgumentTypeError("a name is needed, got ''")
-    return Path(text)
-
-
-def _whole(text: str) -> int:
-    """A whole number of the command line; Python also reads 1_000 and digits of other alphabets."""
-    if not re.fullmatch("-?[0-9]{1,15}", text):
-        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'")
-    return int(text)
-
-
-def _seconds(text: str) -> float:
-    """A positive number of the command line."""
-    value = number_in(text)
-    if value is None or value <= 0.0:
-        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
-    return value
-
-
-def _add_json(command: argparse.ArgumentParser, what: str) -> None:
-    command.add_argument(
-        "--json", action="store_true", help=f'{what}; for an error, its text under "error"'
+        "--out", type=path_option, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
     )

@@ -30,6 +30,7 @@ from drake_dae.commands.run_folder import (
     stage,
 )
 from drake_dae.dae.timing.profile import TimeOptimalReference
+from drake_dae.diagrams.clearances import links_in_the_way
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
@@ -37,8 +38,6 @@ from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
 from drake_dae.pictures.view import start_meshcat
-from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
-from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -251,7 +250,7 @@ def _write(run: _CommandRun) -> bool:
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
-        behind = _ways(loop, record, run.context)
+        behind = links_in_the_way(loop, record, run.context)
         bound = None
         if loop.generator is not None:
             reference, state = loop.generator.reference, record["state"][0]
@@ -341,19 +340,6 @@ def _colored(job: JobVerdict) -> str:
         return text
     color = {JobOutcome.GOOD: 32, JobOutcome.BAD: 31, JobOutcome.UNDECIDED: 33}[job.outcome]
     return f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
-
-
-def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind | Collision, ...]:
-    """The links that went behind a surface in a run, and those that collided."""
-    plant = loop.plant
-    if plant.model is None:
-        return ()
-    own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
-    if "exogenous" in record.signals:
-        own[:, plant.exogenous_places] = record["exogenous"]
-    shapes, states = LinkShapes(plant.model, loop.scene_graph), record["state"]
-    behind = links_behind(plant.model, record.time, states, own, shapes)
-    return *behind, *collisions(shapes, record.time, states)
 
 
 def _as_data(run: _CommandRun, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:

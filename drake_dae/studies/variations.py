@@ -105,17 +105,36 @@ def parse_variations(
     Raises:
         ScenarioError: An option cannot be read, or its values are empty.
     """
-    data, columns = scenario_data(scenario), {}
+    columns = _columns(texts, scenario, count is not None)
+    if count is not None:
+        return random_variations(columns, count, seed)
+    return listed_variations(columns) if together else grid_variations(columns)
+
+
+def parse_ranges(texts: Sequence[str], scenario: Scenario) -> dict[str, tuple[float, float]]:
+    """The ranges that options "KEY=LOW..HIGH" of the command line name.
+
+    Raises:
+        ScenarioError: An option cannot be read, or is no range of numbers.
+    """
+    columns = _columns(texts, scenario, True)
+    for key, given in columns.items():
+        if not isinstance(given, tuple):
+            raise _wrong(key, "expected LOW..HIGH, of a key that takes any number in between")
+    return columns
+
+
+def _columns(texts: Sequence[str], scenario: Scenario, is_random: bool) -> dict[str, Any]:
+    """What options "KEY=VALUES" name."""
+    data, columns = scenario_data(scenario), dict[str, Any]()
     for text in texts:
         key, separator, given = text.partition("=")
         if not (separator and given.strip() and all(key.split("."))):
             raise _wrong(text, "expected KEY=VALUES, for example start.errors.tool.z=0..0.05:6")
         if key in columns:
             raise _wrong(key, "the key varies twice; give all its values at once")
-        columns[key] = _parse(key, given, data, count is not None)
-    if count is not None:
-        return random_variations(columns, count, seed)
-    return listed_variations(columns) if together else grid_variations(columns)
+        columns[key] = _parse(key, given, data, is_random)
+    return columns
 
 
 _NUMBER = r"([-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)"

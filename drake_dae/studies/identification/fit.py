@@ -120,6 +120,20 @@ class Fit:
                     )
         return self._fitted(slopes, chains)
 
+    def known(self, noise: Sequence[FloatArray]) -> Fitted:
+        """The information about the unknowns at the values and states to begin with.
+
+        Args:
+            noise: The deviation of each column of each record, shape (c,).
+
+        Raises:
+            ModelError: The computed motion leaves the recorded one.
+        """
+        self._noise = list(noise)
+        slopes, chains = self._chained(COUPLINGS[-1], None)
+        self._split(chains)
+        return self._fitted(slopes, chains)
+
     def _chained(
         self, coupling: float, known: Sequence[Slopes] | None
     ) -> tuple[list[Slopes], list[Chain]]:
@@ -152,12 +166,8 @@ class Fit:
 
     def _step(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> float:
         """Makes a step; returns its length in deviations of the unknowns."""
-        common = triangle(np.vstack([chain.common for chain in chains]))
+        scaled, rest = self._split(chains)
         p = self._values.size
-        scaled, rest = common[:p, :p] * self._sizes, common[:p, p]
-        _, strengths, rows = np.linalg.svd(scaled)
-        is_known = strengths > 1.0 / UNDETERMINED
-        self._parts = rows[is_known].T, rows[~is_known].T
         reduced = scaled @ self._parts[0]
         change = np.linalg.lstsq(reduced, -rest, rcond=None)[0]
         step = self._sizes * (self._parts[0] @ change)
@@ -175,6 +185,16 @@ class Fit:
             self._set_noise(index, after)
         deviations = np.linalg.norm(reduced @ change) if share == 1.0 else np.inf
         return float(deviations) / max(1.0, np.sqrt(p))
+
+    def _split(self, chains: Sequence[Chain]) -> tuple[FloatArray, FloatArray]:
+        """Finds what is determined; returns the factor of the information over sizes, and rest."""
+        common = triangle(np.vstack([chain.common for chain in chains]))
+        p = self._values.size
+        scaled, rest = common[:p, :p] * self._sizes, common[:p, p]
+        _, strengths, rows = np.linalg.svd(scaled)
+        is_known = strengths > 1.0 / UNDETERMINED
+        self._parts = rows[is_known].T, rows[~is_known].T
+        return scaled, rest
 
     def _set_noise(self, index: int, errors: FloatArray) -> None:
         """The noise of each group of columns, from their errors."""

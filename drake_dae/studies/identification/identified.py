@@ -214,6 +214,34 @@ def _digits(value: float, half: float) -> int:
     return int(np.clip(np.ceil(np.log10(abs(value) / half)) + 2, 2, 12))
 
 
+def known_covariance(
+    information: FloatArray, determined: FloatArray, undetermined: FloatArray, sizes: FloatArray
+) -> FloatArray:
+    """The covariance of the unknowns, nan for those that are not determined, shape (p, p).
+
+    Args:
+        information: F, shape (p, p).
+        determined: As of `Fitted`.
+        undetermined: As of `Fitted`.
+        sizes: The sizes of the unknowns.
+    """
+    basis = sizes[:, None] * determined
+    found: FloatArray = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
+    is_open = np.square(undetermined).sum(axis=1) > SHARE**2
+    found[is_open] = found[:, is_open] = np.nan
+    return found
+
+
+def undetermined_names(
+    undetermined: FloatArray, names: Sequence[str]
+) -> tuple[tuple[str, ...], ...]:
+    """The parameters of each direction that is not determined, by name."""
+    return tuple(
+        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE).tolist())
+        for column in undetermined.T
+    )
+
+
 def resampled(information: FloatArray, determined: FloatArray, sizes: FloatArray) -> FloatArray:
     """The deviations of the unknowns by the bootstrap, shape (p,).
 

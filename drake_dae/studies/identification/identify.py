@@ -13,11 +13,12 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.studies.identification.driven import Driven
 from drake_dae.studies.identification.fit import SMALLEST, Fit, Fitted
 from drake_dae.studies.identification.identified import (
-    SHARE,
     WHITE,
     Identified,
     Noise,
+    known_covariance,
     resampled,
+    undetermined_names,
 )
 from drake_dae.studies.identification.measured import SAME, Channel, measured, measured_ports
 from drake_dae.studies.identification.pieces import Pieces
@@ -72,13 +73,7 @@ def identify(
     if not named:
         raise ModelError("there is no record to identify parameters from")
     driven = Driven(loop, context, measured_ports(loop), unknowns.places)
-    pieces = []
-    for title, record in named.items():
-        data = measured(record, driven, title)
-        biases, delays = unknowns.of_sensors(data.channels)
-        if (delays >= 0).any():
-            _check_even(data.times, title)
-        pieces.append(Pieces(driven, data, biases, unknowns.num_sensed, delays=delays))
+    pieces = [pieces_of(record, driven, unknowns, title) for title, record in named.items()]
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
@@ -87,6 +82,19 @@ def identify(
         near = Fit([each.first(BRIEF) for each in pieces], start, sizes, lowest).run().values
     fitted = Fit(pieces, near, sizes, lowest).run()
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
+
+
+def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) -> Pieces:
+    """A record in pieces.
+
+    Raises:
+        ModelError: It does not fit the plant or the unknowns.
+    """
+    data = measured(record, driven, title)
+    biases, delays = unknowns.of_sensors(data.channels)
+    if (delays >= 0).any():
+        _check_even(data.times, title)
+    return Pieces(driven, data, biases, unknowns.num_sensed, delays=delays)
 
 
 def _check_even(times: FloatArray, title: str) -> None:
@@ -114,17 +122,11 @@ def _identified(
     fitted: Fitted,
 ) -> Identified:
     names, p = [unknown.name for unknown in unknowns.all], start.size
-    basis = sizes[:, None] * fitted.determined
-    information = fitted.information[:, :, :p].sum(axis=0)
-    covariance = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
+    parts = fitted.determined, fitted.undetermined
+    covariance = known_covariance(fitted.information[:, :, :p].sum(axis=0), *parts, sizes)
     bootstrap = resampled(fitted.information, fitted.determined, sizes)
-    is_open = np.square(fitted.undetermined).sum(axis=1) > SHARE**2
-    covariance[is_open] = covariance[:, is_open] = np.nan
-    bootstrap[is_open] = np.nan
-    undetermined = tuple(
-        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE))
-        for column in fitted.undetermined.T
-    )
+    bootstrap[np.isnan(np.diagonal(covariance))] = np.nan
+    undetermined = undetermined_names(fitted.undetermined, names)
     noise = _noise(loop, pieces, fitted)
     given = fitted.values, start, covariance, bootstrap, undetermined, noise, fitted.errors
     return Identified(unknowns.all, *given)
@@ -152,7 +154,7 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         deviation = float(np.sqrt(np.mean(np.square(np.concatenate(columns)))))
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
-        stated = _stated(loop, one_of[signal, unit])
+stated = stated_noise(loop, one_of[signal, unit])
         is_white, is_least = bool(abs(largest) < limit), deviation < least[signal, unit]
         found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
     return found
@@ -165,7 +167,7 @@ def _correlation(errors: FloatArray) -> float:
     return float(own[1:] @ own[:-1]) / power if power else 0.0
 
 
-def _stated(loop: ClosedLoop, channel: Channel) -> float | None:
+def stated_noise(loop: ClosedLoop, channel: Channel) -> float | None:
     """The deviation that a sensor is said to have."""
     if channel.signal == "measured_force" and loop.sensor is not None:
         return float(loop.sensor.noise_deviation[channel.place])

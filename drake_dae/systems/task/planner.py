@@ -239,12 +239,6 @@ def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
                 "along outputs in m"
             )
         found[names.index(name)] = rate
-    phase = task.plan.phases[index]
-    if found.any() and phase.ends_in_contact and not phase.begins_in_contact and found[place] >= 0:
-        raise ModelError(
-            f"{task.plan.where(index)}: direction: the move does not lead to the surface; give "
-            f"'{names[place]}' a component below 0"
-        )
     return found
 
 
