@@ -154,7 +154,7 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         deviation = float(np.sqrt(np.mean(np.square(np.concatenate(columns)))))
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
-stated = stated_noise(loop, one_of[signal, unit])
+        stated = stated_noise(loop, one_of[signal, unit])
         is_white, is_least = bool(abs(largest) < limit), deviation < least[signal, unit]
         found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
     return found
