@@ -87,6 +87,8 @@ def _columns(
     path: str | Path, head: Sequence[str], columns: Mapping[str, str] | None
 ) -> list[tuple[int, str, str]]:
     """Place, name and unit of the columns that are read."""
+    if len(head) == 1 and ";" in head[0]:
+        raise ModelError(f"{path} separates its columns by ';'; separate them by ','")
     parsed = [(i, *_parsed(text)) for i, text in enumerate(head)]
     if columns is not None:
         known = {name: (i, unit) for i, name, unit in parsed}

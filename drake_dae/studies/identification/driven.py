@@ -75,25 +75,35 @@ class Driven:
 
     @cached_property
     def _compiled(self) -> CompiledDiagram:
-        plant, sensor = self.loop.plant, self.loop.sensor
-        free = [plant.GetInputPort("control")]
-        if sensor is not None and sensor.HasInputPort("noise"):
-            free.append(sensor.GetInputPort("noise"))
-        return compile_open(self.loop.diagram, free, self.outputs)
+        return compile_open(
+            self.loop.diagram, [self.loop.plant.GetInputPort("control")], self.outputs
+        )
 
     @property
     def period(self) -> float:
         """The step of a discrete plant, in s; 0 for a continuous one."""
         return self.loop.plant.time_step
 
+    @cached_property
+    def lag(self) -> float:
+        """The time constant of the force sensor in s; 0 for none."""
+        return 0.0 if self.loop.sensor is None else self.loop.sensor.time_constant
+
+    @cached_property
+    def felt(self) -> slice:
+        """The states of the force sensor, which come last; empty without a lag."""
+        size = len(self.loop.sensor.bias) if self.lag and self.loop.sensor is not None else 0
+        first = int(self._compiled.sizes["held" if self.period else "state"])
+        return slice(first, first + size)
+
     @property
     def num_states(self) -> int:
-        """n."""
-        return int(self._compiled.sizes["held" if self.period else "state"])
+        """n, those of the plant and then those of a force sensor with a lag."""
+        return self.felt.stop
 
     @cached_property
     def state_of_plant(self) -> slice:
-        """Where the state of the plant stands; after it comes that of a sensor."""
+        """Where the state of the plant stands."""
         places = self._compiled.held if self.period else self._compiled.states
         return dict(places)[self.loop.plant]
 
@@ -132,13 +142,15 @@ class Driven:
 
     @cached_property
     def names(self) -> Sequence[str]:
-        """The outputs in the order of `seen`."""
-        return self._compiled.outputs
+        """The outputs in the order of `seen`; last "felt_force" of a sensor with a lag."""
+        own = ("felt_force",) if self.lag else ()
+        return (*self._compiled.outputs, *own)
 
     @cached_property
     def sizes(self) -> Sequence[int]:
         """The number of entries of each output."""
-        return [self.outputs[name].size() for name in self.names]
+        own = [self.felt.stop - self.felt.start] if self.lag else []
+        return [*(self.outputs[name].size() for name in self._compiled.outputs), *own]
 
     @cached_property
     def _symbols(self) -> list[ca.SX]:
@@ -157,8 +169,19 @@ class Driven:
         for system, name, part in compiled.fixed:
             if name == "control" and system is self.loop.plant:
                 values[part] = control
+        return self._given(time, state[: self.felt.start], values)
+
+    def _given(self, time: ca.SX, state: ca.SX, values: ca.SX) -> list[ca.SX]:
         nothing = ca.SX(0, 1)
         return [time, *((nothing, state) if self.period else (state, nothing)), values]
+
+    def _force(self, given: Sequence[ca.SX]) -> ca.SX:
+        """What a force sensor feels: the multipliers."""
+        names = list(self._compiled.outputs)
+        sizes = [self.outputs[name].size() for name in names]
+        first = sum(sizes[: names.index("constraint_force")])
+        size = self.felt.stop - self.felt.start
+        return self._compiled.row.call(list(given))[0][first : first + size]
 
     def _functions(self, value: ca.SX, valid: ca.SX) -> tuple[Many, Many]:
         """A function, and one with its derivatives with respect to state and unknown parameters."""
@@ -175,18 +198,28 @@ class Driven:
     def _moves(self) -> tuple[Many, Many]:
         """The derivative of the state, or the next state of a discrete plant."""
         compiled, given = self._compiled, self._arguments()
+        felt = self._symbols[1][self.felt]
         if not self.period:
-            return self._functions(*compiled.rate.call(given))
-        (rate,) = compiled.rates
+            rate, valid = compiled.rate.call(given)
+            if self.lag:
+                rate = ca.vertcat(rate, (self._force(given) - felt) / self.lag)
+            return self._functions(rate, valid)
+        (update,) = compiled.rates
         noise = ca.SX.zeros(compiled.sizes["noise"])
-        values, valid = rate.function.call([*given, noise])
-        state = ca.SX(self._symbols[1])
-        state[list(rate.places)] = values
+        values, valid = update.function.call([*given, noise])
+        state = ca.SX(self._symbols[1][: self.felt.start])
+        state[list(update.places)] = values
+        if self.lag:
+            # The force of a step acts on the sensor during the next one.
+            force = self._force(self._given(given[0] + self.period, state, given[-1]))
+            share = float(np.exp(-self.period / self.lag))
+            state = ca.vertcat(state, force + share * (felt - force))
         return self._functions(state, valid)
 
     @cached_property
     def _shows(self) -> tuple[Many, Many]:
-        return self._functions(*self._compiled.row.call(self._arguments()))
+        row, valid = self._compiled.row.call(self._arguments())
+        return self._functions(ca.vertcat(row, self._symbols[1][self.felt]), valid)
 
     def _called(
         self,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
@@ -37,7 +38,10 @@ UNDETERMINED = 1.0
 determined, and is left where it began."""
 
 MOST_OF_THE_WAY = 0.9
-"""So much of the distance to its bound is the longest step of an unknown."""
+"""So much of the distance to its bound is the longest step of what must stay above it."""
+
+TINY = 1e-15
+"""The least distance to a bound that SciPy can work with, in sizes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +80,20 @@ class Fit:
         start: The values at which the unknowns begin, shape (p,).
         sizes: Their sizes, shape (p,).
         lowest: Their lower bounds, -inf for none, shape (p,).
+        strict: Which must stay above these, shape (p,).
     """
 
     def __init__(
-        self, pieces: Sequence[Pieces], start: FloatArray, sizes: FloatArray, lowest: FloatArray
+        self,
+        pieces: Sequence[Pieces],
+        start: FloatArray,
+        sizes: FloatArray,
+        lowest: FloatArray,
+        strict: np.ndarray,
     ) -> None:
         self._pieces = [each.fine_enough(start) for each in pieces]
         self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
+        self._strict = strict
         self._states = [each.first_states.copy() for each in pieces]
         self._spread = [_spread(each) for each in pieces]
         self._noise = [1e-3 * spread for spread in self._spread]
@@ -168,23 +179,35 @@ class Fit:
         """Makes a step; returns its length in deviations of the unknowns."""
         scaled, rest = self._split(chains)
         p = self._values.size
-        reduced = scaled @ self._parts[0]
-        change = np.linalg.lstsq(reduced, -rest, rcond=None)[0]
-        step = self._sizes * (self._parts[0] @ change)
-        gap = MOST_OF_THE_WAY * (self._values - self._lowest)
-        down = step < 0.0
-        share = float(np.min(gap[down] / -step[down], initial=1.0))
-        self._values = self._values + share * step
+        step = self._sizes * self._over_sizes(scaled, rest)
         for index, chain in enumerate(chains):
-            states, _ = chain.states(share * step)
+            states, _ = chain.states(step)
             self._states[index] = self._states[index] + states
-            changes = np.concatenate([states, np.broadcast_to(share * step, (len(states), p))], 1)
+            changes = np.concatenate([states, np.broadcast_to(step, (len(states), p))], 1)
             after = slopes[index].errors + np.einsum(
                 "jkci,ji->jkc", slopes[index].of_errors, changes
             )
             self._set_noise(index, after)
-        deviations = np.linalg.norm(reduced @ change) if share == 1.0 else np.inf
-        return float(deviations) / max(1.0, np.sqrt(p))
+        self._values = np.maximum(self._values + step, self._lowest)
+        return float(np.linalg.norm(scaled @ (step / self._sizes))) / max(1.0, np.sqrt(p))
+
+    def _over_sizes(self, scaled: FloatArray, rest: FloatArray) -> FloatArray:
+        """The step of the unknowns over their sizes, along what is determined and above bounds.
+
+        Args:
+            scaled, rest: As `_split` returns them.
+        """
+        known, unknown = self._parts
+        found: FloatArray = known @ np.linalg.lstsq(scaled @ known, -rest, rcond=None)[0]
+        # What must stay positive comes closer to zero by nine tenths at most.
+        reach = np.where(self._strict, MOST_OF_THE_WAY, 1.0)
+        least = reach * (self._lowest - self._values) / self._sizes
+        if (found >= least).all():
+            return found
+        rows = np.vstack([scaled, unknown.T / UNDETERMINED])
+        right = np.concatenate([-rest, np.zeros(unknown.shape[1])])
+        bounded = lsq_linear(rows, right, (np.minimum(least, -TINY), np.inf), method="bvls")
+        return np.maximum(bounded.x, least)
 
     def _split(self, chains: Sequence[Chain]) -> tuple[FloatArray, FloatArray]:
         """Finds what is determined; returns the factor of the information over sizes, and rest."""

@@ -148,11 +148,20 @@ class Identified:
 
     def remarks(self) -> list[str]:
         """What is to be known about the values."""
-        found = [
-            f"The records do not determine {listed(names)[1:-1]}: they stay as they were. A motion "
-            "or a force that depends on them is needed, or fewer free parameters."
-            for names in self.undetermined
+        found = list[str]()
+        if self.undetermined:
+            names = listed((" with ".join(each) for each in self.undetermined), 20)[1:-1]
+            found.append(
+                f"Not determined by the records, and left as before: {names}. A motion or a force "
+                "that depends on them is needed, or fewer free parameters."
+            )
+        at_bound = [
+            unknown.name
+            for unknown, value in zip(self.unknowns, self.values.tolist(), strict=True)
+            if unknown.lowest is not None and value <= unknown.lowest
         ]
+        if at_bound:
+            found.append(f"At the lower bound: {listed(at_bound)[1:-1]}.")
         strong = np.abs(np.triu(self.correlations, 1)) > STRONG
         found += [
             f"{self.names[i]} and {self.names[j]} are hard to tell apart: their correlation is "
@@ -177,8 +186,9 @@ class Identified:
             )
         if any(not (noise.is_white or noise.is_least) for noise in self.noise.values()):
             found.append(
-                "Where errors are not white the intervals are too short: the model lacks something "
-                "(a free parameter, friction, a bias), or sensors round."
+                "Where errors are not white the intervals are too short, by the bootstrap less so: "
+                "the model lacks something (a free parameter, friction, a bias), the "
+                "noise of a sensor passes a filter, or it rounds."
             )
         larger = [
             name

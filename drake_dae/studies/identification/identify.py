@@ -24,6 +24,9 @@ from drake_dae.studies.identification.measured import SAME, Channel, measured, m
 from drake_dae.studies.identification.pieces import Pieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
+ROUNDED = 10.0
+"""What is left is called that of computing if it is less than so many times the least noise."""
+
 BRIEF, LONG = 2000, 4000
 """Of a record with more rows than the latter, so many are used for a first estimate."""
 
@@ -72,15 +75,17 @@ def identify(
     named = records if isinstance(records, Mapping) else _numbered(records)
     if not named:
         raise ModelError("there is no record to identify parameters from")
+    _check_differ(named)
     driven = Driven(loop, context, measured_ports(loop), unknowns.places)
     pieces = [pieces_of(record, driven, unknowns, title) for title, record in named.items()]
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
+    given = sizes, lowest, np.array([unknown.strict for unknown in unknowns.all])
     near = start
     if any(each.data.times.size > LONG for each in pieces):
-        near = Fit([each.first(BRIEF) for each in pieces], start, sizes, lowest).run().values
-    fitted = Fit(pieces, near, sizes, lowest).run()
+        near = Fit([each.first(BRIEF) for each in pieces], start, *given).run().values
+    fitted = Fit(pieces, near, *given).run()
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
 
 
@@ -95,6 +100,19 @@ def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) ->
     if (delays >= 0).any():
         _check_even(data.times, title)
     return Pieces(driven, data, biases, unknowns.num_sensed, delays=delays)
+
+
+def _check_differ(records: Mapping[str, Record]) -> None:
+    """Refuses one run under two names, whose noise would be taken for that of two."""
+    named = list(records.items())
+    for i, (title, record) in enumerate(named):
+        for before, other in named[:i]:
+            pairs = [
+                (record.time, other.time),
+                *((r.values, other[n]) for n, r in record.signals.items() if n in other.signals),
+            ]
+            if all(np.array_equal(one, two) for one, two in pairs):
+                raise ModelError(f"{before} and {title} are the same run; name it once")
 
 
 def _check_even(times: FloatArray, title: str) -> None:
@@ -155,7 +173,7 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
         stated = stated_noise(loop, one_of[signal, unit])
-        is_white, is_least = bool(abs(largest) < limit), deviation < least[signal, unit]
+        is_white, is_least = bool(abs(largest) < limit), deviation < ROUNDED * least[signal, unit]
         found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
     return found
 

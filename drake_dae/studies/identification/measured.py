@@ -18,6 +18,9 @@ from drake_dae.systems.blocks.traced import Traced
 SAME = 1e-3
 """Times that differ by less than this part of a period are one."""
 
+LARGEST = 1e9
+"""A larger number in a record is that of a run that has diverged."""
+
 FEWEST = 20
 """A record needs at least so many rows."""
 
@@ -84,14 +87,12 @@ class Measured:
 
 
 def measured_ports(loop: ClosedLoop) -> dict[str, OutputPort]:
-    """Name -> an output port of the plant, or of a sensor with a state, that a record may measure.
+    """Name -> an output port of the plant that a record may measure.
 
     With "constraint_residual", which is zero where constraints are ideal.
     """
-    plant, sensor = loop.plant, loop.sensor
+    plant = loop.plant
     found = {name: plant.GetOutputPort(name) for name in ("state", "constraint_force")}
-    if sensor is not None and sensor.time_constant and not sensor.sample_period:
-        found["measured_force"] = sensor.GetOutputPort("measured_force")
     if plant.is_ideal and plant.dae.num_constraints:
         found["constraint_residual"] = plant.GetOutputPort("constraint_residual")
     return found
@@ -113,8 +114,8 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
     loop, plant = driven.loop, driven.loop.plant
     if record.time.size < FEWEST:
         raise ModelError(
-            f"{title} has {record.time.size} rows; at least {FEWEST} are needed, and a motion that "
-            "depends on the parameters takes about a second"
+            f"{title} has {record.time.size} rows; at least {FEWEST} are needed: record a longer "
+            "motion, or rows at fixed steps or samples"
         )
     _check_steps(record, plant.time_step, title)
     columns = _columns(record, "control", plant.dae.control_signals, title)
@@ -138,28 +139,22 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
         )
     states = _first_states(record, driven, channels, values, title)
     found = Measured(record.time, acting, controls, states, np.column_stack(values), channels)
-    ends_whole = not driven.period or _is_whole(float(np.diff(record.time)[-1]), driven.period)
-    return found if ends_whole else found.first(record.time.size - 1)
-
-
-def _is_whole(duration: float, period: float) -> bool:
-    """Whether a duration is that of whole steps; that of the end of a run may not be."""
-    return abs(duration / period - round(duration / period)) <= SAME
+    steps = float(np.diff(record.time)[-1]) / driven.period if driven.period else 1.0
+    return found if abs(steps - round(steps)) <= SAME else found.first(record.time.size - 1)
 
 
 def _check_steps(record: Record, period: float, title: str) -> None:
     """Refuses a record whose rows are not those of the steps of a discrete plant."""
-    steps = np.diff(record.time)
-    if period:
-        counts = steps / period
-        wrong = np.abs(counts - np.round(counts)) > SAME
-        # A run may end within a step.
-        if wrong[:-1].any() or (counts[:-1] < 0.5).any() or np.ptp(np.round(counts[:-1])) > 0:
-            raise ModelError(
-                f"{title} has rows {steps.min():.4g} to {steps.max():.4g} s after each other, and "
-                f"the plant steps by {period:g} s: rows must come at each step, or at each second, "
-                "third, ... one"
-            )
+    if not period:
+        return
+    steps = np.diff(record.time)[:-1]  # A run may end within a step.
+    counts = np.round(steps / period)
+    if (np.abs(steps / period - counts) > SAME).any() or counts[0] < 1 or np.ptp(counts) > 0:
+        raise ModelError(
+            f"{title} has rows {steps.min():.4g} to {steps.max():.4g} s after each other, and the "
+            f"plant steps by {period:g} s: rows must come at each step, or at each second, third, "
+            "... one"
+        )
 
 
 def _acts_before(hold: System, times: FloatArray, period: float) -> np.ndarray:
@@ -207,6 +202,12 @@ def _columns(
                 f"{title}: '{name}.{signal.name}' is not a number at {record.time[row]:g} s; leave "
                 "out the rows from there on"
             )
+        if np.abs(values).max(initial=0.0) > LARGEST:
+            row = int(np.argmax(np.abs(values) > LARGEST))
+            raise ModelError(
+                f"{title}: '{name}.{signal.name}' is {values[row]:.2g} at {record.time[row]:g} s: "
+                "the run has failed there; leave out the rows shortly before and from there on"
+            )
         found[signal.name] = values
     return found
 
@@ -230,10 +231,13 @@ def _channels(
     if name not in record.signals:
         name, biases = "state", 0.0 * biases
     columns = _columns(record, name, plant.dae.state_signals, title)
+    period = loop.encoders.sensor.period if loop.encoders is not None and name != "state" else 0.0
     for place, signal in enumerate(plant.dae.state_signals):
         if signal.name in columns and is_position(signal):
             channels.append(Channel(name, signal, "state", place, float(biases[place])))
-            values.append(columns[signal.name])
+            # Between samples a record repeats the last one.
+            column = columns[signal.name]
+            values.append(_at_samples(record.time, column, period) if period else column)
     # Forces.
     sensor = loop.sensor
     is_sensed = sensor is not None and "measured_force" in record.signals
@@ -246,15 +250,24 @@ def _channels(
         column, port, bias = columns[signal.name], "constraint_force", 0.0
         if is_sensed and sensor is not None:
             bias = float(sensor.bias[place])
+            port = "felt_force" if sensor.time_constant else port
             if sensor.sample_period:
-                # A discrete plant has stepped when the sensor samples.
-                later = int(plant.time_step > 0.0)
+                # A discrete plant has stepped when the sensor samples, a lag has not.
+                later = int(plant.time_step > 0.0 and not sensor.time_constant)
                 column = _sampled(record.time, column, sensor.sample_period, later)
-            else:
-                port = "measured_force"
+            elif loop.noise is not None:
+                # It is drawn anew after each time constant, and rows between have the same one.
+                drawn = np.ceil(record.time / sensor.time_constant - SAME)
+                column = np.where(np.diff(drawn, append=np.inf) > 0.0, column, np.nan)
         channels.append(Channel(name, signal, port, place, bias))
         values.append(column)
     return channels, values
+
+
+def _at_samples(times: FloatArray, column: FloatArray, period: float) -> FloatArray:
+    """A column at the samples, and nan between them."""
+    is_sample = np.abs(times - period * np.round(times / period)) < SAME * period
+    return np.where(is_sample, column, np.nan)
 
 
 def _sampled(times: FloatArray, column: FloatArray, period: float, later: int) -> FloatArray:
@@ -293,8 +306,8 @@ def _first_states(
     for name in ("estimated_state", "measured_state", "state"):
         known |= _columns(record, name, signals, title)
     for channel, column in zip(channels, values, strict=True):
-        if channel.port == "state":
-            known[channel.entry.name] = column - channel.bias
+        if channel.port == "state" and "state" not in record.signals:
+            known[channel.entry.name] = _filled(record.time, column) - channel.bias
     missing = [s.name for s in signals if s.name not in known and is_position(s)]
     if missing:
         raise ModelError(f"{title} lacks the positions {listed(missing)}")
@@ -306,11 +319,16 @@ def _first_states(
         force = record["contact_force"]
         found[:, first + size : first + size + force.shape[1]] = force
     for channel, column in zip(channels, values, strict=True):
-        if channel.port == "measured_force":  # The state of the sensor, after that of the plant.
-            found[:, driven.num_states - len(driven.loop.sensor.bias) + channel.place] = (  # type: ignore[union-attr]
-                column - channel.bias
-            )
+        if channel.port == "felt_force":
+            place = driven.felt.start + channel.place
+            found[:, place] = _filled(record.time, column) - channel.bias
     return found
+
+
+def _filled(times: FloatArray, column: FloatArray) -> FloatArray:
+    """A column with straight lines where it has no values."""
+    known = np.isfinite(column)
+    return np.interp(times, times[known], column[known]) if known.any() else np.zeros_like(column)
 
 
 def _rates(
@@ -319,15 +337,15 @@ def _rates(
     """Differences of positions, for velocities that a record has not."""
     signals = driven.loop.plant.dae.state_signals
     positions = [signal for signal in signals if is_position(signal)]
-    lacking = [s for s in signals if s.name not in known and not is_position(s)]
+    velocities = [signal for signal in signals if not is_position(signal)]
+    lacking = [signal.name for signal in velocities if signal.name not in known]
     if not lacking:
         return {}
-    if len(positions) != len(signals) - len(positions):
+    if len(positions) != len(velocities):
         raise ModelError(
-            f"the record lacks {listed(s.name for s in lacking)}, which do not follow from the "
-            "positions by differences; record them"
+            f"the record lacks {listed(lacking)}, which do not follow from the positions by "
+            "differences; record them"
         )
-    velocities = [signal for signal in signals if not is_position(signal)]
     return {
         v.name: np.gradient(known[q.name], times)
         for q, v in zip(positions, velocities, strict=True)

@@ -54,7 +54,7 @@ def identify_scenario(
 
     Returns:
         The result, and the scenario whose plant and sensors have the values that were found, except
-        for those that are not determined, and for delays, which no sensor of a scenario has.
+        for those that are not determined, delays, and biases of sensors that it does not have.
 
     Raises:
         ModelError: As of `identify`.
@@ -84,6 +84,10 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
         if np.isfinite(deviation):
             values.setdefault(unknown.parameter, {})[unknown.entry] = float(value)
     numbers = dict(scenario.plant_parameters)
+    # No sensor of a scenario has a delay, and there may be none.
+    left_out = {FORCE_DELAY, POSITION_DELAY}
+    left_out |= set() if scenario.force_feedback.is_measured else {FORCE_BIAS}
+    left_out |= set() if scenario.encoders is not None else {POSITION_BIAS}
     for name, entries in values.items():
         all_entries = [
             entries.get(unknown.entry, float(start))
@@ -91,8 +95,8 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
             if unknown.parameter == name
         ]
         value = all_entries[0] if len(all_entries) == 1 else all_entries
-        if name in (FORCE_DELAY, POSITION_DELAY):
-            continue  # No sensor of a scenario has one.
+        if name in left_out:
+            continue
         if name in payloads:
             changes[f"plant_payloads.{payloads[name]}.mass"] = value
         elif name == FORCE_BIAS:

@@ -178,7 +178,7 @@ class Trials:
         values = unknowns.start(driven.nominal, channels)
         sizes, p = np.where(values != 0.0, np.abs(values), 1.0), values.size
         noise = np.array([self._deviation(loop, channel) for channel in channels])
-        fitted = Fit([pieces], values, sizes, np.full(p, -np.inf)).known([noise])
+        fitted = Fit([pieces], values, sizes, np.full(p, -np.inf), np.zeros(p, bool)).known([noise])
         information = fitted.information[:, :, :p].sum(axis=0)
         parts = fitted.determined, fitted.undetermined
         strengths = np.linalg.eigvalsh(sizes[:, None] * information * sizes)

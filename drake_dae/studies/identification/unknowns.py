@@ -33,6 +33,7 @@ class Unknown:
         entry: The entry.
         unit: Its unit.
         lowest: Its lower bound; None for none.
+        strict: Whether it must stay above its bound, as a mass.
         place: Its place in numeric parameter 0 of the plant; -1 for one of a sensor.
     """
 
@@ -42,6 +43,7 @@ class Unknown:
     unit: str
     lowest: float | None = None
     place: int = -1
+    strict: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,11 +148,20 @@ def _all(loop: ClosedLoop) -> list[Unknown]:
         first = plant.dae.parameter_slice(parameter.name).start
         lowest = 0.0 if parameter.positive or parameter.nonnegative else None
         found += [
-            Unknown(name, parameter.name, entry, parameter.unit, lowest, first + entry)
+            Unknown(
+                name,
+                parameter.name,
+                entry,
+                parameter.unit,
+                lowest,
+                first + entry,
+                parameter.positive,
+            )
             for entry, name in enumerate(_names(parameter.name, parameter.value.size))
         ]
     for name, (signal, place) in plant.further_parameters.items():
-        found.append(Unknown(name, name, 0, signal.unit, 0.0, place))
+        positive = name in ("plant.stiffness", "plant.radius")
+        found.append(Unknown(name, name, 0, signal.unit, 0.0, place, positive))
     for name, signals in (
         (FORCE_BIAS, plant.dae.constraint_input_signals),
         (POSITION_BIAS, plant.dae.state_signals),

@@ -329,7 +329,7 @@ WRONG_RECORDS = {
     ),
     "no positions": (lambda r: changed(r, "state", None), "lacks the positions"),
     "another motion": (
-        lambda r: changed(r, "control", lambda s: Recorded(1e9 * s.values, s.signals)),
+        lambda r: changed(r, "control", lambda s: Recorded(1e6 * s.values, s.signals)),
         "leaves the recorded one|have not come to an end",
     ),
 }
