@@ -75,9 +75,7 @@ class Excitation:
         ]
         made = f"{count_of(self.runs, 'run')} made"
         counts = [f"{kind} ({count})" for kind, count in self.refused.items()]
-        found.append(
-            f"{made}; of those refused each {', '.join(counts)}." if counts else f"{made}."
-        )
+        found.append(f"{made}; refused: {', '.join(counts)}." if counts else f"{made}.")
         found += [f"The scenario as it was is refused: {text}." for text in self.problems]
         found += [
             f"Not determined: {', '.join(names)}. Other keys must vary, or fewer be free."
