@@ -1,6 +1,7 @@
 """The values of unknowns that explain records best: Gauss-Newton on pieces in a chain."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +16,11 @@ COUPLINGS = (1e-1, 1e-3, 1e-6)
 """How tightly pieces are joined, one after the other, in deviations of what a piece says of its
 states. From 1e-5 on the results do not change any more."""
 
+FIRST_NOISE = 1e-3
+"""The least noise, relative to how much a column varies, while pieces are joined loosely."""
+
 SMALLEST = 1e-7
-"""The least noise, relative to how much a column varies."""
+"""The least noise in the end."""
 
 EXACT = 1e-9
 """The deviation of constraints at the beginnings of pieces."""
@@ -24,8 +28,9 @@ EXACT = 1e-9
 MOST = 25
 """So many steps of Gauss-Newton are made with one coupling at most."""
 
-CLOSE = 1e-2
-"""A step is the last one with a coupling if it is shorter than this part of the deviations."""
+CLOSE, NEAR = 0.03, 0.3
+"""A step is the last one with a coupling if it is shorter than the first part of the deviations;
+of `MOST` steps the last one may have the second, since contact and friction bend sharply."""
 
 SHORTER = 0.5
 """With derivatives of before, a step must be shorter than the last one by this factor."""
@@ -39,6 +44,15 @@ determined, and is left where it began."""
 
 MOST_OF_THE_WAY = 0.9
 """So much of the distance to its bound is the longest step of what must stay above it."""
+
+WORSE = 3.0
+"""Errors that a step makes larger by this factor show that it was too long."""
+
+HALVED = 6
+"""A step that is too long, or leads to where the motion has no value, is halved so often."""
+
+LONGEST = 1.0
+"""The longest step of an unknown, in its size."""
 
 TINY = 1e-15
 """The least distance to a bound that SciPy can work with, in sizes."""
@@ -96,8 +110,10 @@ class Fit:
         self._strict = strict
         self._states = [each.first_states.copy() for each in pieces]
         self._spread = [_spread(each) for each in pieces]
-        self._noise = [1e-3 * spread for spread in self._spread]
+        self._floor = FIRST_NOISE
+        self._noise = [FIRST_NOISE * spread for spread in self._spread]
         self._parts = np.eye(start.size), np.zeros((start.size, 0))
+        self._before, self._least_left = (self._values, list(self._states)), np.inf
 
     def run(self) -> Fitted:
         """Fits.
@@ -111,9 +127,12 @@ class Fit:
         """
         known: list[Slopes] | None = None
         for coupling in COUPLINGS:
-            before = np.inf
+            # Loose pieces follow noise, so that what is left says nothing of it.
+            self._floor = SMALLEST if coupling == COUPLINGS[-1] else FIRST_NOISE
+            before, self._least_left = np.inf, np.inf
             for _ in range(MOST):
-                slopes, chains = self._chained(coupling, known)
+                slopes, chains = self._shortened(coupling, known)
+                self._least_left = min(self._least_left, self._left(slopes))
                 length, is_new = self._step(slopes, chains), known is None
                 is_last = coupling == COUPLINGS[-1]
                 known = slopes if length < SHORTER * before else None
@@ -123,7 +142,7 @@ class Fit:
                         break
                     known = None
             else:
-                if is_last:
+                if is_last and length > NEAR:
                     raise ModelError(
                         f"the steps toward the best values have not come to an end after {MOST}: "
                         "the record does not fit this robot, or the values to begin with are far "
@@ -144,6 +163,30 @@ class Fit:
         slopes, chains = self._chained(COUPLINGS[-1], None)
         self._split(chains)
         return self._fitted(slopes, chains)
+
+    def _shortened(
+        self, coupling: float, known: Sequence[Slopes] | None
+    ) -> tuple[list[Slopes], list[Chain]]:
+        """`_chained` after the last step, or after a shorter one if it leads too far.
+
+        Raises:
+            ModelError: The computed motion leaves the recorded one.
+        """
+        for _ in range(HALVED):
+            with suppress(ModelError):
+                found = self._chained(coupling, known)
+                if self._left(found[0]) <= WORSE * self._least_left:
+                    return found
+            values, states = self._before
+            self._values = (values + self._values) / 2.0
+            pairs = zip(states, self._states, strict=True)
+            self._states = [(one + other) / 2.0 for one, other in pairs]
+        return self._chained(coupling, known)
+
+    def _left(self, slopes: Sequence[Slopes]) -> float:
+        """The size of all errors, relative to how much their columns vary."""
+        pairs = zip(slopes, self._spread, strict=True)
+        return max(float(np.sqrt(np.nanmean(np.square(s.errors / spread)))) for s, spread in pairs)
 
     def _chained(
         self, coupling: float, known: Sequence[Slopes] | None
@@ -180,6 +223,7 @@ class Fit:
         scaled, rest = self._split(chains)
         p = self._values.size
         step = self._sizes * self._over_sizes(scaled, rest)
+        self._before = self._values, list(self._states)
         for index, chain in enumerate(chains):
             states, _ = chain.states(step)
             self._states[index] = self._states[index] + states
@@ -202,12 +246,13 @@ class Fit:
         # What must stay positive comes closer to zero by nine tenths at most.
         reach = np.where(self._strict, MOST_OF_THE_WAY, 1.0)
         least = reach * (self._lowest - self._values) / self._sizes
+        found *= min(1.0, LONGEST / max(float(np.abs(found).max()), LONGEST))
         if (found >= least).all():
             return found
         rows = np.vstack([scaled, unknown.T / UNDETERMINED])
         right = np.concatenate([-rest, np.zeros(unknown.shape[1])])
         bounded = lsq_linear(rows, right, (np.minimum(least, -TINY), np.inf), method="bvls")
-        return np.maximum(bounded.x, least)
+        return np.clip(bounded.x, least, LONGEST)
 
     def _split(self, chains: Sequence[Chain]) -> tuple[FloatArray, FloatArray]:
         """Finds what is determined; returns the factor of the information over sizes, and rest."""
@@ -226,7 +271,7 @@ class Fit:
         for group in set(groups):
             own = [i for i, each in enumerate(groups) if each == group]
             found = float(np.sqrt(np.nanmean(np.square(errors[:, :, own]))))
-            self._noise[index][own] = np.maximum(found, SMALLEST * float(np.max(spread[own])))
+            self._noise[index][own] = np.maximum(found, self._floor * float(np.max(spread[own])))
 
     def _fitted(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> Fitted:
         p, information, errors = self._values.size, [], []

@@ -60,7 +60,7 @@ class Measured:
 
     Attributes:
         times: The times in s, shape (k,).
-        acting: u at the times, shape (k, q).
+        acting: u at the times, or just after them where the force is sampled then, shape (k, q).
         controls: The same or, of a held control, that of the step from a row to the next one.
         states: A first guess of the states, shape (k, n).
         values: The measured columns, shape (k, c); nan where there is no measurement.
@@ -137,6 +137,8 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
             f"{title} has neither positions (signal 'state' or of the encoders) nor forces "
             f"('constraint_force' or 'measured_force'); it has {listed(record.signals)}"
         )
+    if driven.hold is not None and any(each.signal == "measured_force" for each in channels):
+        acting = controls  # A sensor samples what the control makes that has just been set.
     states = _first_states(record, driven, channels, values, title)
     found = Measured(record.time, acting, controls, states, np.column_stack(values), channels)
     steps = float(np.diff(record.time)[-1]) / driven.period if driven.period else 1.0
@@ -311,9 +313,9 @@ def _first_states(
     missing = [s.name for s in signals if s.name not in known and is_position(s)]
     if missing:
         raise ModelError(f"{title} lacks the positions {listed(missing)}")
-    rates = _rates(driven, known, record.time)
+    known |= _rates(driven, known, record.time)
     for place, name in enumerate(names):
-        found[:, first + place] = known[name] if name in known else rates[name]
+        found[:, first + place] = known[name]
     size = len(signals)
     if driven.period and "contact_force" in record.signals:
         force = record["contact_force"]
@@ -328,25 +330,21 @@ def _first_states(
 def _filled(times: FloatArray, column: FloatArray) -> FloatArray:
     """A column with straight lines where it has no values."""
     known = np.isfinite(column)
-    return np.interp(times, times[known], column[known]) if known.any() else np.zeros_like(column)
+    return np.interp(times, times[known], column[known])
 
 
 def _rates(
     driven: Driven, known: Mapping[str, FloatArray], times: FloatArray
 ) -> dict[str, FloatArray]:
-    """Differences of positions, for velocities that a record has not."""
+    """Differences of positions, for velocities that a record lacks."""
     signals = driven.loop.plant.dae.state_signals
     positions = [signal for signal in signals if is_position(signal)]
     velocities = [signal for signal in signals if not is_position(signal)]
     lacking = [signal.name for signal in velocities if signal.name not in known]
-    if not lacking:
-        return {}
-    if len(positions) != len(velocities):
+    if lacking and len(positions) != len(velocities):
         raise ModelError(
             f"the record lacks {listed(lacking)}, which do not follow from the positions by "
             "differences; record them"
         )
-    return {
-        v.name: np.gradient(known[q.name], times)
-        for q, v in zip(positions, velocities, strict=True)
-    }
+    pairs = zip(positions, velocities, strict=False)
+    return {v.name: np.gradient(known[q.name], times) for q, v in pairs if v.name in lacking}

@@ -275,6 +275,52 @@ def test_a_delay_needs_even_rows():
         identify(loop, context, [Record(record.time[rows], signals)], ["force.delay"])
 
 
+SENSORS = {
+    "samples": "sample_period: 0.002",
+    "samples of a lag": "sample_period: 0.002, time_constant: 0.01",
+    "a lag": "time_constant: 0.01",
+}
+
+
+@pytest.mark.parametrize(
+    "kind", [*list(SENSORS)[:2], pytest.param("a lag", marks=pytest.mark.thorough)]
+)
+@pytest.mark.parametrize("plant", ["ideal", "compliant"])
+def test_rows_between_samples_are_no_measurements(kind, plant):
+    """Encoders and law sample each second row; a sensor of the force samples, lags, or both."""
+    noise, z = "noise_deviation: 0.3, bias: 1.0", []
+    own = ("plant=!CompliantContact {friction: 0.2}",) if plant == "compliant" else ()
+    names, truth = ["link2.mass", "force.bias"], [6.3, 1.0]
+    for seed in range(3):
+        settings = (
+            *(*WALL, *own, "sampling={period: 0.002, delay: 0.002}"),
+            f"encoders={{position_noise: 1e-5, seed: {seed}}}",
+            f"force_feedback=!MeasuredForce {{{SENSORS[kind]}, {noise}, seed: {seed + 100}}}",
+        )
+        loop, context, record = run_of((("link2.mass", 6.3),), *settings)
+        found = identify(loop, context, [record], names)
+        z.append((found.values - truth) / found.deviations)
+        assert found.noise["estimated_state"].deviation == pytest.approx(1e-5, rel=0.2)
+        assert found.noise["measured_force"].deviation == pytest.approx(0.3, rel=0.3)
+    # The sum of squares of 6 normal numbers is above 22.5 but once in 1e3.
+    assert np.square(z).sum() < 22.5
+
+
+@pytest.mark.parametrize("free", [["plant.friction"], ["plant.dissipation"], ["link2.mass"]])
+def test_what_begins_at_its_bound_stops_nothing_else(free):
+    """Friction and dissipation are zero, where noise wants them below in half of all cases."""
+    settings = (*SAMPLED, "plant=!CompliantContact {friction: 0.0}")
+    loop, context, record = run_of((("link1.mass", 12.6),), *settings)
+    names = ["link1.mass", *free, "plant.friction"][: 2 + (free[0] != "plant.friction")]
+    found = identify(loop, context, [noisy(record, 5, NOISE)], names)
+    values = dict(zip(found.names, found.values, strict=True))
+    half = dict(zip(found.names, 3.0 * found.deviations, strict=True))
+    assert abs(values["link1.mass"] - 12.6) < half["link1.mass"]
+    assert 0.0 <= values["plant.friction"] < half["plant.friction"]
+    if values["plant.friction"] == 0.0:
+        assert re.search("At the lower bound: .*plant.friction", found.text())
+
+
 def test_two_records_know_more_than_one():
     loop, context, record = run_of((("link2.mass", 6.3),), *WALL)
     records = [noisy(record, seed, NOISE) for seed in (1, 2)]
@@ -328,6 +374,10 @@ WRONG_RECORDS = {
         "neither positions .* nor forces",
     ),
     "no positions": (lambda r: changed(r, "state", None), "lacks the positions"),
+    "a run that has failed": (
+        lambda r: changed(r, "control", lambda s: Recorded(1e20 * s.values, s.signals)),
+        "the run has failed there",
+    ),
     "another motion": (
         lambda r: changed(r, "control", lambda s: Recorded(1e6 * s.values, s.signals)),
         "leaves the recorded one|have not come to an end",
@@ -371,6 +421,12 @@ def test_what_cannot_be_free_is_refused(free, message):
     loop, context, record = run_of((), *WALL)
     with pytest.raises(ModelError, match=message):
         identify(loop, context, [record], free)
+
+
+def test_a_run_under_two_names_is_refused():
+    loop, context, record = run_of((), *WALL)
+    with pytest.raises(ModelError, match="record 1 and record 2 are the same run"):
+        identify(loop, context, [record, replace(record, events=())], ["link2.mass"])
 
 
 def test_no_record_and_contacts_that_open_are_refused():

@@ -55,6 +55,14 @@ def test_the_command_finds_what_the_plant_has_and_writes_its_scenario(run, tmp_p
     assert row[-2:] == ["6", "kg"]
 
 
+def test_a_bias_of_a_sensor_that_the_scenario_does_not_have_is_told_alone(run, tmp_path, capsys):
+    out = tmp_path / "found.yaml"
+    free = ["--free", "link2.mass,force.bias,position.bias[0]", "--out", str(out)]
+    assert main(["identify", str(run), *free]) == 0
+    assert "force.bias" in capsys.readouterr().out
+    assert set(load_scenario(out).plant_parameters) == {"link2.mass"}
+
+
 def test_a_log_with_names_of_its_own_is_enough(run, log, capsys):
     arguments = ["identify", str(log), "--scenario", "two_link_wall", "--json"]
     columns = ["--columns", str(run / "columns.yaml")]
@@ -97,6 +105,7 @@ WRONG_LOGS = {
         r"no column \[t\]; it has \[time, a.b\]",
     ),
     "back in time": ("time,a.b\n1,1\n0,2\n", None, "strictly increasing"),
+    "semicolons": ("time;a.b\n0;1\n", None, "separates its columns by ';'"),
     "nothing": ("", None, "needs one column 'time'"),
 }
 
