@@ -159,6 +159,14 @@ class AdaptiveController(ParameterizedSystem, Controller):
         else:
             context.SetContinuousState(values)
 
+    def all_parameters(self, context: Context) -> FloatArray:
+        return self.law.all_parameters(self.parameters(context))
+
+    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        own = super().parameters_along(context, times)
+        gains = self.law.all_parameters()[own.shape[1] :]
+        return np.hstack([own, np.tile(gains, (own.shape[0], 1))])
+
     def check_plant(self, plant: Plant) -> None:
         super().check_plant(plant)
         if plant.contacts:
