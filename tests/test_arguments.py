@@ -101,9 +101,7 @@ def springy() -> dd.RobotModel:
 @cache
 def adaptive_law() -> dd.AdaptiveLaw:
     found = arm("two_link")
-    return dd.AdaptiveLaw(
-        found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure
-    )
+    return dd.AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
 
 
 def links_law() -> dd.TrackingLaw:
