@@ -30,11 +30,14 @@ from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
+from drake_dae.scenario.parts.parts import Adaptive
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
+from drake_dae.systems.adaptive.controller import AdaptiveController
+from drake_dae.systems.adaptive.law import AdaptiveLaw
 from drake_dae.systems.cascade.cascade import SpringCascade
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import Sampling
@@ -158,6 +161,13 @@ def build_loop(
             return wire_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
+    if isinstance(scenario.law, Adaptive):
+        with at("law"):
+            adapts = _adaptive(scenario.law, model, structure, settings.period(plant.time_step))
+            generator = ReferenceGenerator(references, law.degrees)
+            return wire_loop(
+                plant, adapts, generator, settings, scene_graph=scene_graph, meshcat=meshcat
+            )
     loop = None if scenario.law is None else scenario.law.loop()
     if loop is not None:
         with at("law"):
@@ -172,6 +182,14 @@ def build_loop(
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
         )
+
+
+def _adaptive(
+    law: Adaptive, model: RobotModel, structure: Structure, period: float
+) -> AdaptiveController:
+    """The controller of an adaptive law."""
+    given = law.parameters, law.rate, law.damping, law.force_rate
+    return AdaptiveController(AdaptiveLaw(model, *given, structure), period)
 
 
 def _cascade(

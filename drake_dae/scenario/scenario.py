@@ -10,10 +10,12 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
+from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -108,9 +110,10 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The law: the tracking law (28) of the whole robot, or for springs in the joints a
-            cascade of low degree. If left out it is the tracking law; with springs in Drake's
-            own contact and without `gains` it is the cascade.
+        law: The law: the tracking law (28) of the whole robot, for springs in the joints a cascade
+            of low degree, or with rigid joints an adaptive law that learns masses. If left out it
+            is the tracking law; with springs in Drake's own contact and without `gains` it is the
+            cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints; with Drake's own contact they are computed, see `advised`, together
             with `integral`, `constraint_damping`, `observer` and measured force if these are left
@@ -190,12 +193,34 @@ class Scenario:
     compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
+        if isinstance(self.law, parts.Adaptive):
+            self._fill_adaptive(self.law)
         if self.is_advised:
             return
         if self.gains is None:
             object.__setattr__(self, "gains", parts.Poles(all=[-4.0]))
         if self.integral is None:
             object.__setattr__(self, "integral", [])
+
+    def _fill_adaptive(self, law: parts.Adaptive) -> None:
+        """Refuses keys that an adaptive law has no use for, and sets its poles."""
+        force = self.force_feedback
+        used = {
+            "gains": self.gains is not None and self.gains != law.gains,
+            "integral": bool(self.integral),
+            "observer": self.observer is not None,
+            "constraint_damping": self.constraint_damping is not None,
+            "task": self.task is not None,
+        }
+        given = [key for key, is_given in used.items() if is_given]
+        if given:
+            raise ModelError(f"{given[0]}: an adaptive law does not use it; leave it out")
+        if force.is_measured is not (law.force_rate > 0.0) or np.any(force.gain):
+            raise ModelError(
+                "law: an adaptive law needs force_feedback: !MeasuredForce, without gain, exactly "
+                "where it has a force_rate"
+            )
+        object.__setattr__(self, "gains", law.gains)
 
     @property
     def is_cascade(self) -> bool:

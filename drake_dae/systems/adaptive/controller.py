@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState, Eve
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.gains import poles
+from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign, poles
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.adaptive.law import AdaptiveLaw
@@ -166,6 +166,10 @@ class AdaptiveController(ParameterizedSystem, Controller):
         own = super().parameters_along(context, times)
         gains = self.law.all_parameters()[own.shape[1] :]
         return np.hstack([own, np.tile(gains, (own.shape[0], 1))])
+
+    def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
+        if not np.array_equal(self.law.design(gains).matrix, self.law.gains.matrix):
+            super().set_gains(context, gains)
 
     def check_plant(self, plant: Plant) -> None:
         super().check_plant(plant)
