@@ -23,6 +23,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import Timed, timed
@@ -36,8 +37,6 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
-from drake_dae.systems.adaptive.controller import AdaptiveController
-from drake_dae.systems.adaptive.law import AdaptiveLaw
 from drake_dae.systems.cascade.cascade import SpringCascade
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import Sampling
@@ -109,6 +108,7 @@ def build_loop(
         ScenarioError: Something does not fit; the message names its key.
     """
     # The law, and its exogenous signals.
+    check_adaptive(scenario)
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
@@ -163,7 +163,8 @@ def build_loop(
             )
     if isinstance(scenario.law, Adaptive):
         with at("law"):
-            adapts = _adaptive(scenario.law, model, structure, settings.period(plant.time_step))
+            period = settings.period(plant.time_step)
+            adapts = adaptive_controller(scenario.law, model, structure, period)
             generator = ReferenceGenerator(references, law.degrees)
             return wire_loop(
                 plant, adapts, generator, settings, scene_graph=scene_graph, meshcat=meshcat
@@ -182,14 +183,6 @@ def build_loop(
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
         )
-
-
-def _adaptive(
-    law: Adaptive, model: RobotModel, structure: Structure, period: float
-) -> AdaptiveController:
-    """The controller of an adaptive law."""
-    given = law.parameters, law.rate, law.damping, law.force_rate
-    return AdaptiveController(AdaptiveLaw(model, *given, structure), period)
 
 
 def _cascade(

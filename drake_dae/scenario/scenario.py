@@ -10,12 +10,10 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
-from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -193,34 +191,14 @@ class Scenario:
     compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
-        if isinstance(self.law, parts.Adaptive):
-            self._fill_adaptive(self.law)
+        if isinstance(self.law, parts.Adaptive) and self.gains is None:
+            object.__setattr__(self, "gains", self.law.gains)
         if self.is_advised:
             return
         if self.gains is None:
             object.__setattr__(self, "gains", parts.Poles(all=[-4.0]))
         if self.integral is None:
             object.__setattr__(self, "integral", [])
-
-    def _fill_adaptive(self, law: parts.Adaptive) -> None:
-        """Refuses keys that an adaptive law has no use for, and sets its poles."""
-        force = self.force_feedback
-        used = {
-            "gains": self.gains is not None and self.gains != law.gains,
-            "integral": bool(self.integral),
-            "observer": self.observer is not None,
-            "constraint_damping": self.constraint_damping is not None,
-            "task": self.task is not None,
-        }
-        given = [key for key, is_given in used.items() if is_given]
-        if given:
-            raise ModelError(f"{given[0]}: an adaptive law does not use it; leave it out")
-        if force.is_measured is not (law.force_rate > 0.0) or np.any(force.gain):
-            raise ModelError(
-                "law: an adaptive law needs force_feedback: !MeasuredForce, without gain, exactly "
-                "where it has a force_rate"
-            )
-        object.__setattr__(self, "gains", law.gains)
 
     @property
     def is_cascade(self) -> bool:

@@ -27,16 +27,16 @@ def heavy(*settings: str, more: str = "", duration: float = 8.0):
         ((), "", 1e-7, 1e-5),
         ((SAMPLED,), "", 6e-5, 0.02),
         ((MEASURED,), ", force_rate: 10.0", 1e-7, 0.06),
-        ((DRAKE,), "", 5e-4, 0.06),
+        ((DRAKE,), "", 6e-4, 0.2),
     ],
 )
 def test_it_learns_and_tracks(settings, more, height, force):
-    """Without it the errors are 57 mm and 2.2 N; a measured force lags, compliance adds 0.4 mm."""
+    """Without it 57 mm and 2.2 N; a measured force lags, and Drake's contact adds 0.4 mm."""
     record = run_scenario(heavy(*settings, more=more))[2]
     late = np.abs(record["tracking_error"][record.time > 6.0]).max(axis=0)
     assert late[0] < height
     assert late[1] < force
-    assert record["parameter_estimate"][-1] == pytest.approx([6.6], abs=5e-3)
+    assert record["parameter_estimate"][-1] == pytest.approx([6.6], abs=0.02)
 
 
 @pytest.mark.slow
@@ -54,14 +54,15 @@ def test_a_scenario_rolls_out():
     [
         (("gains=!Poles {all: [-5.0]}",), "", "gains: an adaptive law does not use it"),
         (("integral=[tool.z]",), "", "integral: an adaptive law"),
-        ((), ", force_rate: 10.0", "needs force_feedback: !MeasuredForce"),
-        ((MEASURED,), "", "exactly where it has a force_rate"),
+        (("observer={rate: 5.0}", SAMPLED), "", "observer: an adaptive law"),
+        ((), ", force_rate: 10.0", "force_feedback: .* needs !MeasuredForce"),
+        ((MEASURED,), "", "exactly with a force_rate"),
         ((), ", rate: -1.0", "law: rate must be positive"),
     ],
 )
 def test_what_it_cannot_use_is_refused(settings, more, why):
     with pytest.raises(ScenarioError, match=why):
-        heavy(*settings, more=more)
+        build_scenario(heavy(*settings, more=more))
 
 
 def test_an_unknown_parameter_is_refused_with_the_known_ones():
