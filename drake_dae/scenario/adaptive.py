@@ -33,9 +33,7 @@ def check_adaptive(scenario: Scenario) -> None:
         if is_given
     ]
     if force.is_measured is not (law.force_rate > 0.0) or np.any(force.gain):
-        why = (
-            "an adaptive law needs !MeasuredForce, without gain, exactly where it has a force_rate"
-        )
+        why = "an adaptive law needs !MeasuredForce, without gain, exactly with a force_rate"
         problems.append(("force_feedback", why))
     if problems:
         raise ScenarioError(*problems)
