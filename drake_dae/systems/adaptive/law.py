@@ -60,7 +60,9 @@ class AdaptiveLaw:
     friction may be adapted), and the state is measured. What is not of the model (other friction, a
     drive at its limit, a compliant contact, where J s is not 0) adds a term to V', and estimates
     may drift where nothing excites them. Estimates may be unphysical on the way: the law does not
-    invert M. Sampled, the error is of the order of T, and V rises at times by the order of T^2.
+    invert M. With Coulomb friction of 0.3 on Drake's contact the tool of the seven-joint wall is
+    taken for 1.8 kg in place of 1.1, with 43 mm of error. Sampled, the error is of the order of T,
+    and V rises at times by the order of T^2.
 
     Beside a `DisturbanceObserver`: with a link 10 % heavier than known, samples of 1 ms and poles
     at -4 1/s this law leaves 0.05 mm of error, the observer 0.9 mm at 10 1/s and 0.3 mm at 50 1/s.
