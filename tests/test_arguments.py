@@ -99,6 +99,11 @@ def springy() -> dd.RobotModel:
 
 
 @cache
+def adaptive_law() -> dd.AdaptiveLaw:
+    found = arm("two_link")
+    return dd.AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
+
+
 def links_law() -> dd.TrackingLaw:
     return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
 
@@ -239,6 +244,8 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.SpringCascade: lambda: dd.SpringCascade(
         links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01
     ),
+    dd.AdaptiveLaw: adaptive_law,
+    dd.AdaptiveController: lambda: dd.AdaptiveController(adaptive_law()),
     "law of SpringCascade": links_law,
     "model of SpringCascade": springy,
     "model of link_side": springy,

@@ -23,6 +23,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import Timed, timed
@@ -30,6 +31,7 @@ from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
+from drake_dae.scenario.parts.parts import Adaptive
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -106,6 +108,7 @@ def build_loop(
         ScenarioError: Something does not fit; the message names its key.
     """
     # The law, and its exogenous signals.
+    check_adaptive(scenario)
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
@@ -157,6 +160,14 @@ def build_loop(
         with at("task"):
             return wire_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
+            )
+    if isinstance(scenario.law, Adaptive):
+        with at("law"):
+            period = settings.period(plant.time_step)
+            adapts = adaptive_controller(scenario.law, model, structure, period)
+            generator = ReferenceGenerator(references, law.degrees)
+            return wire_loop(
+                plant, adapts, generator, settings, scene_graph=scene_graph, meshcat=meshcat
             )
     loop = None if scenario.law is None else scenario.law.loop()
     if loop is not None:

@@ -108,9 +108,10 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The law: the tracking law (28) of the whole robot, or for springs in the joints a
-            cascade of low degree. If left out it is the tracking law; with springs in Drake's
-            own contact and without `gains` it is the cascade.
+        law: The law: the tracking law (28) of the whole robot, for springs in the joints a cascade
+            of low degree, or with rigid joints an adaptive law that learns masses. If left out it
+            is the tracking law; with springs in Drake's own contact and without `gains` it is the
+            cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints; with Drake's own contact they are computed, see `advised`, together
             with `integral`, `constraint_damping`, `observer` and measured force if these are left
@@ -190,6 +191,8 @@ class Scenario:
     compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
+        if isinstance(self.law, parts.Adaptive) and self.gains is None:
+            object.__setattr__(self, "gains", self.law.gains)
         if self.is_advised:
             return
         if self.gains is None:

@@ -90,7 +90,7 @@ Reference = Annotated[
 Load = Annotated[known_forces.KnownForce, Form(_WRITTEN)]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascade, Choice()]
+Law = Annotated[parts.Tracking | parts.SpringCascade | parts.Adaptive, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     plants.IdealConstraints

@@ -1,10 +1,12 @@
 """Parts of a scenario without a class in the library: force feedback, gains, start."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pydrake.systems.framework import Context
 
+from drake_dae.arrays import positive
 from drake_dae.dae.beyond.spring_loop import DAMPING, SpringLoop
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
@@ -70,6 +72,48 @@ class Tracking:
     """The tracking law (28) of the whole robot: four derivatives of the model behind springs."""
 
     is_cascade: ClassVar = False
+
+    def loop(self) -> SpringLoop | None:
+        """None: there is no loop around springs."""
+        return None
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """A law that learns parameters which enter linearly, such as masses, while it tracks.
+
+    It is a `systems.adaptive.AdaptiveLaw`, for rigid joints and contacts that stay closed. `gains`,
+    `integral`, `observer` and `constraint_damping` are left out. With `sampling` its estimates are
+    sampled too.
+
+    Attributes:
+        parameters: Name of a parameter, as in `plant_parameters` -> how fast it is learned: its
+            entry of Gamma, in its unit squared per J. It starts at the law's own value.
+        rate: The rate in 1/s at which errors of positions decay.
+        damping: The rate in 1/s at which the motion comes to such a decay.
+        force_rate: The rate in 1/s at which the error of a measured force decays, with
+            `force_feedback`; 0 without.
+    """
+
+    parameters: Mapping[str, float]
+    rate: float = 4.0
+    damping: float = 8.0
+    force_rate: float = 0.0
+    is_cascade: ClassVar = False
+
+    def __post_init__(self) -> None:
+        if not self.parameters:
+            raise ModelError("parameters: name at least one, such as {link2.mass: 2.0}")
+        for name, value in (*self.parameters.items(), ("rate", self.rate)):
+            positive(name, value)
+        positive("damping", self.damping)
+        if self.force_rate:
+            positive("force_rate", self.force_rate)
+
+    @property
+    def gains(self) -> "Poles":
+        """The poles that the errors of positions have when the parameters are learned."""
+        return Poles(all=[-self.rate])
 
     def loop(self) -> SpringLoop | None:
         """None: there is no loop around springs."""

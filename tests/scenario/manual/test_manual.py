@@ -46,6 +46,7 @@ PURE = {
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),
     ("!SpringCascade", "damping"),
+    ("!Adaptive", "parameters"),  # In the unit of each, squared, per J.
     ("!MeasuredForce", "gain"),
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),

@@ -11,6 +11,8 @@ from problems import PROBLEMS
 from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
+    AdaptiveController,
+    AdaptiveLaw,
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
@@ -113,6 +115,13 @@ def observer_behind_springs():
     return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
 
 
+def adaptive(force_rate, period):
+    found = arm("two_link")
+    masses = {"link1.mass": 3.0, "link2.mass": 2.0}
+    own = AdaptiveLaw(found.model, masses, 4.0, 8.0, force_rate, structure=found.structure)
+    return AdaptiveController(own, period)
+
+
 def torque_loop(kind):
     model = actuated("two_link", kind).model
     links = link_side(model).dae
@@ -169,6 +178,9 @@ BLOCKS = {
     "SpringView": lambda: SpringView(actuated("two_link", "flexible").model),
     "TorqueLoop": lambda: torque_loop("flexible"),
     "TorqueLoop before motors": lambda: torque_loop("flexible motor"),
+    "AdaptiveController": lambda: adaptive(0.0, 0.0),
+    "AdaptiveController of a measured force": lambda: adaptive(5.0, 0.0),
+    "AdaptiveController with samples": lambda: adaptive(5.0, 0.01),
     "UnilateralRobotPlant": lambda: opening(None),
     "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),

@@ -1,0 +1,86 @@
+"""The key `law: !Adaptive` of a scenario."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from runs import run_scenario, scenario
+
+from drake_dae import build_scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.rolled import roll_scenario
+
+LAW = "law=!Adaptive {{parameters: {{link2.mass: 2.0}}{}}}"
+HEAVY = "plant_parameters={link2.mass: 6.6}"
+MEASURED = "force_feedback=!MeasuredForce {time_constant: 0.005}"
+SAMPLED = "sampling={period: 1.0e-3}"
+DRAKE = "plant=!CompliantContact {time_step: 0.001}"
+
+
+def heavy(*settings: str, more: str = "", duration: float = 8.0):
+    return scenario("two_link_wall", f"duration={duration}", HEAVY, LAW.format(more), *settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "more", "height", "force"),
+    [
+        ((), "", 1e-7, 1e-5),
+        ((SAMPLED,), "", 6e-5, 0.02),
+        ((MEASURED,), ", force_rate: 10.0", 1e-7, 0.06),
+        ((DRAKE,), "", 6e-4, 0.2),
+    ],
+)
+def test_it_learns_and_tracks(settings, more, height, force):
+    """Without it 57 mm and 2.2 N; a measured force lags, and Drake's contact adds 0.4 mm."""
+    record = run_scenario(heavy(*settings, more=more))[2]
+    late = np.abs(record["tracking_error"][record.time > 6.0]).max(axis=0)
+    assert late[0] < height
+    assert late[1] < force
+    assert record["parameter_estimate"][-1] == pytest.approx([6.6], abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "positions", "force"),
+    [((), 1e-8, 1e-6), (("plant=!CompliantContact {time_step: 0.001, friction: 0.0}",), 2e-4, 0.1)],
+)
+def test_seven_joints_with_a_tool_half_as_heavy_again(settings, positions, force):
+    """Without it 56 mm and 5.5 N, on the ideal wall and on Drake's."""
+    tool = "plant_parameters={tool.mass: 1.1}", "law=!Adaptive {parameters: {tool.mass: 2.0}}"
+    record = run_scenario(scenario("seven_joint_wall", "duration=8.0", *tool, *settings))[2]
+    late = np.abs(record["tracking_error"][record.time > 6.0]).max(axis=0)
+    assert late[:-1].max() < positions
+    assert late[-1] < force
+    assert record["parameter_estimate"][-1] == pytest.approx([1.1], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_scenario_rolls_out():
+    chosen = heavy(SAMPLED, duration=0.2)
+    _, _, expected = run_scenario(chosen)
+    loop, context = build_scenario(chosen)
+    rolled = roll_scenario(chosen, loop, context)
+    assert rolled.failure is None
+    assert_allclose(rolled.record["state"][-1], expected["state"][-1], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("settings", "more", "why"),
+    [
+        (("gains=!Poles {all: [-5.0]}",), "", "gains: an adaptive law does not use it"),
+        (("integral=[tool.z]",), "", "integral: an adaptive law"),
+        (("observer={rate: 5.0}", SAMPLED), "", "observer: an adaptive law"),
+        ((), ", force_rate: 10.0", "force_feedback: .* needs !MeasuredForce"),
+        ((MEASURED,), "", "exactly with a force_rate"),
+        ((), ", rate: -1.0", "law: rate must be positive"),
+    ],
+)
+def test_what_it_cannot_use_is_refused(settings, more, why):
+    with pytest.raises(ScenarioError, match=why):
+        build_scenario(heavy(*settings, more=more))
+
+
+def test_an_unknown_parameter_is_refused_with_the_known_ones():
+    chosen = scenario("two_link_wall", "law=!Adaptive {parameters: {link9.mass: 1.0}}")
+    with pytest.raises(ScenarioError, match=r"law: .* no parameter 'link9.mass'; it has \[link1"):
+        build_scenario(chosen)
