@@ -25,7 +25,7 @@ GRACE = 0.1
 
 
 _MOST_TOLD = 3
-"""So many failures of phases, the last ones, are told of a task that was done."""
+"""The number of failed phases, the last ones, that the verdict of a finished task names."""
 
 
 class JobOutcome(Enum):

@@ -154,7 +154,7 @@ def test_the_shipped_task_tells_its_story(tmp_path, capsys):
     assert found["phases"][1]["reason"] == (
         "feel has moved 0.015 m without a force of 2 N, retry 1 of 2"
     )
-    # At constant speed but for the begin, half of whose time it loses; samples of 1 ms.
+    # The speed is constant after a ramp, which costs half of its time; samples of 1 ms.
     assert_allclose(found["phases"][1]["time"], 0.015 / 0.03 + 0.1, atol=1.1e-3)
     assert_allclose(found["phases"][2]["time"], 0.028 / 0.03 + 0.1, atol=3e-3)
     record = Record.load(tmp_path / "run" / "record.npz")

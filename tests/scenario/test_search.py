@@ -30,8 +30,8 @@ task:
   phases:
   - !Press {force: 5, over: 0.1}
   - !Search
-    {outputs: tool.yz, radius: 0.006, depth: 0.0015, speed: 0.04, over: 0.1, on_failure: leave}
-  - !Dwell {duration: 0.05}
+    {outputs: tool.yz, radius: 0.006, depth: 0.0015, speed: 0.04, over: 0.1, on_failure: leave,
+     on_success: stop}
 start: {positions: {joint2: -0.1938, joint4: -1.936, joint6: 0.559}}
 duration: 3.2
 integrator: {integration_scheme: runge_kutta3, max_step_size: 0.002, use_error_control: false}
@@ -54,8 +54,8 @@ def test_a_search_ends_where_the_tool_falls_or_with_its_spiral(depth, tmp_path):
     row = np.searchsorted(record.time, ended)
     place = record["controlled_output"][row, :2]
     if depth:
-        # At rest in a dimple that its law does not know the tool may lose the contact.
-        assert names[:4] == ["Press", "Search", "Dwell", "done"]
+        assert names == ["Press", "Search", "held"]
+        assert (changes[2].chosen, changes[2].failed) == ("stop", False)
         assert changes[2].reason == "after a fall of 0.0015 m"
         assert np.linalg.norm(place - [0.002, 0.603]) < 0.003
         return

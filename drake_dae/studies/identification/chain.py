@@ -20,7 +20,8 @@ class Chain:
         (f_j dz_j + g_j dtheta + d_j - dz_(j+1)) / s    between one and the next.
 
     States are eliminated one after the other by orthogonal transformations, as in a square root
-    information filter: unstable motions do not spoil it, nor do states that nothing is known about.
+    information filter. This remains accurate for unstable motions, and for states without any
+    measurement.
 
     Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 6.
 

@@ -268,5 +268,6 @@ def resampled(information: FloatArray, determined: FloatArray, sizes: FloatArray
     left = np.einsum("ia,kij,jb->kab", basis, sums[:, :, :p], basis)
     right = np.einsum("ia,ki->ka", basis, sums[:, :, p])
     # A draw may leave out the only pieces that determine something.
-    changes = np.array([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(left, right)])  # noqa: B905
+    pairs = zip(left, right, strict=True)
+    changes = np.array([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in pairs])
     return np.std(changes @ basis.T, axis=0)

@@ -282,6 +282,35 @@ SENSORS = {
 }
 
 
+@pytest.mark.parametrize("kind", SENSORS)
+@pytest.mark.parametrize("plant", ["ideal", "compliant"])
+def test_what_sensors_do_to_a_force_is_known_exactly(kind, plant):
+    """Without noise a sample one row off, or the control of the step before, shows in the bias."""
+    own = ("plant=!CompliantContact {friction: 0.2}",) if plant == "compliant" else ()
+    settings = (
+        *(*WALL, *own, "sampling={period: 0.002, delay: 0.002}"),
+        f"force_feedback=!MeasuredForce {{{SENSORS[kind]}, bias: 1.0}}",
+    )
+    loop, context, record = run_of((("link2.mass", 6.3),), *settings)
+    found = identify(loop, context, [record], ["link2.mass", "force.bias"])
+    # Third-order steps of the run and fourth-order ones here differ by 1e-5 N in a lag of 10 ms.
+    assert found["link2.mass"] == pytest.approx(6.3, rel=1e-6)
+    assert found["force.bias"] == pytest.approx(1.0, abs=1e-4)
+    assert found.noise["measured_force"].deviation < 1e-4
+
+
+def test_a_hold_may_act_just_before_the_step_of_its_instant():
+    """At 0.501 s the times of a sample and of a step differ by the last bit; see `events_of`."""
+    times = np.array([1002 * 0.0005, 501 * 0.001])
+    assert times[0] == times[1]
+    settings = (WALL[0], "duration=0.6", *FIXED, "sampling={period: 0.001, delay: 0.001}")
+    own = "plant=!CompliantContact {friction: 0.2, time_step: 0.0005}"
+    loop, context, record = run_of((("link2.mass", 6.3),), *settings, own)
+    found = identify(loop, context, [record], ["link2.mass"])
+    assert found.noise["state"].deviation < 1e-9
+    assert found["link2.mass"] == pytest.approx(6.3, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     "kind", [*list(SENSORS)[:2], pytest.param("a lag", marks=pytest.mark.thorough)]
 )

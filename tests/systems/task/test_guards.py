@@ -154,7 +154,7 @@ def test_a_run_that_is_interrupted_goes_on_as_one_that_is_not(tmp_path):
 
 
 def test_a_phase_of_a_users_own_has_all_that_the_others_have():
-    """It goes up at 0.05 m/s, but for half of the ramp, until its guard has 20 mm."""
+    """It goes up at 0.05 m/s after a ramp, which costs half its time, until a guard at 20 mm."""
     rise = Rise(5.0, over=0.1, guards=[PhaseGuard("travel", 0.02)], on_failure="hold")
     loop, context, changes = ended([rise], FAR, 0.6)
     assert [change.phase for change in changes] == ["Rise", "held"]

@@ -23,6 +23,9 @@ class Search(Phase):
     spiral ends. A surface that is tilted against the model falls, too: the depth has to be more
     than the radius times the tilt.
 
+    The law's model has no hole. A tool that presses on in a steep one may be pushed out of it (in a
+    dimple 4 mm deep and 3 mm wide after 0.5 s), so let a Release, "leave" or "stop" follow.
+
     Attributes:
         outputs: The two outputs along the surface, in m: "tool.yz" for example.
         radius: The radius at which the search ends, in m.
