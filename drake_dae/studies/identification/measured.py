@@ -127,8 +127,7 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
         )
     controls = np.column_stack([columns[s.name] for s in plant.dae.control_signals])
     acting, after = controls, np.vstack([controls[1:], controls[-1:]])
-    if driven.hold is not None:
-        # A row of a continuous plant has the control of the step that led to it.
+    if driven.hold is not None:  # A row of a continuous plant has what led to it.
         is_after = _acts_before(driven.hold, record.time, driven.period) | (not driven.period)
         controls = np.where(is_after[:, None], after, acting)
     channels, values = _channels(record, loop, title)
@@ -141,8 +140,10 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
         acting = controls  # A sensor samples what the control makes that has just been set.
     states = _first_states(record, driven, channels, values, title)
     found = Measured(record.time, acting, controls, states, np.column_stack(values), channels)
+    # The last row has the control and the sample of its instant, others those before it.
     steps = float(np.diff(record.time)[-1]) / driven.period if driven.period else 1.0
-    return found if abs(steps - round(steps)) <= SAME else found.first(record.time.size - 1)
+    is_last = abs(steps - round(steps)) > SAME or (driven.hold is not None and not driven.period)
+    return found.first(record.time.size - 1) if is_last else found
 
 
 def _check_steps(record: Record, period: float, title: str) -> None:
@@ -251,8 +252,7 @@ def _channels(
             continue
         column, port, bias = columns[signal.name], "constraint_force", 0.0
         if is_sensed and sensor is not None:
-            bias = float(sensor.bias[place])
-            port = "felt_force" if sensor.time_constant else port
+            bias, port = float(sensor.bias[place]), "felt_force" if sensor.time_constant else port
             if sensor.sample_period:
                 # A discrete plant has stepped when the sensor samples, a lag has not.
                 later = int(plant.time_step > 0.0 and not sensor.time_constant)
@@ -288,7 +288,8 @@ def _sampled(times: FloatArray, column: FloatArray, period: float, later: int) -
     rows = np.searchsorted(times, taken - SAME * period)
     is_there = np.abs(times[np.minimum(rows, times.size - 1)] - taken) < SAME * period
     good = is_there & (rows + later < times.size)
-    found[rows[good] + later] = column[good]
+    # Of the rows with one sample the first one: the last row of a record may have the next.
+    found[rows[good][::-1] + later] = column[good][::-1]
     return found
 
 
@@ -303,7 +304,6 @@ def _first_states(
     plant = driven.loop.plant
     found = np.zeros((record.time.size, driven.num_states))
     signals, first = plant.dae.state_signals, driven.state_of_plant.start
-    names = [signal.name for signal in signals]
     known = dict[str, FloatArray]()
     for name in ("estimated_state", "measured_state", "state"):
         known |= _columns(record, name, signals, title)
@@ -314,16 +314,16 @@ def _first_states(
     if missing:
         raise ModelError(f"{title} lacks the positions {listed(missing)}")
     known |= _rates(driven, known, record.time)
-    for place, name in enumerate(names):
-        found[:, first + place] = known[name]
+    for place, signal in enumerate(signals):
+        found[:, first + place] = known[signal.name]
     size = len(signals)
     if driven.period and "contact_force" in record.signals:
         force = record["contact_force"]
         found[:, first + size : first + size + force.shape[1]] = force
     for channel, column in zip(channels, values, strict=True):
         if channel.port == "felt_force":
-            place = driven.felt.start + channel.place
-            found[:, place] = _filled(record.time, column) - channel.bias
+            felt = _filled(record.time, column) - channel.bias
+            found[:, driven.felt.start + channel.place] = felt
     return found
 
 
