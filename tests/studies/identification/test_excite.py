@@ -99,6 +99,7 @@ def test_promised_deviations_are_those_of_the_closed_form(slider):
     assert found.before.deviations[0] == pytest.approx(closed_form(0.1, 2.0), rel=1e-4)
     after = closed_form(*found.choice.values())
     assert found.after.deviations[0] == pytest.approx(after, rel=1e-4)
+    assert found.after.halves[0] == pytest.approx(1.96 * after, rel=1e-4)
     assert found.after.d_size == pytest.approx(after / MASS, rel=1e-4)
     assert found.after.a_size == pytest.approx(after / MASS, rel=1e-4)
     # Better than random choices, and about the best that the speed allows.

@@ -25,6 +25,8 @@ from drake_dae import (
 )
 from drake_dae.errors import SimulationError
 from drake_dae.simulation.records.phases import phase_spans
+from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.phases.tally import Tally
 
 PERIOD = 0.003
 PRESS = Press(10.0, over=0.05)
@@ -190,3 +192,15 @@ def test_a_task_that_is_done_in_contact_stays_there(phases):
     assert (last.phase in ("done", "held"), last.in_contact, last.failed) == (True, True, False)
     record = loop.record(context)
     assert_allclose(record["constraint_force"][-1, 0], last.force, atol=1e-3)
+
+
+def test_a_guard_counts_consecutive_samples():
+    """A force above its limit in every second sample, as of noise, never trips a guard of two."""
+    phase = Dwell(1.0, guards=[PhaseGuard("force", 10.0, samples=2)])
+    tally, margins = Tally([phase], 1e-3), []
+    counted = [0.0] * tally.size
+    for force in (11.0, 9.0, 11.0, 9.0, 11.0, 12.0):
+        now = Moment(0.1, force, 0.0, 0.0, 5.0)
+        margins.append(float(tally.margins(phase, counted, now)[0]))
+        counted = [float(one) for one in tally.after(phase, counted, now)]
+    assert [margin <= 0.0 for margin in margins] == [False, False, False, False, False, True]
