@@ -4,6 +4,7 @@ import ast
 import contextlib
 import io
 import re
+import sys
 from collections import defaultdict
 from pathlib import Path
 from unittest.mock import patch
@@ -14,6 +15,7 @@ from drake_dae.commands.options import parse_options
 from drake_dae.scenario.manual.page import keys_page
 
 ROOT = BOOK.parents[1]
+sys.path.append(str(ROOT / "tests" / "support"))
 
 TOPICS = {
     "dae": "Systems, laws and theory",
@@ -39,6 +41,7 @@ def generated_pages() -> dict[str, str]:
         "reference/names.md": names_page(),
         "reference/keys.md": keys_page(),
         "reference/commands.md": commands_page(),
+        "reference/equations.md": equations_page(),
     }
 
 
@@ -119,3 +122,11 @@ def _help(arguments: list[str]) -> str:
     ):
         parse_options([*arguments, "--help"])
     return printed.getvalue()
+
+
+def equations_page() -> str:
+    """Where each equation of the paper is computed, and which test proves it."""
+    from equations import table
+
+    head = "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the test "
+    return f"{head}that proves it. `make equations` prints the same.\n\n{table()}\n"
