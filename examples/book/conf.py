@@ -50,7 +50,7 @@ _SECTION = re.compile(r"\s*(Args|Attributes|Raises|Returns|Yields|Warns):$")
 
 
 def _plain_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text: what is indented after a colon, as ports and equations, stays so."""
+    """Docstrings are plain text: what is indented, as ports and equations, stays so."""
     found: list[str] = []
     indent = -1  # Of the line that a literal block follows; -1 outside of one, -2 in a section.
     for i, line in enumerate(lines):

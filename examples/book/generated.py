@@ -128,5 +128,7 @@ def equations_page() -> str:
     """Where each equation of the paper is computed, and which test proves it."""
     from equations import table
 
-    head = "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the test "
-    return f"{head}that proves it. `make equations` prints the same.\n\n{table()}\n"
+    return (
+        "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the "
+        f"test that proves it. `make equations` prints the same.\n\n{table()}\n"
+    )

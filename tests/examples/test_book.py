@@ -80,7 +80,8 @@ def test_block_that_fails_is_named_by_its_line(text, line, tmp_path, monkeypatch
 def test_files_commands_and_code_share_a_folder(tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text(
-        "# T\n\n```yaml\n# one.yaml\nvalue: 3\n```\n\n```console\n$ cat one.yaml | wc -l\n1\n```\n\n"
+        "# T\n\n```yaml\n# one.yaml\nvalue: 3\n```\n\n"
+        "```console\n$ cat one.yaml | wc -l\n1\n```\n\n"
         "```python\nfrom pathlib import Path\nprint(Path('one.yaml').read_text())\n```\n\n"
         "```text\nvalue: 3\n```\n",
         "utf-8",
