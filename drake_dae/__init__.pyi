@@ -64,7 +64,7 @@ from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
 from .pictures.film import save_film as save_film
-from .pictures.view import start_meshcat as start_meshcat
+from .pictures.scene.view import start_meshcat as start_meshcat
 from .robots.actuation.dc_motors import DcMotors as DcMotors
 from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos

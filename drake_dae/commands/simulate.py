@@ -34,10 +34,12 @@ from drake_dae.diagrams.clearances import links_in_the_way
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
+from drake_dae.pictures.moments import moments_of, ordered
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
-from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
-from drake_dae.pictures.view import start_meshcat
+from drake_dae.pictures.scene.friction import slips
+from drake_dae.pictures.scene.run_motion import RunMotion, contact_paths, follow
+from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -302,18 +304,22 @@ def _write(run: _CommandRun) -> bool:
         course: RunMotion | None = None
         if run.pictures and (write.plots or write.animation) and model is not None:
             course = follow(loop, record, run.context)
+        moments = moments_of(record, limits)
+        if course is not None:
+            moments = ordered(record, [*moments, *slips(course)])
         if write.plots and run.pictures:
             paths = contact_paths(course) if course is not None else []
             plots = [name for name in PLOTS if paths or name != PATHS]
             with _collected(problems), stage(folder, *plots) as place, _frozen():
-                save_plots(record, predicted, limits.control, place, paths, accuracy)
+                save_plots(record, predicted, limits.control, place, paths, accuracy, moments)
             for one in loop.generator.references if loop.generator is not None else ():
                 if isinstance(one, TimeOptimalReference):
                     with _collected(problems), stage(folder, PROFILE) as place:
                         save_profile(one.profile, place)
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as place:
-                page = animate(course, loop.scene_graph, run.title, phase_spans(record))
+                spans = phase_spans(record)
+                page = animate(course, loop.scene_graph, run.title, spans, moments)
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]

@@ -13,6 +13,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.pictures.axes import decades, grid, labelled, legend, round_off
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
+from drake_dae.pictures.moments import moments_of
 from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first figure.
@@ -73,7 +74,8 @@ def plot_runs(
                 text = f"the run '{label}' has no {course.group} '{course.signal.name}'"
                 raise ModelError(f"{text} in {course.signal.unit or '1'}")
     single = first if not others else None
-    marks = () if single is None else mark_labels(single)
+    moments = [] if single is None else moments_of(single)
+    marks = () if single is None else mark_labels(single, moments)
     figure, axes = grid(
         [
             labelled(Signal(f"|error of {one.signal.name}|", one.signal.unit))
@@ -87,7 +89,7 @@ def plot_runs(
     for axis, course in zip(axes, chosen, strict=True):
         draw(axis, records, course)
     if single is not None:
-        mark_events(axes, single)
+        mark_events(axes, single, moments)
         mark_phases(figure, single)
     legend(figure, axes[0])
     return figure

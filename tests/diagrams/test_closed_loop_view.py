@@ -35,10 +35,10 @@ from drake_dae import (
     start_meshcat,
 )
 from drake_dae.errors import ModelError
-from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
-from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
-from drake_dae.pictures.surroundings import scene_extent
-from drake_dae.pictures.view import FRAME_RATE, draw_scene
+from drake_dae.pictures.scene.arrows import ForceArrows, GrowingPaths
+from drake_dae.pictures.scene.run_motion import contact_paths, follow, frame_times
+from drake_dae.pictures.scene.surroundings import scene_extent
+from drake_dae.pictures.scene.view import FRAME_RATE, draw_scene
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.surfaces import surfaces
 from drake_dae.robots.surfaces.surface import tangents
@@ -127,7 +127,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
         np.testing.assert_allclose(rotation(quaternion)[:, 2], normal, atol=1e-3)
     for values in scale.values.T:
         np.testing.assert_allclose(values, force / np.max(force), rtol=1e-6)
-    # The longest arrow is a fifth of the scene, all of it on the free side, from the contact on.
+    # The longest arrow is a fifth of the scene; it ends at the contact, not on the tool.
     things, places = objects(page), transforms(page)
     shaft = things[f"{path}/arrow/shaft"]["geometries"][0]
     head = things[f"{path}/arrow/head"]["geometries"][0]
@@ -136,9 +136,9 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     _, size = scene_extent(model, ConstraintWrenches(model), nominal, loop.scene_graph)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
-    assert middle - shaft["height"] / 2 == pytest.approx(0.0, abs=1e-9)
+    assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
     tip = places[f"{path}/arrow/head"][2, 3]
-    assert tip == pytest.approx(shaft["height"] + head["height"], rel=1e-6)
+    assert tip == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -124,6 +124,14 @@ class Plant(System):
         """All parameters as `parameters`, with exogenous ones at the context's time."""
         return self.parameters(context)
 
+    def friction(self, context: Context) -> dict[str, float]:
+        """Name of a constraint -> its coefficient of friction, of those that have one."""
+        values, found = self.parameters(context), dict[str, float]()
+        for constraint in self.model.constraints if self.model is not None else ():
+            if (name := constraint.friction_parameter) is not None:
+                found[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
+        return found
+
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         """The parameters at the times of a run, in s, one row for each."""
         return np.tile(self.parameters(context), (np.size(times), 1))

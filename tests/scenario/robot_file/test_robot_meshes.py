@@ -11,7 +11,7 @@ from vendors import COLLADA, binary_stl, write_panda, write_ur5
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
-from drake_dae.pictures.view import start_meshcat
+from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 

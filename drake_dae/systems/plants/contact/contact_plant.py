@@ -266,6 +266,12 @@ class ContactPlant(Diagram, Plant):
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         return {"contact_force": self.contact_force_signals}
 
+    def friction(self, context: Context) -> dict[str, float]:
+        given = self.material.friction
+        own = super().friction(context)
+        names = [constraint.name for constraint in self.model.constraints]
+        return own if given is None else dict.fromkeys(names, given)
+
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         contact = builder.AddSystem(ContactVisualizer(meshcat))
         for name in ("contact_results", "query_object"):
