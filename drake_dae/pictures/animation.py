@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
+from drake_dae.pictures.inline import InlinePage
 from drake_dae.pictures.moments import Kind, Moment, moments_of, ordered
 from drake_dae.pictures.scene.arrows import (
     FORCE_COLOR,
@@ -70,18 +71,10 @@ _SIDES = 6
 _OVERLAY = Path(__file__).with_name("overlay.html")
 
 
-class AnimationPage(str):
-    """The HTML page of an animation, as text; a notebook shows it in its place."""
-
-    def _repr_html_(self) -> str:
-        page = html.escape(str(self), quote=True)
-        return f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0"></iframe>'
-
-
 @checked(ModelError)
 def make_animation(
     loop: ShownLoop, record: Record, context: Context, title: str = ""
-) -> AnimationPage:
+) -> InlinePage:
     """Replays a record of a robot in Meshcat, with the paths of its constrained points.
 
     The page shows the clock and the size of each constraint force at its arrow, draws the actual
@@ -113,7 +106,7 @@ def animate(
     title: str = "",
     phases: Sequence[PhaseSpan] = (),
     moments: Sequence[Moment] = (),
-) -> AnimationPage:
+) -> InlinePage:
     """The page of `make_animation`.
 
     Args:
@@ -182,7 +175,7 @@ def animate(
         "phases": [[span.begin, span.name] for span in phases],
         "moments": [[one.time, one.kind.color, one.text] for one in moments],
     }
-    return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, said))
+    return InlinePage(_with_overlay(meshcat.StaticHtml(), course, said))
 
 
 def _legend(

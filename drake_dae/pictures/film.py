@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,13 +59,19 @@ if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.figure import Figure
 
 RATE = 10.0
-"""Pictures per second of a film."""
+"""Pictures per second of a .gif."""
+
+FAST = 25.0
+"""Pictures per second of an .mp4."""
 
 STRIP = 4
 """Pictures of a strip."""
 
 _WIDTH, _HEIGHT = 480, 400
 _ANGLE = 0.62  # The vertical angle of view, in rad.
+_EVERYWHERE = ["-pix_fmt", "yuv420p", "-preset", "veryfast"]
+"""What players of browsers need, and what takes no longer than drawing."""
+
 _LETTER = 7.0  # The width of a letter of a label, in pixels.
 _LEAST_FORCE = 0.02  # No arrow below this fraction of the largest force of the run.
 
@@ -98,35 +105,52 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
         loop: A loop of a `RobotPlant` whose links have geometry.
         record: The record of a run of this loop.
         context: The context of its diagram, for the parameters; not changed.
-        path: A .gif for the film, or a .png for four moments of it side by side.
+        path: A .gif or .mp4 for the film, or a .png for four moments of it side by side. An .mp4 is
+            sharper and smoother, and takes the program ffmpeg.
 
     Raises:
-        ModelError: There is no robot, nothing of it can be seen, or the file has another suffix.
+        ModelError: There is no robot, nothing of it can be seen, the file has another suffix, or
+            there is no ffmpeg.
         OSError: The file cannot be written.
     """
     name, kind = Path(path).name, Path(path).suffix
-    if kind not in (".gif", ".png"):
-        raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{name}'")
-    course = follow(loop, record, context, RATE)
-    scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
+    if kind not in (".gif", ".mp4", ".png"):
+        raise ModelError(f"a film is a .gif or .mp4, a strip of pictures a .png, got '{name}'")
+    if kind == ".mp4" and shutil.which("ffmpeg") is None:
+        raise ModelError(
+            "an .mp4 is written by ffmpeg, and there is none here; install it (apt install "
+            "ffmpeg), or write a .gif"
+        )
+    rate, sharpness = (FAST, 2) if kind == ".mp4" else (RATE, 1)
+    course = follow(loop, record, context, rate)
+    scene, last = _Scene(course, loop.scene_graph, sharpness), len(course.times) - 1
     scene.notes = phases_at(record, course.start_time + course.times)
-    if kind == ".gif":
-        from matplotlib.animation import PillowWriter
-
-        figure, (axis,) = _screen(1)
-        writer = PillowWriter(fps=int(RATE))
-        # Not `writer.saving`, which also writes what an interruption left.
-        writer.setup(figure, str(path), dpi=100)
-        for number in range(last + 1):
-            axis.clear()
-            scene.draw(axis, number)
-            writer.grab_frame()
-        writer.finish()
-    else:
+    if kind == ".png":
         figure, axes = _screen(STRIP)
         for place, axis in enumerate(axes):
             scene.draw(axis, round(last * place / (STRIP - 1)))
         figure.savefig(path)
+        return
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    figure, (axis,) = _screen(1)
+    if kind == ".gif":
+        writer: PillowWriter | FFMpegWriter = PillowWriter(fps=int(rate))
+    else:
+        writer = FFMpegWriter(fps=int(rate), codec="h264", extra_args=_EVERYWHERE)
+    # Not `writer.saving`, which also writes what an interruption left.
+    writer.setup(figure, str(path), dpi=100 * sharpness)
+    try:
+        for number in range(last + 1):
+            axis.clear()
+            scene.draw(axis, number)
+            writer.grab_frame()
+    except BaseException:
+        if kind == ".mp4":  # Its program is running.
+            writer.finish()
+            Path(path).unlink(missing_ok=True)
+        raise
+    writer.finish()
 
 
 def _screen(columns: int) -> tuple[Figure, list[Axes]]:
@@ -141,14 +165,15 @@ def _screen(columns: int) -> tuple[Figure, list[Axes]]:
 class _Camera:
     """A pinhole that looks at a point from an eye; the picture's y axis points down."""
 
-    def __init__(self, eye: FloatArray, at: FloatArray, far: float) -> None:
+    def __init__(self, eye: FloatArray, at: FloatArray, far: float, sharpness: int = 1) -> None:
         forward = (at - eye) / np.linalg.norm(at - eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         axes = np.column_stack([right, np.cross(forward, right), forward])
         self.pose = RigidTransform(RotationMatrix(axes), eye)
         self.info = CameraInfo(_WIDTH, _HEIGHT, _ANGLE)
-        core = RenderCameraCore("film", self.info, ClippingRange(far / 100, far), RigidTransform())
+        sharp = CameraInfo(sharpness * _WIDTH, sharpness * _HEIGHT, _ANGLE)
+        core = RenderCameraCore("film", sharp, ClippingRange(far / 100, far), RigidTransform())
         self.color = ColorRenderCamera(core)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -166,7 +191,9 @@ class _Camera:
 class _Scene:
     """The links and surfaces in front of a camera."""
 
-    def __init__(self, course: RunMotion, scene_graph: SceneGraph | None) -> None:
+    def __init__(
+        self, course: RunMotion, scene_graph: SceneGraph | None, sharpness: int = 1
+    ) -> None:
         model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
@@ -174,7 +201,7 @@ class _Scene:
         self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         view = View.of(_ANGLE, _WIDTH / _HEIGHT, _TOP)
         placed = run_view(course, scene_graph, view, ARROW * self._size)
-        self._camera = _Camera(*placed, 10.0 * self._size)
+        self._camera = _Camera(*placed, 10.0 * self._size, sharpness)
         self.notes = [""] * len(course.times)
         self._course, self._points, self._wanted = course, course.points, course.wanted_points
         builder = DiagramBuilder()
@@ -226,7 +253,8 @@ class _Scene:
         from matplotlib.patheffects import withStroke
 
         course = self._course
-        axis.imshow(self._render(number), interpolation="nearest")
+        everywhere = (-0.5, _WIDTH - 0.5, _HEIGHT - 0.5, -0.5)
+        axis.imshow(self._render(number), interpolation="nearest", extent=everywhere)
         axis.set_axis_off()
         wrench, boxes = course.wrenches[number], list[FloatArray]()
         sizes = np.linalg.norm(wrench.forces, axis=1)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -42,12 +43,13 @@ class _Course:
     place: int
 
 
+@checked(ModelError)
 def plot_runs(
     records: Mapping[str, Record], names: Sequence[str] = (), errors: bool = False
 ) -> Figure:
     """Draws signals of runs over each other, outputs with their references dashed.
 
-    With one run its phases, impacts and open contacts are marked.
+    A notebook shows the figure; its `savefig` writes it into a file. With one run its phases, impacts and open contacts are marked.
 
     Args:
         records: Label of a run -> its record.

@@ -126,8 +126,10 @@ def test_a_tool_that_goes_from_rest_slides_from_the_stiction_tolerance_on():
     slides = [one for one in slips(run) if one.kind is Kind.SLIDE]
     for one in slides:
         k = round((one.time - run.start_time) * 200.0)
-        assert k == 0 or speeds[max(k - 2, 0)] < tolerance.value[0] < speeds[k + 2]
-    assert len(slides) == 1 + np.count_nonzero(np.diff(np.sign(np.diff(run.points[:, 0, 2]))))
+        assert k <= 1 or speeds[k - 2] < tolerance.value[0] < speeds[k + 2]
+    # It may reverse between two frames, and then sticks in none.
+    turns = np.count_nonzero(np.diff(np.sign(np.diff(run.points[:, 0, 2]))))
+    assert 1 <= len(slides) <= 1 + turns
 
 
 @pytest.mark.slow
