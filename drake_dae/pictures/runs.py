@@ -49,7 +49,8 @@ def plot_runs(
 ) -> Figure:
     """Draws signals of runs over each other, outputs with their references dashed.
 
-    A notebook shows the figure; its `savefig` writes it into a file. With one run its phases, impacts and open contacts are marked.
+    A notebook shows the figure; its `savefig` writes it into a file. With one run its phases and
+    what happens to its contacts are marked.
 
     Args:
         records: Label of a run -> its record.
