@@ -30,7 +30,7 @@ from drake_dae.commands.run_folder import (
     stage,
 )
 from drake_dae.dae.timing.profile import TimeOptimalReference
-from drake_dae.diagrams.clearances import links_in_the_way
+from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
@@ -56,6 +56,7 @@ from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
     departure_remarks,
+    limit_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -253,6 +254,7 @@ def _write(run: _CommandRun) -> bool:
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
         behind = links_in_the_way(loop, record, run.context)
+        near = nearness(loop, record, run.context)
         bound = None
         if loop.generator is not None:
             reference, state = loop.generator.reference, record["state"][0]
@@ -271,6 +273,7 @@ def _write(run: _CommandRun) -> bool:
             limits.pushing,
             changes,
             is_cut_short=bool(run.failure or (stopped and changes[-1].failed)) or interrupted,
+            notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
         is_unexplained = verdict.tracking is Tracking.OFF and not reasons
@@ -278,12 +281,14 @@ def _write(run: _CommandRun) -> bool:
             "missed": job.outcome is JobOutcome.BAD or is_unexplained,
             "job": job.to_dict(),
             "phases": [asdict(change) for change in changes],
+            **asdict(near),
             **_as_data(run, verdict, reasons),
         }
         if model is not None:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
             text = "\n".join([text, *surface_remarks(model, record), *rolling])
+        text = "\n".join([text, *map(str, (*near.distances, *near.speeds))])
         text = "\n".join([text, *departure_remarks(record, limits.control)])
         scenario = run.scenario
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
