@@ -29,7 +29,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures sheet clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -47,6 +47,7 @@ help:
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
+	@echo 'make sheet       every scenario at three moments, as page and film, into runs/sheet/; chromium'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -119,6 +120,9 @@ pictures: $(VENV)/installed
 	$(BIN)/drake-dae render runs/pictures --out $(PICTURES)/seven_joint_wall.gif
 	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png
 	cp runs/pictures/errors.png $(PICTURES)/seven_joint_wall_errors.png
+
+sheet: $(VENV)/installed
+	$(BIN)/python tests/campaign/contact_sheet.py $(ARGS)
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache
