@@ -123,6 +123,7 @@ from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
+from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
 from .studies.identification.excitation import Excitation as Excitation
 from .studies.identification.excite import excite as excite

@@ -252,7 +252,7 @@ class _Scene:
         """Draws the moment of that number, with the paths up to it."""
         from matplotlib.patheffects import withStroke
 
-        course = self._course
+        course, halo = self._course, withStroke(linewidth=3.0, foreground="white")
         everywhere = (-0.5, _WIDTH - 0.5, _HEIGHT - 0.5, -0.5)
         axis.imshow(self._render(number), interpolation="nearest", extent=everywhere)
         axis.set_axis_off()
@@ -281,12 +281,16 @@ class _Scene:
             boxes.append(box)
             x, y = box[:2] + size / 2.0
             caption = axis.text(x, y, text, color=FORCE, fontsize=10, ha="center", va="center")
-            caption.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+            caption.set_path_effects([halo])
         time = course.start_time + course.times[number]
-        axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
-        axis.text(12, 46, self.notes[number], fontsize=11, color="0.25")
         scale = f"longest force {self._largest:.3g} N, grid {self.floor.cell:g} m"
-        axis.text(_WIDTH - 12, 24, scale, fontsize=9, color="0.4", ha="right")
+        said = [
+            axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25"),
+            axis.text(12, 46, self.notes[number], fontsize=11, color="0.25"),
+            axis.text(_WIDTH - 12, 24, scale, fontsize=9, color="0.35", ha="right"),
+        ]
+        for text in said:
+            text.set_path_effects([halo])
         axis.set_xlim(-0.5, _WIDTH - 0.5)
         axis.set_ylim(_HEIGHT - 0.5, -0.5)
 

@@ -78,6 +78,7 @@ IMPORT_NAMES = {
     "drake": "pydrake",
     "pycollada": "collada",
     "pyyaml": "yaml",
+    "rerun-sdk": "rerun",
 }
 
 
