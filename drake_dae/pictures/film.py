@@ -289,8 +289,8 @@ class _Scene:
             axis.text(12, 46, self.notes[number], fontsize=11, color="0.25"),
             axis.text(_WIDTH - 12, 24, scale, fontsize=9, color="0.35", ha="right"),
         ]
-        for text in said:
-            text.set_path_effects([halo])
+        for words in said:
+            words.set_path_effects([halo])
         axis.set_xlim(-0.5, _WIDTH - 0.5)
         axis.set_ylim(_HEIGHT - 0.5, -0.5)
 
