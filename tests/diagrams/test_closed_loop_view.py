@@ -182,6 +182,13 @@ def test_what_the_page_says(shown):
     assert "/" + "/".join(force["path"]) + "/arrow/head" in objects(page)
     wanted = at(record, "constraint_force", np.arange(33) / 32)[:, 0]
     np.testing.assert_allclose(force["values"], wanted, rtol=1e-3)
+    words = [text for _, text in said["legend"]]
+    assert f"constraint force, the longest {wanted.max():.3g} N" in words
+    (grid,) = [text for text in words if text.startswith("grid of ")]
+    lines = vertices(objects(page)["/floor"]).reshape(-1, 2, 3)
+    apart = np.diff(np.unique(np.round(lines[:, 0, 0], 6)))
+    # The page holds single precision.
+    np.testing.assert_allclose(apart, float(grid.split()[2]), atol=1e-5)
     (path,) = said["paths"]
     drawn = objects(page)["/" + "/".join(path)]["geometries"][0]["data"]
     # Six sides of two triangles for each of the 32 pieces, one after the other.

@@ -76,6 +76,8 @@ class Plant(System):
     13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
     14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
+    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+        the law may not know; not negative.
     """
 
     __slots__ = ()
