@@ -157,3 +157,13 @@ def test_on_compliant_contact_the_cone_is_the_plants_and_not_the_laws():
     force = run.wrenches[-1].forces[0]
     angle = np.arccos(force @ cone.normals[-1] / np.linalg.norm(force))
     assert angle == pytest.approx(np.arctan(0.3), rel=1e-3)  # It slides at 0.1 m/s, v_s is 1e-4.
+
+
+@pytest.mark.slow
+def test_drakes_own_contact_has_the_cone_of_its_material():
+    plant = "plant=!MultibodyPlant {stiffness: 1.0e5, friction: 0.4}"
+    case = scenario("wall_point_contact", "duration=0.05", plant)
+    loop, context = build_scenario(case)
+    simulate(loop.diagram, context, case.duration, case.integrator)
+    (cone,) = friction_cones(follow(loop, loop.record(context), context))
+    assert cone.coefficient == 0.4

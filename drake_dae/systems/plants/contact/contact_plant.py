@@ -128,7 +128,7 @@ class ContactPlant(Diagram, Plant):
         check_model(model)
         self.model: RobotModel = model
         self.dae, self.structure = model.dae, structure
-        self.time_step = material.time_step
+        self.time_step, self._friction = material.time_step, material.friction
         self._values = changed_parameters(model, parameters or {})
         if model.stages:
             check_step(model, material.time_step, self._values)
@@ -267,10 +267,9 @@ class ContactPlant(Diagram, Plant):
         return {"contact_force": self.contact_force_signals}
 
     def friction(self, context: Context) -> dict[str, float]:
-        given = self.material.friction
-        own = super().friction(context)
-        names = [constraint.name for constraint in self.model.constraints]
-        return own if given is None else dict.fromkeys(names, given)
+        if self._friction is None:
+            return super().friction(context)
+        return {constraint.name: self._friction for constraint in self.model.constraints}
 
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         contact = builder.AddSystem(ContactVisualizer(meshcat))
