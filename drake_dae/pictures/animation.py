@@ -188,7 +188,7 @@ def _legend(
         found += [(_hex(PATH_COLOR), "path"), (_hex(_DESIRED), "desired path")]
         longest = f"constraint force, the longest {arrows.largest_force:.3g} N"
         found.append((_hex(FORCE_COLOR), longest))
-    if any(course.acting.with_moment):
+    if arrows.has_moment:
         longest = f"moment, the longest {arrows.largest_moment:.3g} N m"
         found.append((_hex(MOMENT_COLOR), longest))
     if cones:

@@ -39,7 +39,7 @@ from drake_dae.pictures.scene.arrows import ForceArrows, GrowingPaths
 from drake_dae.pictures.scene.run_motion import contact_paths, follow, frame_times
 from drake_dae.pictures.scene.surroundings import scene_extent
 from drake_dae.pictures.scene.view import FRAME_RATE, draw_scene
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches
 from drake_dae.robots.surfaces import surfaces
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scenario.shipped import find_scenario
@@ -421,6 +421,17 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
     assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
     assert arrows.largest_force == 20.0
+
+
+def test_round_off_of_a_moment_is_no_arrow_of_full_length():
+    arrows = ForceArrows(start_meshcat(), arm("two_link").model, length=0.3)
+    row = np.array([[0.0, 0.0, 1.0]])
+    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 1e-9 * row)])
+    assert not arrows.has_moment
+    assert arrows.largest_moment > 1e3 * 1e-9
+    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 2.0 * row)])
+    assert arrows.has_moment
+    assert arrows.largest_moment == 2.0
 
 
 def shown_at_rest(model, forces):

@@ -23,6 +23,9 @@ PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
 _PIECE = 32
 """The number of points in a piece of a growing path."""
 
+_NEGLIGIBLE = 1e-6
+"""A moment is negligible below so much of the largest force at the length of the longest arrow."""
+
 LEAST_SCALE = 1e-3
 """The scale of an arrow without force: a transformation must not be zero."""
 
@@ -41,10 +44,12 @@ class ForceArrows:
 
     Attributes:
         largest_force, largest_moment: The force and moment of the longest arrow, N and N m.
+        has_moment: Whether some moment is not negligible beside the forces.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
         self.largest_force = self.largest_moment = 1e-6
+        self.has_moment, self._length = False, length
         self._meshcat, self._model = meshcat, model
         self._wrenches = ConstraintWrenches(model)
         pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
@@ -91,7 +96,9 @@ class ForceArrows:
                 for rows in (wrenches.forces, wrenches.moments)
             )
             self.largest_force = max(self.largest_force, force)
-            self.largest_moment = max(self.largest_moment, moment)
+            least = _NEGLIGIBLE * self._length * self.largest_force
+            self.has_moment = self.has_moment or moment > least
+            self.largest_moment = max(self.largest_moment, moment, least)
 
     def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
         size = float(np.linalg.norm(arrow))
