@@ -30,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -50,6 +50,7 @@ help:
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
 	@echo 'make gallery     run all scenarios and show them on one page, in build/gallery/; some minutes'
+	@echo 'make sheet       every scenario at three moments, as page and film, into runs/sheet/; chromium'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -128,6 +129,9 @@ docs: $(VENV)/installed-docs
 
 gallery: $(VENV)/installed
 	$(BIN)/python examples/gallery
+
+sheet: $(VENV)/installed
+	$(BIN)/python tests/campaign/contact_sheet.py $(ARGS)
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache

@@ -63,8 +63,10 @@ from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
+from .pictures.diagram import save_diagram as save_diagram
 from .pictures.film import save_film as save_film
-from .pictures.view import start_meshcat as start_meshcat
+from .pictures.runs import plot_runs as plot_runs
+from .pictures.scene.view import start_meshcat as start_meshcat
 from .robots.actuation.dc_motors import DcMotors as DcMotors
 from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
@@ -121,6 +123,7 @@ from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
+from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
 from .studies.identification.excitation import Excitation as Excitation
 from .studies.identification.excite import excite as excite

@@ -36,6 +36,7 @@ _MODULES = {
     "print": "keys",
     "cache": "keys",
     "render": "plot",
+    "diagram": "plot",
     "excite": "identify",
 }
 """The modules of commands that have none of their own."""

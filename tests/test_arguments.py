@@ -45,7 +45,7 @@ from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.run_motion import ShownLoop
+from drake_dae.pictures.scene.run_motion import ShownLoop
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction

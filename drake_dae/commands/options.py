@@ -100,8 +100,21 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--check", action="store_true", help="exit code 2 for a run that missed its task"
     )
     add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
-    shown = commands.add_parser("play", help="play the animation of a run in the browser")
-    shown.add_argument("folder", type=path_option, help="the folder of the run")
+    shown = commands.add_parser(
+        "play",
+        help="play the animation of a run in the browser, or of several beside each other",
+        description="Opens the animation of a run in the browser. Of several runs it writes a page "
+        "that shows their animations beside each other, at the same time after their starts.",
+    )
+    shown.add_argument(
+        "runs", nargs="+", type=path_option, metavar="RUN", help="the folder of a run"
+    )
+    shown.add_argument(
+        "--out",
+        type=path_option,
+        metavar="FILE",
+        help="the page of several runs (default: compare.html)",
+    )
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -139,7 +152,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     add_json(written, "print the names of the files as JSON")
     film = commands.add_parser(
         "render",
-        help="render a run into a GIF or a strip of pictures",
+        help="render a run into a GIF, an MP4 or a strip of pictures",
         description=(
             "Renders the run in a folder, with the paths and the forces of its contacts. "
             "It needs no screen and no browser."
@@ -151,7 +164,21 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     film.add_argument(
         "--out",
         type=path_option,
-        help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
+        help="a .gif or .mp4 (by ffmpeg), or a .png for four moments side by side (default: "
+        "film.gif in the folder)",
+    )
+    blocks = commands.add_parser(
+        "diagram",
+        parents=[named],
+        help="draw the blocks of a scenario's loop and their wires",
+        description="Draws the Drake diagram of a scenario: its blocks, and the wires with the "
+        "names of their ports. Graphviz's program `dot` draws it; a .dot is written without it.",
+    )
+    blocks.add_argument(
+        "--out",
+        type=path_option,
+        metavar="FILE",
+        help="a .svg, .png, .pdf or .dot (default: <scenario>.svg)",
     )
     drawn = commands.add_parser(
         "plot",

@@ -1,21 +1,24 @@
-"""`drake-dae plot` and `drake-dae render`: pictures of recorded runs."""
+"""`drake-dae plot`, `render` and `diagram`: pictures of recorded runs, and of a loop's blocks."""
 
 import argparse
 from pathlib import Path
 
-from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, stage
+from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, run_label, stage
 from drake_dae.errors import ModelError
+from drake_dae.pictures.diagram import save_diagram
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Draws or renders what the options name; returns the exit code."""
-    path = _render(options) if options.command == "render" else _plot(options)
+    draw = {"render": _render, "plot": _plot, "diagram": _diagram}[options.command]
+    path = draw(options)
     print(f"written to {path}")
     return 0
 
@@ -33,6 +36,16 @@ def _render(options: argparse.Namespace) -> Path:
     return path
 
 
+def _diagram(options: argparse.Namespace) -> Path:
+    """Draws the blocks of a scenario's loop and their wires."""
+    file = find_scenario(options.scenario)
+    path: Path = options.out or Path(f"{file.stem}.svg")
+    loop, _ = build_scenario(load_scenario(file, options.settings))
+    with stage(path.parent, path.name) as place:
+        save_diagram(loop.diagram, place / path.name)
+    return path
+
+
 def _plot(options: argparse.Namespace) -> Path:
     """Draws signals of runs over each other."""
     path: Path = options.out
@@ -40,15 +53,9 @@ def _plot(options: argparse.Namespace) -> Path:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
     if len(set(options.runs)) < len(options.runs):
         raise ModelError("a run is named twice; name each run once")
-    records = {_label(run, options.runs): load_run(run) for run in options.runs}
+    records = {run_label(run, options.runs): load_run(run) for run in options.runs}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)
     with stage(path.parent, path.name) as place:
         figure.savefig(place / path.name, dpi=110)
     return path
-
-
-def _label(path: Path, paths: list[Path]) -> str:
-    """The name of a run: that of its folder if no other one is named alike."""
-    alike = [other for other in paths if other.name == path.name]
-    return path.name if len(alike) == 1 and path.name else str(path)

@@ -88,6 +88,12 @@ def load_run(path: Path) -> Record:
     raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
 
 
+def run_label(path: Path, paths: Sequence[Path]) -> str:
+    """The name of a run among others: that of its folder if no other one is named alike."""
+    alike = [other for other in paths if other.name == path.name]
+    return path.name if len(alike) == 1 and path.name else str(path)
+
+
 def _prepare(folder: Path) -> tuple[int, Path | None]:
     """The open file with the lock, and the folder to which an earlier run was moved."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -30,14 +30,16 @@ from drake_dae.commands.run_folder import (
     stage,
 )
 from drake_dae.dae.timing.profile import TimeOptimalReference
-from drake_dae.diagrams.clearances import links_in_the_way
+from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
+from drake_dae.pictures.moments import moments_of, ordered
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
-from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
-from drake_dae.pictures.view import start_meshcat
+from drake_dae.pictures.scene.friction import slips
+from drake_dae.pictures.scene.run_motion import RunMotion, contact_paths, follow
+from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -54,6 +56,7 @@ from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
     departure_remarks,
+    limit_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -251,6 +254,7 @@ def _write(run: _CommandRun) -> bool:
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
         behind = links_in_the_way(loop, record, run.context)
+        near = nearness(loop, record, run.context)
         bound = None
         if loop.generator is not None:
             reference, state = loop.generator.reference, record["state"][0]
@@ -269,6 +273,7 @@ def _write(run: _CommandRun) -> bool:
             limits.pushing,
             changes,
             is_cut_short=bool(run.failure or (stopped and changes[-1].failed)) or interrupted,
+            notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
         is_unexplained = verdict.tracking is Tracking.OFF and not reasons
@@ -276,12 +281,14 @@ def _write(run: _CommandRun) -> bool:
             "missed": job.outcome is JobOutcome.BAD or is_unexplained,
             "job": job.to_dict(),
             "phases": [asdict(change) for change in changes],
+            **asdict(near),
             **_as_data(run, verdict, reasons),
         }
         if model is not None:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
             text = "\n".join([text, *surface_remarks(model, record), *rolling])
+        text = "\n".join([text, *map(str, (*near.distances, *near.speeds))])
         text = "\n".join([text, *departure_remarks(record, limits.control)])
         scenario = run.scenario
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
@@ -302,18 +309,22 @@ def _write(run: _CommandRun) -> bool:
         course: RunMotion | None = None
         if run.pictures and (write.plots or write.animation) and model is not None:
             course = follow(loop, record, run.context)
+        moments = moments_of(record, limits)
+        if course is not None:
+            moments = ordered(record, [*moments, *slips(course)])
         if write.plots and run.pictures:
             paths = contact_paths(course) if course is not None else []
             plots = [name for name in PLOTS if paths or name != PATHS]
             with _collected(problems), stage(folder, *plots) as place, _frozen():
-                save_plots(record, predicted, limits.control, place, paths, accuracy)
+                save_plots(record, predicted, limits.control, place, paths, accuracy, moments)
             for one in loop.generator.references if loop.generator is not None else ():
                 if isinstance(one, TimeOptimalReference):
                     with _collected(problems), stage(folder, PROFILE) as place:
                         save_profile(one.profile, place)
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as place:
-                page = animate(course, loop.scene_graph, run.title, phase_spans(record))
+                spans = phase_spans(record)
+                page = animate(course, loop.scene_graph, run.title, spans, moments)
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]

@@ -2,8 +2,10 @@
 
 import argparse
 import json
+import shlex
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.results import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
-from drake_dae.studies.variations import parse_variations
+from drake_dae.studies.variations import Variation, parse_variations, setting
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -26,6 +28,24 @@ def run_command(options: argparse.Namespace) -> int:
         code, report = _sweep(options)
     print(json.dumps(report, indent=2))
     return code
+
+
+def _again(options: argparse.Namespace, folder: Path, variations: Sequence[Variation]) -> list[str]:
+    """For each run the command that makes its record, plots and animation."""
+    first = ["drake-dae", "simulate", str(options.scenario)]
+    first += ["--rollout"] if options.rollout else []
+    given = [part for text in options.settings for part in ("--set", text)]
+    return [
+        shlex.join(
+            [
+                *first,
+                *given,
+                *(part for item in changes.items() for part in ("--set", setting(*item))),
+                *("--out", str(folder / f"run{number}")),
+            ]
+        )
+        for number, changes in enumerate(variations)
+    ]
 
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -56,7 +76,9 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     except KeyboardInterrupt:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
         raise
-    files = study.save(folder)
+    title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
+    again = _again(options, folder, variations)
+    files = study.save(folder, title, again, scenario.duration)
     names = ", ".join([file.name, *(written.name for written in files)])
     print(f"{study}\nwritten to {folder}/: {names}", flush=True)
     unfinished = [result for result in study.results if result.outcome is not Outcome.FINISHED]

@@ -31,7 +31,7 @@ from drake_dae.diagrams.parts import (
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
-from drake_dae.pictures.view import add_live_view
+from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.limits import ControlLimits

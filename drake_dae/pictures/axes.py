@@ -43,7 +43,7 @@ def grid(
         notes: Notes below all axes.
         noted: The text before the notes.
     """
-    from matplotlib.figure import Figure
+    from drake_dae.pictures.shown import ShownFigure
 
     count = len(titles)
     columns = 1 if count <= 2 else 2
@@ -55,7 +55,7 @@ def grid(
     text = fill(noted + _plain(entries), int(width / _LETTER) - 6) if notes else ""
     below = (_BOTTOM if count else 0.1) + _LINE * len(text.splitlines())
     height = below + rows * _AXES + max(rows - 1, 0) * _GAP + top
-    figure = Figure(figsize=(width, height))
+    figure = ShownFigure(figsize=(width, height))
     if text:
         figure.text(0.1 / width, 0.08 / height, text, fontsize=9, va="bottom")
     if not count:
@@ -91,7 +91,7 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
         titles: Their titles.
         labels: The entries of a legend above all axes, for which room is left.
     """
-    from matplotlib.figure import Figure
+    from drake_dae.pictures.shown import ShownFigure
 
     columns = min(len(titles), 3)
     rows = -(-len(titles) // columns)
@@ -99,7 +99,7 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
     width = cell * columns
     top = _TITLE + _LINE * legend_shape(labels, width)[0] + 0.15
     height = rows * (_SQUARE + _BOTTOM) + (rows - 1) * _TITLE + top
-    figure = Figure(figsize=(width, height))
+    figure = ShownFigure(figsize=(width, height))
     axes: list[Axes] = []
     for number, title in enumerate(titles):
         row, column = divmod(number, columns)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from drake_dae.pictures.moments import Kind, Moment
 from drake_dae.simulation.open_contacts import open_spans
-from drake_dae.simulation.records.events import impacts
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
 
@@ -14,25 +14,48 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-IMPACT, OPEN = "impact", "contact open"
-"""The labels of marks in a plot."""
+_NAME = 0.11
+"""The room for the name of a phase, in inches along the axis of time."""
+
+OPEN = "contact open"
+"""The label of the time in which a contact was open."""
 
 
-def mark_labels(record: Record) -> tuple[str, ...]:
+def mark_labels(record: Record, moments: Sequence[Moment] = ()) -> tuple[str, ...]:
     """The legend entries of the marks of a record, in any order."""
     found = [OPEN] if open_spans(record) else []
-    return (*found, IMPACT) if impacts(record.events) else tuple(found)
+    return (*found, *(kind.label for kind in _kinds(moments)))
 
 
-def mark_events(axes: Sequence[Axes], record: Record) -> None:
-    """Marks in axes over time where contacts were open, and impacts."""
+def mark_events(axes: Sequence[Axes], record: Record, moments: Sequence[Moment] = ()) -> None:
+    """Marks in axes over time where contacts were open, and on the axis of time what happens.
+
+    An impact has a line through all of the plot.
+    """
     for axis in axes:
         for number, span in enumerate(open_spans(record)):
             label = "" if number else OPEN
             axis.axvspan(*span, color="0.9", linewidth=0.0, zorder=0.4, label=label)
-        for number, event in enumerate(impacts(record.events)):
-            label = "" if number else IMPACT
-            axis.axvline(event.time, color="C3", linewidth=0.8, alpha=0.7, zorder=0.6, label=label)
+        for kind in _kinds(moments):
+            times = [one.time for one in moments if one.kind is kind]
+            for time in times if kind is Kind.IMPACT else ():
+                axis.axvline(time, color=kind.color, linewidth=0.8, alpha=0.7, zorder=0.6)
+            axis.plot(
+                times,
+                [0.0] * len(times),
+                color=kind.color,
+                linestyle="",
+                marker="^",
+                markersize=5,
+                clip_on=False,
+                transform=axis.get_xaxis_transform(),
+                label=kind.label,
+                zorder=3.0,
+            )
+
+
+def _kinds(moments: Sequence[Moment]) -> list[Kind]:
+    return [kind for kind in Kind if any(one.kind is kind for one in moments)]
 
 
 def mark_phases(figure: Figure, record: Record) -> None:
@@ -40,13 +63,18 @@ def mark_phases(figure: Figure, record: Record) -> None:
     spans = phase_spans(record)
     for axis in figure.axes:
         axis.margins(x=0.01)
+        width = axis.get_position().width * figure.get_figwidth()
+        # Names of short phases stand beside each other.
+        apart = _NAME / width * float(record.time[-1] - record.time[0]) if spans else 0.0
+        place = -float("inf")
         for number, span in enumerate(spans):
             if number % 2:
                 axis.axvspan(
                     span.begin, span.end, color="C0", alpha=0.06, linewidth=0.0, zorder=0.3
                 )
+            place = max(span.begin, place + apart)
             axis.text(
-                span.begin,
+                place,
                 0.97,
                 f" {span.name}",
                 transform=axis.get_xaxis_transform(),

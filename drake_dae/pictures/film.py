@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
+    Box,
     ClippingRange,
     ColorRenderCamera,
     FramePoseVector,
@@ -23,6 +25,7 @@ from pydrake.geometry import (
     RenderEngineVtkParams,
     RenderLabel,
     Rgba,
+    Role,
     SceneGraph,
     Shape,
     TriangleSurfaceMesh,
@@ -35,8 +38,18 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.run_motion import RunMotion, ShownLoop, follow, run_extent
-from drake_dae.pictures.surroundings import surroundings
+from drake_dae.pictures.scene.floor import floor_below
+from drake_dae.pictures.scene.framing import View
+from drake_dae.pictures.scene.labels import label_box, to_be_seen
+from drake_dae.pictures.scene.run_motion import (
+    RunMotion,
+    ShownLoop,
+    follow,
+    run_points,
+    run_view,
+)
+from drake_dae.pictures.scene.surroundings import surroundings
+from drake_dae.pictures.scene.view import ARROW, PIECE
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.simulation.records.phases import phases_at
 from drake_dae.simulation.records.record import Record
@@ -46,20 +59,38 @@ if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.figure import Figure
 
 RATE = 10.0
-"""Pictures per second of a film."""
+"""Pictures per second of a .gif."""
+
+FAST = 25.0
+"""Pictures per second of an .mp4."""
 
 STRIP = 4
 """Pictures of a strip."""
 
 _WIDTH, _HEIGHT = 480, 400
 _ANGLE = 0.62  # The vertical angle of view, in rad.
+_EVERYWHERE = ["-pix_fmt", "yuv420p", "-preset", "veryfast"]
+"""What players of browsers need, and what takes no longer than drawing."""
+
+_LETTER = 7.0  # The width of a letter of a label, in pixels.
 _LEAST_FORCE = 0.02  # No arrow below this fraction of the largest force of the run.
 
 ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
 """Colors of the actual path, the desired path, forces, and impacts."""
 
-_LABEL = np.array([34.0, 14.0])
-"""Half the width and height of a label, in pixels."""
+_TOP = 56.0 / _HEIGHT
+"""The part of the height of a picture that is left to the clock and the phase."""
+
+_LIGHTS = (([0.8, 0.6, -0.7], 1.0), ([-0.8, 0.2, -0.3], 0.4))
+_PHYSICAL_LIGHTS = (
+    ([0.8, 0.6, -0.7], 2.2),
+    ([-0.8, 0.2, -0.3], 1.0),
+    ([0.3, -0.9, -0.2], 1.0),
+    ([0.0, 0.0, -1.0], 1.0),
+)
+"""The directions of lights, and their intensities."""
+
+_SURFACE, _FLOOR = Rgba(0.75, 0.85, 0.95, 0.5), Rgba(1.0, 1.0, 1.0, 1.0)
 
 Pixels = NDArray[np.uint8]
 
@@ -74,35 +105,52 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
         loop: A loop of a `RobotPlant` whose links have geometry.
         record: The record of a run of this loop.
         context: The context of its diagram, for the parameters; not changed.
-        path: A .gif for the film, or a .png for four moments of it side by side.
+        path: A .gif or .mp4 for the film, or a .png for four moments of it side by side. An .mp4 is
+            sharper and smoother, and takes the program ffmpeg.
 
     Raises:
-        ModelError: There is no robot, nothing of it can be seen, or the file has another suffix.
+        ModelError: There is no robot, nothing of it can be seen, the file has another suffix, or
+            there is no ffmpeg.
         OSError: The file cannot be written.
     """
     name, kind = Path(path).name, Path(path).suffix
-    if kind not in (".gif", ".png"):
-        raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{name}'")
-    course = follow(loop, record, context, RATE)
-    scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
+    if kind not in (".gif", ".mp4", ".png"):
+        raise ModelError(f"a film is a .gif or .mp4, a strip of pictures a .png, got '{name}'")
+    if kind == ".mp4" and shutil.which("ffmpeg") is None:
+        raise ModelError(
+            "an .mp4 is written by ffmpeg, and there is none here; install it (apt install "
+            "ffmpeg), or write a .gif"
+        )
+    rate, sharpness = (FAST, 2) if kind == ".mp4" else (RATE, 1)
+    course = follow(loop, record, context, rate)
+    scene, last = _Scene(course, loop.scene_graph, sharpness), len(course.times) - 1
     scene.notes = phases_at(record, course.start_time + course.times)
-    if kind == ".gif":
-        from matplotlib.animation import PillowWriter
-
-        figure, (axis,) = _screen(1)
-        writer = PillowWriter(fps=int(RATE))
-        # Not `writer.saving`, which also writes what an interruption left.
-        writer.setup(figure, str(path), dpi=100)
-        for number in range(last + 1):
-            axis.clear()
-            scene.draw(axis, number)
-            writer.grab_frame()
-        writer.finish()
-    else:
+    if kind == ".png":
         figure, axes = _screen(STRIP)
         for place, axis in enumerate(axes):
             scene.draw(axis, round(last * place / (STRIP - 1)))
         figure.savefig(path)
+        return
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    figure, (axis,) = _screen(1)
+    if kind == ".gif":
+        writer: PillowWriter | FFMpegWriter = PillowWriter(fps=int(rate))
+    else:
+        writer = FFMpegWriter(fps=int(rate), codec="h264", extra_args=_EVERYWHERE)
+    # Not `writer.saving`, which also writes what an interruption left.
+    writer.setup(figure, str(path), dpi=100 * sharpness)
+    try:
+        for number in range(last + 1):
+            axis.clear()
+            scene.draw(axis, number)
+            writer.grab_frame()
+    except BaseException:
+        if kind == ".mp4":  # Its program is running.
+            writer.finish()
+            Path(path).unlink(missing_ok=True)
+        raise
+    writer.finish()
 
 
 def _screen(columns: int) -> tuple[Figure, list[Axes]]:
@@ -117,14 +165,15 @@ def _screen(columns: int) -> tuple[Figure, list[Axes]]:
 class _Camera:
     """A pinhole that looks at a point from an eye; the picture's y axis points down."""
 
-    def __init__(self, eye: FloatArray, at: FloatArray, far: float) -> None:
+    def __init__(self, eye: FloatArray, at: FloatArray, far: float, sharpness: int = 1) -> None:
         forward = (at - eye) / np.linalg.norm(at - eye)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         axes = np.column_stack([right, np.cross(forward, right), forward])
         self.pose = RigidTransform(RotationMatrix(axes), eye)
         self.info = CameraInfo(_WIDTH, _HEIGHT, _ANGLE)
-        core = RenderCameraCore("film", self.info, ClippingRange(far / 100, far), RigidTransform())
+        sharp = CameraInfo(sharpness * _WIDTH, sharpness * _HEIGHT, _ANGLE)
+        core = RenderCameraCore("film", sharp, ClippingRange(far / 100, far), RigidTransform())
         self.color = ColorRenderCamera(core)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -142,20 +191,26 @@ class _Camera:
 class _Scene:
     """The links and surfaces in front of a camera."""
 
-    def __init__(self, course: RunMotion, scene_graph: SceneGraph | None) -> None:
+    def __init__(
+        self, course: RunMotion, scene_graph: SceneGraph | None, sharpness: int = 1
+    ) -> None:
         model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
-        middle, self._size = run_extent(course, scene_graph)
-        eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
-        self._camera = _Camera(eye, middle, 10.0 * self._size)
+        seen = run_points(course, scene_graph)
+        self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+        view = View.of(_ANGLE, _WIDTH / _HEIGHT, _TOP)
+        placed = run_view(course, scene_graph, view, ARROW * self._size)
+        self._camera = _Camera(*placed, 10.0 * self._size, sharpness)
         self.notes = [""] * len(course.times)
         self._course, self._points, self._wanted = course, course.points, course.wanted_points
         builder = DiagramBuilder()
         scene = builder.AddSystem(scene_graph.Clone())
+        # A .gltf mesh makes the renderer draw all meshes by its materials, under other lights.
+        physical = _has_gltf(scene_graph)
         lights = [
             LightParameter(type="directional", direction=direction, frame="world", intensity=power)
-            for direction, power in (([0.8, 0.6, -0.7], 1.0), ([-0.8, 0.2, -0.3], 0.4))
+            for direction, power in (_PHYSICAL_LIGHTS if physical else _LIGHTS)
         ]
         parameters = RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=lights)
         scene.AddRenderer("film", MakeRenderEngineVtk(parameters))
@@ -165,15 +220,23 @@ class _Scene:
         self._frames = {}
         source = scene.RegisterSource("surroundings")
         touched = surroundings(
-            model, course.acting, course.points, course.parameters[0], self._size
+            model, course.acting, course.points, course.parameters[0], PIECE * self._size
         )
+        self.floor = floor_below(seen, touched)
+        for number, (begin, end) in enumerate(zip(*self.floor.lines, strict=True)):
+            sides = np.abs(end - begin) + 0.002 * self._size
+            line = GeometryInstance(
+                RigidTransform((begin + end) / 2.0), Box(*sides), f"line{number}"
+            )
+            line.set_perception_properties(_properties(_FLOOR))
+            scene.RegisterAnchoredGeometry(source, line)
         for one in touched:
             constraint, picture = one.constraint, one.picture
             frame = GeometryFrame(constraint.name)
             self._frames[constraint] = scene.RegisterFrame(source, frame)
-            seen = GeometryInstance(picture.pose, _shape(picture.form), constraint.name)
-            seen.set_perception_properties(_surface_properties())
-            scene.RegisterGeometry(source, frame.id(), seen)
+            shape = GeometryInstance(picture.pose, _shape(picture.form), constraint.name)
+            shape.set_perception_properties(_properties(_SURFACE))
+            scene.RegisterGeometry(source, frame.id(), shape)
         if self._frames:
             builder.ExportInput(scene.get_source_pose_port(source), "surroundings")
         builder.ExportOutput(scene.get_query_output_port(), "query")
@@ -189,33 +252,45 @@ class _Scene:
         """Draws the moment of that number, with the paths up to it."""
         from matplotlib.patheffects import withStroke
 
-        course = self._course
-        axis.imshow(self._render(number), interpolation="nearest")
+        course, halo = self._course, withStroke(linewidth=3.0, foreground="white")
+        everywhere = (-0.5, _WIDTH - 0.5, _HEIGHT - 0.5, -0.5)
+        axis.imshow(self._render(number), interpolation="nearest", extent=everywhere)
         axis.set_axis_off()
-        wrench = course.wrenches[number]
-        taken: list[FloatArray] = []
-        for row, force in enumerate(wrench.forces):
+        wrench, boxes = course.wrenches[number], list[FloatArray]()
+        sizes = np.linalg.norm(wrench.forces, axis=1)
+        tails = wrench.points - ARROW * self._size * wrench.forces / max(self._largest, 1e-6)
+        ends = [
+            self._camera.project(np.array(each)) for each in zip(wrench.points, tails, strict=True)
+        ]
+        shown = [row for row, size in enumerate(sizes) if size > _LEAST_FORCE * self._largest]
+        kept = to_be_seen([ends[row] for row in shown])
+        for row in range(len(ends)):
             for points, color in ((self._wanted, DESIRED), (self._points[: number + 1], ACTUAL)):
                 axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
-            size = float(np.linalg.norm(force))
-            if size > _LEAST_FORCE * self._largest:
-                tail = wrench.points[row] - 0.25 * self._size * force / self._largest
-                head, tail = self._camera.project(np.array([wrench.points[row], tail]))
-                shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
-                axis.annotate("", head, tail, arrowprops=shape)
-                place = _label_place(head, tail, taken)
-                taken.append(place)
-                x, y = place
-                caption = axis.text(
-                    x, y, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
-                )
-                caption.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:
-                x, y = self._camera.project(wrench.points[row])[0]
+                x, y = ends[row][0]
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
+        for row in shown:
+            head, tail = ends[row]
+            shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
+            axis.annotate("", head, tail, arrowprops=shape)
+            name = f"{course.acting.constraints[row].name} " if len(ends) > 1 else ""
+            text = f"{name}{sizes[row]:.3g} N"
+            size = np.array([_LETTER * len(text) + 4.0, 16.0])
+            box = label_box(size, head, tail, boxes, kept, (0.0, _TOP * _HEIGHT, _WIDTH, _HEIGHT))
+            boxes.append(box)
+            x, y = box[:2] + size / 2.0
+            caption = axis.text(x, y, text, color=FORCE, fontsize=10, ha="center", va="center")
+            caption.set_path_effects([halo])
         time = course.start_time + course.times[number]
-        axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
-        axis.text(12, 46, self.notes[number], fontsize=11, color="0.25")
+        scale = f"longest force {self._largest:.3g} N, grid {self.floor.cell:g} m"
+        said = [
+            axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25"),
+            axis.text(12, 46, self.notes[number], fontsize=11, color="0.25"),
+            axis.text(_WIDTH - 12, 24, scale, fontsize=9, color="0.35", ha="right"),
+        ]
+        for words in said:
+            words.set_path_effects([halo])
         axis.set_xlim(-0.5, _WIDTH - 0.5)
         axis.set_ylim(_HEIGHT - 0.5, -0.5)
 
@@ -234,15 +309,10 @@ class _Scene:
         return np.array(image.data[:, :, :3])
 
 
-def _label_place(head: FloatArray, tail: FloatArray, taken: list[FloatArray]) -> FloatArray:
-    """The place of the label of an arrow, in pixels: behind its tail, not over others."""
-    way = tail - head
-    length = float(np.linalg.norm(way))
-    way = way / length if length > 1.0 else np.array([0.0, 1.0])
-    place = tail + _LABEL * way
-    while any(np.all(np.abs(place - other) < _LABEL) for other in taken):
-        place = place + np.array([0.0, 5.0])
-    return np.clip(place, _LABEL, np.array([_WIDTH, _HEIGHT]) - _LABEL)
+def _has_gltf(scene_graph: SceneGraph) -> bool:
+    inspector = scene_graph.model_inspector()
+    shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
+    return any(isinstance(shape, Mesh) and shape.extension() == ".gltf" for shape in shapes)
 
 
 def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
@@ -265,8 +335,8 @@ def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "surface")))
 
 
-def _surface_properties() -> PerceptionProperties:
+def _properties(color: Rgba) -> PerceptionProperties:
     properties = PerceptionProperties()
-    properties.AddProperty("phong", "diffuse", Rgba(0.75, 0.85, 0.95, 0.5))
+    properties.AddProperty("phong", "diffuse", color)
     properties.AddProperty("label", "id", RenderLabel.kDontCare)
     return properties

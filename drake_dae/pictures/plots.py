@@ -21,13 +21,14 @@ from drake_dae.pictures.axes import (
     squares,
 )
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
+from drake_dae.pictures.moments import Moment
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.figure import Figure
 
-    from drake_dae.pictures.run_motion import ContactPath
+    from drake_dae.pictures.scene.run_motion import ContactPath
 
 PATHS = "path.png"
 """The plot of points that move on surfaces, if there are any."""
@@ -49,6 +50,7 @@ def save_plots(
     folder: str | Path,
     paths: Sequence[ContactPath] = (),
     accuracy: float | None = None,
+    moments: Sequence[Moment] = (),
 ) -> list[Path]:
     """Draws a run into PNG files: outputs, errors, constraint residual, controls, paths.
 
@@ -59,12 +61,13 @@ def save_plots(
         folder: The folder to write to.
         paths: The paths of points on surfaces; without any there is no such file.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        moments: What happens in the run, marked on the axes of time.
     """
     figures = [
-        plot_outputs(record, predicted),
-        plot_errors(record, predicted, accuracy),
-        plot_residual(record),
-        plot_controls(record, limits),
+        plot_outputs(record, predicted, moments),
+        plot_errors(record, predicted, accuracy, moments),
+        plot_residual(record, moments),
+        plot_controls(record, limits, moments),
     ]
     for figure in figures:
         mark_phases(figure, record)
@@ -76,12 +79,13 @@ def save_plots(
     return files
 
 
-def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
+def plot_outputs(record: Record, predicted: FloatArray, moments: Sequence[Moment] = ()) -> Figure:
     """Controlled outputs, with their references dashed; held ones are a line of text.
 
     Args:
         record: A record with controlled_output and desired_output.
         predicted: The tracking error by theory, shape (k, p).
+        moments: What happens in the run.
     """
     values = record["controlled_output"]
     desired = record["desired_output"]
@@ -92,7 +96,7 @@ def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
     drawn = np.flatnonzero(~held)
     figure, axes = grid(
         [labelled(signals[i]) for i in drawn],
-        ("actual", "reference", *mark_labels(record)) if len(drawn) else (),
+        ("actual", "reference", *mark_labels(record, moments)) if len(drawn) else (),
         [
             f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
             + (f" (within {short(off[i], 1)})" if off[i] > ROUND_OFF * size[i] else "")
@@ -103,13 +107,18 @@ def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
     for axis, i in zip(axes, drawn, strict=False):
         axis.plot(record.time, values[:, i], color="C0", label="actual")
         axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
-    mark_events(axes, record)
+    mark_events(axes, record, moments)
     if len(drawn):
         legend(figure, axes[0])
     return figure
 
 
-def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Figure:
+def plot_errors(
+    record: Record,
+    predicted: FloatArray,
+    accuracy: float | None = None,
+    moments: Sequence[Moment] = (),
+) -> Figure:
     """|z - r| of every output on a log scale, over the predicted error.
 
     With an accuracy, the region below it is grey: there errors come from the integrator. An output
@@ -119,6 +128,7 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
         record: A record with controlled_output and desired_output.
         predicted: The tracking error by theory, shape (k, p).
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        moments: What happens in the run.
     """
     values = record["controlled_output"]
     errors = np.abs(values - record["desired_output"])
@@ -131,7 +141,7 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
     titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
     figure, axes = grid(
         titles,
-        ("predicted", "actual", label, *mark_labels(record)) if len(drawn) else (),
+        ("predicted", "actual", label, *mark_labels(record, moments)) if len(drawn) else (),
         [
             f"{signals[i].name} ("
             + (
@@ -160,30 +170,32 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
         else:
             axis.axhspan(floor / 3.0, blurred[i], color="0.88", zorder=0.5, label=label)
         decades(axis, floor)
-    mark_events(axes, record)
+    mark_events(axes, record, moments)
     if len(drawn):
         legend(figure, axes[0])
     return figure
 
 
-def plot_residual(record: Record) -> Figure:
+def plot_residual(record: Record, moments: Sequence[Moment] = ()) -> Figure:
     """Constraint outputs and their derivatives, after each step and before the projection."""
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
     title = "|constraint residual|, before each step's projection"
-    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record)))
+    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record, moments)))
     floor = round_off(np.ones(1))
     for i, label in enumerate(labels):
         axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     decades(axis, floor)
-    mark_events([axis], record)
+    mark_events([axis], record, moments)
     legend(figure, axis)
     return figure
 
 
-def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
+def plot_controls(
+    record: Record, limits: FloatArray | None = None, moments: Sequence[Moment] = ()
+) -> Figure:
     """Controls, with the actuators' limits if these are within the plot."""
     values = record["control"]
     signals = record.signals["control"].signals
@@ -193,9 +205,9 @@ def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
             labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
             for signal, bound in zip(signals, bounds, strict=True)
         ],
-        marks := mark_labels(record),
+        marks := mark_labels(record, moments),
     )
-    mark_events(axes, record)
+    mark_events(axes, record, moments)
     if axes and marks:
         legend(figure, axes[0])
     for i, axis in enumerate(axes):

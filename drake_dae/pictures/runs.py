@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.pictures.axes import decades, grid, labelled, legend, round_off
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
+from drake_dae.pictures.moments import moments_of
 from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first figure.
@@ -41,12 +43,14 @@ class _Course:
     place: int
 
 
+@checked(ModelError)
 def plot_runs(
     records: Mapping[str, Record], names: Sequence[str] = (), errors: bool = False
 ) -> Figure:
     """Draws signals of runs over each other, outputs with their references dashed.
 
-    With one run its phases, impacts and open contacts are marked.
+    A notebook shows the figure; its `savefig` writes it into a file. With one run its phases and
+    what happens to its contacts are marked.
 
     Args:
         records: Label of a run -> its record.
@@ -73,7 +77,8 @@ def plot_runs(
                 text = f"the run '{label}' has no {course.group} '{course.signal.name}'"
                 raise ModelError(f"{text} in {course.signal.unit or '1'}")
     single = first if not others else None
-    marks = () if single is None else mark_labels(single)
+    moments = [] if single is None else moments_of(single)
+    marks = () if single is None else mark_labels(single, moments)
     figure, axes = grid(
         [
             labelled(Signal(f"|error of {one.signal.name}|", one.signal.unit))
@@ -87,7 +92,7 @@ def plot_runs(
     for axis, course in zip(axes, chosen, strict=True):
         draw(axis, records, course)
     if single is not None:
-        mark_events(axes, single)
+        mark_events(axes, single, moments)
         mark_phases(figure, single)
     legend(figure, axes[0])
     return figure

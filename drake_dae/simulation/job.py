@@ -108,6 +108,7 @@ def judge_job(
     pushing: frozenset[str] | None = frozenset(),
     changes: Sequence[PhaseChange] = (),
     is_cut_short: bool = False,
+    notes: Sequence[str] = (),
 ) -> JobVerdict:
     """Whether a run did its job.
 
@@ -124,6 +125,7 @@ def judge_job(
         pushing: Names of the unilateral constraint forces; None if all are.
         changes: The starts of phases of a task.
         is_cut_short: Whether the run failed or was interrupted before its end.
+        notes: What the user should know besides, each in words.
     """
     ended = [f"the run broke off at {record.time[-1]:.4g} s"] if is_cut_short else []
     problems, remarks = [*ended, *violations], list[str]()
@@ -135,7 +137,7 @@ def judge_job(
         _judge_contacts(record, pushing, problems, remarks)
         undecided = _judge_outputs(record, outputs, problems, remarks)
     outcome = JobOutcome.BAD if problems else JobOutcome.UNDECIDED if undecided else JobOutcome.GOOD
-    return JobVerdict(outcome, outputs, tuple(problems), tuple(remarks))
+    return JobVerdict(outcome, outputs, tuple(problems), (*remarks, *notes))
 
 
 def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: list[str]) -> bool:

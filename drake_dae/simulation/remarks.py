@@ -13,6 +13,7 @@ from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -49,6 +50,38 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
         f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there the surface "
         "continues as a plane"
     )
+
+
+def limit_remarks(record: Record, limits: Limits) -> list[str]:
+    """The drive and the joint that come closest to a limit, each relative to its own limits.
+
+    Args:
+        record: A record with control and state.
+        limits: The limits of the robot.
+    """
+    found = []
+    if limits.control is not None and np.isfinite(limits.control).any():
+        shares = np.max(np.abs(record["control"]), axis=0) / limits.control
+        place, signal = int(np.argmax(shares)), record.signals["control"].signals
+        unit = f" {signal[place].unit}".rstrip()
+        found.append(
+            f"of the drives {signal[place].name} comes closest to its limit, with "
+            f"{shares[place]:.0%} of {limits.control[place]:.4g}{unit}"
+        )
+    if limits.state is not None:
+        lower, upper = limits.state
+        values = record["state"][:, : lower.size]
+        left = np.minimum(values - lower, upper - values).min(axis=0)
+        # A joint with one limit alone has no range to compare with.
+        shares = np.where(np.isfinite(upper - lower), left / (upper - lower), np.inf)
+        place, signal = int(np.argmin(shares)), record.signals["state"].signals
+        if np.isfinite(shares[place]):
+            unit = f" {signal[place].unit}".rstrip()
+            found.append(
+                f"of the joints {signal[place].name} comes closest to a limit, with "
+                f"{left[place]:.3g}{unit} left"
+            )
+    return found
 
 
 def ball_remarks(radius: float | None) -> list[str]:

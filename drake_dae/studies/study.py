@@ -14,10 +14,11 @@ from drake_dae.analysis.tables import Part, Table, count_of, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
+from drake_dae.pictures.inline import InlinePage
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.variations import Variation
+from drake_dae.studies.variations import Variation, run_name
 
-FILES = ("runs.csv", "summary.txt", "histograms.png", "map.png")
+FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
 """The files of `Study.save`."""
 
 MOST_REASONS = 5
@@ -98,17 +99,28 @@ class Study:
             }
         return found
 
-    def save(self, folder: str | Path) -> list[Path]:
-        """Writes `runs.csv`, `summary.txt`, and the plots that the study has figures for.
+    def save(
+        self, folder: str | Path, title: str = "", again: Sequence[str] = (), duration: float = 1.0
+    ) -> list[Path]:
+        """Writes `runs.csv`, `summary.txt`, `study.html`, and the plots that it has figures for.
+
+        `study.html` is one page without anything from outside: a table to sort, parallel
+        coordinates, and runs beside each other. It shows the plots and the animation of a run that
+        has a folder "run<number>" beside the page.
 
         Args:
             folder: The folder to write to; it is made.
+            title: The title of the page; that of the folder if empty.
+            again: For each run a command that makes its folder, shown in the page.
+            duration: The duration of the runs, in s.
         """
         from drake_dae.studies.study_plots import save_study_plots
 
+        if again and len(again) != len(self.results):
+            raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        table, summary = place / FILES[0], place / FILES[1]
+        table, summary, page = (place / name for name in FILES[:3])
         columns = self.table()
         with open(table, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -117,13 +129,32 @@ class Study:
                 [_cell(entry) for entry in row] for row in zip(*columns.values(), strict=True)
             )
         summary.write_text(f"{self}\n", encoding="utf-8")
-        return [table, summary, *save_study_plots(self.table(), self.keys, self.figures, place)]
+        named = title or place.resolve().name
+        page.write_text(self._page(named, again, duration), encoding="utf-8")
+        plots = save_study_plots(columns, self.keys, self.figures, place)
+        return [table, summary, page, *plots]
+
+    def _repr_html_(self) -> str:
+        """The page of `save`, in a notebook."""
+        return self._page(repr(self), (), 1.0)._repr_html_()
+
+    def _page(self, title: str, again: Sequence[str], duration: float) -> InlinePage:
+        from drake_dae.studies.study_page import PageText, study_page
+
+        said = f"{count_of(len(self.results), 'run')}: {_counts(self.results)}"
+        names = [run_name(changes) for changes in self.variations]
+        text = PageText(title, said, names, again, duration)
+        return InlinePage(study_page(self.table(), self.keys, self.figures, text))
 
     def _parts(self) -> list[Part]:
         parts: list[Part] = [[f"{count_of(len(self.results), 'run')}: {_counts(self.results)}"]]
         others = [result for result in self.results if result.outcome is not Outcome.FINISHED]
         if others:
-            shown = [f"run {r.run} {r.outcome}: {r.reason}" for r in others[:MOST_REASONS]]
+            names = [run_name(self.variations[r.run]) for r in others[:MOST_REASONS]]
+            shown = [
+                f"run {r.run}, {name}, {r.outcome}: {r.reason}"
+                for r, name in zip(others, names, strict=False)
+            ]
             more = len(others) - len(shown)
             parts.append([*shown, f"and {more} more, see runs.csv"] if more else shown)
         beyond = Counter(name for result in self.results for name in result.exceeded)

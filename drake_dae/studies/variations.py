@@ -14,7 +14,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, vector
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 
 MOST_RUNS = 1_000_000
@@ -242,6 +242,32 @@ def _drawn(key: str, given: Any, count: int, seed: int) -> list[Any]:
         return low * (1.0 - share) + high * share
 
     return [filled(value, "", run) for run, value in enumerate(chosen)]
+
+
+def run_name(changes: Variation) -> str:
+    """What is special about a run: "link1.mass=9.6, tool.z=0.05".
+
+    A key is shortened to its last parts as long as it differs from the others.
+    """
+    parts = {key: key.split(".") for key in changes}
+
+    def short(key: str) -> str:
+        for count in range(2, len(parts[key]) + 1):
+            tail = parts[key][-count:]
+            if not any(other[-count:] == tail for name, other in parts.items() if name != key):
+                return ".".join(tail)
+        return key
+
+    return ", ".join(f"{short(key)}={_in_brief(value)}" for key, value in changes.items())
+
+
+def _in_brief(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else setting("", value)[1:]
+
+
+def setting(key: str, value: Any) -> str:
+    """The change "key=value" of a command line, which `load_scenario` reads back."""
+    return f"{key}={dump_yaml({'v': value}, on_one_line=True).strip()[4:-1]}"
 
 
 def plain(key: str, value: Any) -> Any:

@@ -15,8 +15,8 @@ import drake_dae
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands import simulate
-from drake_dae.pictures import view
 from drake_dae.pictures.plots import PLOTS
+from drake_dae.pictures.scene import view
 from drake_dae.scenario.shipped import find_scenario
 
 

@@ -122,7 +122,7 @@ def test_a_study_is_json(tmp_path, capsys):
         (["export", "--out="], "argument --out: a name is needed"),
         (["new", "a.urdf", "--out="], "argument --out: a name is needed"),
         (["render", ""], "argument folder: a name is needed"),
-        (["play", ""], "argument folder: a name is needed"),
+        (["play", ""], "argument RUN: a name is needed"),
         (["sweep", "--vary", "a=1", "--random=1_0"], "expected a whole number, got '1_0'"),
         (["sweep", "--vary", "a=1", "--time-limit=nan"], "expected a positive number of seconds"),
     ],

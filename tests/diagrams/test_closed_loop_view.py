@@ -35,11 +35,11 @@ from drake_dae import (
     start_meshcat,
 )
 from drake_dae.errors import ModelError
-from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
-from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
-from drake_dae.pictures.surroundings import scene_extent
-from drake_dae.pictures.view import FRAME_RATE, draw_scene
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.pictures.scene.arrows import ForceArrows, GrowingPaths
+from drake_dae.pictures.scene.run_motion import contact_paths, follow, frame_times
+from drake_dae.pictures.scene.surroundings import scene_extent
+from drake_dae.pictures.scene.view import FRAME_RATE, draw_scene
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches
 from drake_dae.robots.surfaces import surfaces
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scenario.shipped import find_scenario
@@ -127,7 +127,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
         np.testing.assert_allclose(rotation(quaternion)[:, 2], normal, atol=1e-3)
     for values in scale.values.T:
         np.testing.assert_allclose(values, force / np.max(force), rtol=1e-6)
-    # The longest arrow is a fifth of the scene, all of it on the free side, from the contact on.
+    # The longest arrow is a fifth of the scene; it ends at the contact, not on the tool.
     things, places = objects(page), transforms(page)
     shaft = things[f"{path}/arrow/shaft"]["geometries"][0]
     head = things[f"{path}/arrow/head"]["geometries"][0]
@@ -136,9 +136,9 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     _, size = scene_extent(model, ConstraintWrenches(model), nominal, loop.scene_graph)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
-    assert middle - shaft["height"] / 2 == pytest.approx(0.0, abs=1e-9)
+    assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
     tip = places[f"{path}/arrow/head"][2, 3]
-    assert tip == pytest.approx(shaft["height"] + head["height"], rel=1e-6)
+    assert tip == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.slow
@@ -182,6 +182,13 @@ def test_what_the_page_says(shown):
     assert "/" + "/".join(force["path"]) + "/arrow/head" in objects(page)
     wanted = at(record, "constraint_force", np.arange(33) / 32)[:, 0]
     np.testing.assert_allclose(force["values"], wanted, rtol=1e-3)
+    words = [text for _, text in said["legend"]]
+    assert f"constraint force, the longest {wanted.max():.3g} N" in words
+    (grid,) = [text for text in words if text.startswith("grid of ")]
+    lines = vertices(objects(page)["/floor"]).reshape(-1, 2, 3)
+    apart = np.diff(np.unique(np.round(lines[:, 0, 0], 6)))
+    # The page holds single precision.
+    np.testing.assert_allclose(apart, float(grid.split()[2]), atol=1e-5)
     (path,) = said["paths"]
     drawn = objects(page)["/" + "/".join(path)]["geometries"][0]["data"]
     # Six sides of two triangles for each of the 32 pieces, one after the other.
@@ -414,6 +421,17 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
     assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
     assert arrows.largest_force == 20.0
+
+
+def test_round_off_of_a_moment_is_no_arrow_of_full_length():
+    arrows = ForceArrows(start_meshcat(), arm("two_link").model, length=0.3)
+    row = np.array([[0.0, 0.0, 1.0]])
+    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 1e-9 * row)])
+    assert not arrows.has_moment
+    assert arrows.largest_moment > 1e3 * 1e-9
+    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 2.0 * row)])
+    assert arrows.has_moment
+    assert arrows.largest_moment == 2.0
 
 
 def shown_at_rest(model, forces):

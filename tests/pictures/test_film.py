@@ -1,5 +1,9 @@
 """Films: what they show, against the record and Drake's own camera."""
 
+import json
+import shutil
+import subprocess
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -68,8 +72,8 @@ def test_projection_is_that_of_drakes_camera():
 
 
 def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
-    with pytest.raises(ModelError, match=r"a \.gif, a strip of pictures a \.png, got 'x\.mp4'"):
-        save_film(*recorded("two_link_wall", "duration=0.01"), "x.mp4")
+    with pytest.raises(ModelError, match=r"a strip of pictures a \.png, got 'x\.avi'"):
+        save_film(*recorded("two_link_wall", "duration=0.01"), "x.avi")
     assert main(["render", str(tmp_path)]) == 1
     assert "is no folder of a run" in capsys.readouterr().err
 
@@ -84,3 +88,24 @@ def test_command_films_a_run(tmp_path, capsys):
     # The next run into this folder takes it away: it shows another run.
     assert main(["simulate", "two_link_wall", "--set", "duration=0.1", "--out", str(folder)]) == 0
     assert not (folder / "film.gif").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_an_mp4_has_all_moments_and_is_seen_by_any_browser(tmp_path):
+    loop, record, context = recorded("two_link_wall", "duration=0.4")
+    save_film(loop, record, context, tmp_path / "film.mp4")
+    asked = "stream=codec_name,width,height,pix_fmt,nb_frames,r_frame_rate"
+    command = ["ffprobe", "-v", "error", "-show_entries", asked, "-of", "json"]
+    done = subprocess.run([*command, tmp_path / "film.mp4"], capture_output=True, check=True)
+    (stream,) = json.loads(done.stdout)["streams"]
+    assert (stream["codec_name"], stream["pix_fmt"]) == ("h264", "yuv420p")
+    assert (stream["nb_frames"], stream["r_frame_rate"]) == ("11", "25/1")
+    assert (stream["width"], stream["height"]) == (960, 800)
+
+
+def test_without_ffmpeg_an_mp4_is_refused_before_anything_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ModelError, match=r"no.*install ffmpeg|install it \(apt install ffmpeg\)"):
+        save_film(*recorded("two_link_wall", "duration=0.01"), tmp_path / "film.mp4")
+    assert not list(tmp_path.iterdir())

@@ -1,11 +1,13 @@
 """Signals of runs, drawn over each other, and the command that does it."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from runs import scenario
 
-from drake_dae import Record
+from drake_dae import Record, build_scenario, simulate
 from drake_dae.cli import main
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -129,3 +131,16 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     ):
         assert main(["plot", *arguments]) == 1
         assert said in capsys.readouterr().err
+
+
+def test_a_notebook_shows_figures_and_loops(monkeypatch):
+    """As PNG, without Matplotlib's inline mode; blocks and wires where Graphviz is."""
+    case = scenario("two_link_wall", "duration=0.05")
+    loop, context = build_scenario(case)
+    simulate(loop.diagram, context, case.duration, case.integrator)
+    figure = plot_runs({"one": loop.record(context)})
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    if shutil.which("dot"):
+        assert loop._repr_html_().startswith("<svg")
+    monkeypatch.setenv("PATH", "")
+    assert loop._repr_html_() is None

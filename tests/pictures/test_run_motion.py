@@ -6,7 +6,7 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import LinkExpressions, PointCoordinates, PointOnSurface, RobotModel, Sphere
-from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
+from drake_dae.pictures.scene.run_motion import RunMotion, contact_paths, follow
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 
 
@@ -33,7 +33,7 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     times, nothing = np.arange(len(places)) * 0.1, np.zeros((0, 6))
     flashes = np.zeros((len(places), 1))
     course = RunMotion(
-        None, model, times, 0.0, states, parameters, wrenches, nothing, acting, flashes
+        None, model, times, 0.0, states, parameters, wrenches, nothing, acting, flashes, {}
     )
     (path,) = contact_paths(course)
     assert path.name == "ball"

@@ -10,8 +10,8 @@ import pytest
 
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.plots import plot_paths
-from drake_dae.pictures.run_motion import contact_paths, follow, run_extent
-from drake_dae.pictures.surroundings import surroundings
+from drake_dae.pictures.scene.run_motion import contact_paths, follow, run_points
+from drake_dae.pictures.scene.surroundings import surroundings
 from drake_dae.scenario.build import build_scenario
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
@@ -65,10 +65,8 @@ def test_a_wall_is_as_long_as_the_way_along_it():
 def test_the_head_of_the_biped_is_in_sight():
     """Its hip is at 0.7 m, and the trunk and the head stand 0.6 m above it."""
     run, loop = course("biped", "duration=0.5")
-    middle, size = run_extent(run, loop.scene_graph)
-    assert middle[2] + size / 2 >= 1.3
-    links_alone, small = run_extent(run, None)
-    assert links_alone[2] + small / 2 < middle[2] + size / 2
+    assert run_points(run, loop.scene_graph)[:, 2].max() >= 1.3
+    assert run_points(run, None)[:, 2].max() < 1.0
 
 
 @pytest.mark.slow

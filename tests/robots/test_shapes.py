@@ -16,8 +16,9 @@ from drake_dae import (
     Sphere,
     shipped_model,
 )
-from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
-from drake_dae.robots.geometry.shapes import LinkShapes, collisions
+from drake_dae.robots.geometry.clearances import LinkBehind, links_behind, surface_distances
+from drake_dae.robots.geometry.shapes import LinkShapes, collisions, nearest_links
+from drake_dae.robots.geometry.speeds import contact_speeds
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 BASE, LENGTH, RADIUS = 0.3, 0.5, 0.06
@@ -169,6 +170,59 @@ def test_a_robot_without_shapes_has_none():
     bare = LinkShapes(model, None)
     assert not bare
     assert collisions(bare, np.zeros(1), np.zeros((1, 8))) == ()
+
+
+def test_the_least_distances_and_when_they_are_by_hand():
+    """Balls at the ends of links over a table, and of the first and the last link."""
+    model, shapes = chain(Plane(point=[0.0, 0.0, -0.5], normal=[0.0, 0.0, 1.0]))
+    turns = np.linspace(0.3, 1.1, 20)
+    states = np.array([[0.1, 0.2, turn, turn, 0, 0, 0, 0] for turn in turns])
+    own = np.tile(model.dae.parameter_values, (20, 1))
+    times = np.arange(20) / 100.0
+    (table,) = surface_distances(model, times, states, own, shapes)
+    # The last link is at the contact, the first at the base: of the others the third is lowest.
+    heights = np.array([[ends(state[:JOINTS])[k, 2] for k in (1, 2)] for state in states]) + 0.5
+    row, column = divmod(int(np.argmin(heights)), 2)
+    assert (table.first, table.second) == (("link1", "link2")[column], "wall")
+    assert table.distance == pytest.approx(heights[row, column] - RADIUS, rel=1e-9)
+    assert table.time == times[row]
+    assert "comes closest to the surface of 'wall' at" in str(table)
+
+    near = nearest_links(shapes, times, states)
+    apart = [
+        np.linalg.norm(places[3] - places[0]) - 2 * RADIUS
+        for places in (ends(state[:JOINTS]) for state in states)
+    ]
+    assert {near.first, near.second} == {"link0", "link3"}
+    # Drake's distance of balls is exact.
+    assert near.distance == pytest.approx(min(apart), rel=1e-9)
+    assert near.time == times[np.argmin(apart)]
+    # Without shapes links are their origins.
+    (bare,) = surface_distances(model, times, states, own)
+    assert bare.of_origin
+    origins = [ends(state[:JOINTS])[k - 1, 2] + 0.5 for state in states for k in (1, 2, 3)]
+    assert bare.distance == pytest.approx(min(origins), rel=1e-9)
+    assert nearest_links(LinkShapes(model, None), times, states) is None
+
+
+def test_a_contact_point_goes_as_fast_as_its_frame():
+    """All joints turn about y: the velocity is the sum of rates times levers."""
+    model, _ = chain(Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0]))
+    random = np.random.default_rng(3)
+    states, times = random.normal(size=(20, 2 * JOINTS)), np.arange(20) / 10.0
+    own = np.tile(model.dae.parameter_values, (20, 1))
+    wanted = []
+    for state in states:
+        places = np.vstack([[0.0, 0.0, BASE], ends(state[:JOINTS])])
+        velocity = sum(
+            np.cross([0.0, rate, 0.0], places[-1] - joint)
+            for rate, joint in zip(state[JOINTS:], places[:-1], strict=True)
+        )
+        wanted.append(np.linalg.norm(velocity))
+    (one,) = contact_speeds(model, times, states, own)
+    assert (one.constraint, one.frame) == ("wall", "tip")
+    assert one.speed == pytest.approx(max(wanted), rel=1e-9)
+    assert one.time == times[np.argmax(wanted)]
 
 
 @pytest.mark.slow

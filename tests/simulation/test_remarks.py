@@ -9,7 +9,8 @@ from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.simulation.remarks import departure_remarks
+from drake_dae.simulation.remarks import departure_remarks, limit_remarks
+from drake_dae.simulation.summary import Limits
 
 SHORT = ("--set", "duration=0.02", "--set", "write={plots: false, animation: false}")
 
@@ -48,3 +49,23 @@ def test_a_run_says_when_limits_made_errors_leave_their_prediction():
     held = replace(record, signals={**record.signals, "departure": still})
     assert departure_remarks(held, None) == []
     assert departure_remarks(Record(times, {"control": Recorded(control, of_control)}), None) == []
+
+
+def test_the_nearest_limits_are_named_with_what_is_left():
+    """Of two drives the second uses 60 %; of two joints the first is 0.1 of its 4 rad away."""
+    control = np.array([[1.0, -6.0], [-2.0, 3.0]])
+    state = np.array([[0.0, 0.0], [1.6, 0.4]])
+    record = Record(
+        [0.0, 1.0],
+        {
+            "control": Recorded(control, [Signal("first", "N m"), Signal("second", "N m")]),
+            "state": Recorded(state, [Signal("shoulder", "rad"), Signal("elbow", "rad")]),
+        },
+    )
+    limits = Limits(np.array([np.inf, 10.0]), (np.array([-2.0, -1.0]), np.array([2.0, 1.0])))
+    assert limit_remarks(record, limits) == [
+        "of the drives second comes closest to its limit, with 60% of 10 N m",
+        "of the joints shoulder comes closest to a limit, with 0.4 rad left",
+    ]
+    free = np.array([-np.inf, -np.inf]), np.array([np.inf, 1.0])
+    assert limit_remarks(record, Limits(np.array([np.inf, np.inf]), free)) == []

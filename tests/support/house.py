@@ -73,7 +73,13 @@ LONG = {
 }
 
 # Distributions whose modules bear another name.
-IMPORT_NAMES = {"cupy-cuda12x": "cupy", "drake": "pydrake", "pyyaml": "yaml"}
+IMPORT_NAMES = {
+    "cupy-cuda12x": "cupy",
+    "drake": "pydrake",
+    "pycollada": "collada",
+    "pyyaml": "yaml",
+    "rerun-sdk": "rerun",
+}
 
 
 def declared_modules() -> set[str]:

@@ -155,25 +155,11 @@ class CsvReference(SplineReference):
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:
     """Columns of a file, the first one increasing from 0, shape (k, len(names))."""
-    try:
-        lines = read_text(file).splitlines()
-        delimiter = max(",;\t", key=lines[0].count if lines else len)
-        cells = [row for row in csv.reader(lines, delimiter=delimiter) if any(row)]
-    except (OSError, ValueError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ReferenceSignalError(f"cannot read '{file}': {reason}") from error
-    header = [name.strip() for name in cells[0]] if cells else []
+    header, cells = read_cells(file)
     for name in names:
         if name not in header:
             raise ReferenceSignalError(f"'{file}': {unknown_name('column', name, header)}")
-    places = [header.index(name) for name in names]
-    values = np.empty((len(cells) - 1, len(names)))
-    for index, row in enumerate(cells[1:]):
-        for column, place in enumerate(places):
-            cell = row[place] if place < len(row) else ""
-            values[index, column] = _number(cell, f"'{file}', row {index + 2}, {names[column]}")
-    if len(values) < 2:
-        raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")
+    values = numbers_of(file, header, cells, names)
     steps = np.diff(values[:, 0])
     if not np.all(steps > 0):
         place = int(np.argmin(steps > 0))
@@ -182,6 +168,41 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
             f"after {values[place, 0]:g}"
         )
     values[:, 0] -= values[0, 0]
+    return values
+
+
+def read_cells(file: Path) -> tuple[list[str], list[list[str]]]:
+    """The names of the columns of a file, and its other rows that are not empty.
+
+    Raises:
+        ReferenceSignalError: It cannot be read.
+    """
+    try:
+        lines = read_text(file).splitlines()
+        delimiter = max(",;\t", key=lines[0].count if lines else len)
+        cells = [row for row in csv.reader(lines, delimiter=delimiter) if any(row)]
+    except (OSError, ValueError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ReferenceSignalError(f"cannot read '{file}': {reason}") from error
+    return [name.strip() for name in cells[0]] if cells else [], cells[1:]
+
+
+def numbers_of(
+    file: Path, header: Sequence[str], cells: Sequence[Sequence[str]], names: Sequence[str]
+) -> FloatArray:
+    """Columns as numbers, shape (k, len(names)) with k >= 2.
+
+    Raises:
+        ReferenceSignalError: A cell is no number, or there are too few rows.
+    """
+    places = [header.index(name) for name in names]
+    values = np.empty((len(cells), len(names)))
+    for index, row in enumerate(cells):
+        for column, place in enumerate(places):
+            cell = row[place] if place < len(row) else ""
+            values[index, column] = _number(cell, f"'{file}', row {index + 2}, {names[column]}")
+    if len(values) < 2:
+        raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")
     return values
 
 

@@ -7,9 +7,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.robots.constraints.constraint import Touch
-from drake_dae.robots.geometry.shapes import TOUCHING, LinkShapes, moments
+from drake_dae.robots.geometry.shapes import TOUCHING, LeastDistance, LinkShapes, moments
 from drake_dae.robots.model import RobotModel
 from drake_dae.trace.functions import TracedFunction
 
@@ -52,6 +52,36 @@ class LinkBehind:
             f"{self.link} is behind the surface of '{self.constraint}' {when}, by up to "
             f"{self.depth:.3g} m"
         )
+
+
+def surface_distances(
+    model: RobotModel,
+    times: FloatArray,
+    states: FloatArray,
+    parameters: FloatArray,
+    shapes: LinkShapes | None = None,
+) -> tuple[LeastDistance, ...]:
+    """The link that comes closest to each surface along a motion.
+
+    Which links count is as for `links_behind`: not what is at the contact, nor what is farther from
+    it than from what stands still.
+
+    Args:
+        model: The robot.
+        times: The times of the motion in s, shape (k,).
+        states: x at these times, shape (k, n).
+        parameters: The values of all parameters at these times, shape (k, P).
+        shapes: The collision geometry of the links; without any a link is its origin.
+    """
+    found, chosen = list[LeastDistance](), moments(len(times))
+    for constraint in model.constraints if len(times) else ():
+        touch = constraint.touch(model.links)
+        if touch is None:
+            continue
+        surface = _Surface(model, constraint.name, touch)
+        nearest = surface.nearest(times[chosen], states[chosen], parameters[chosen], shapes)
+        found += [nearest] if nearest is not None else []
+    return tuple(found)
 
 
 def links_behind(
@@ -142,6 +172,48 @@ class _Surface:
         self, times: FloatArray, states: FloatArray, parameters: FloatArray
     ) -> LinkBehind | None:
         """The link whose origin is deepest; None if none is behind."""
+        found = self._origins_along(states, parameters)
+        if found is None:
+            return None
+        depths, to_contact, counts = found
+        counts &= depths > SHARE * to_contact
+        return self._worst(times, np.where(counts, depths, 0.0), self._links)
+
+    def deepest_shape(
+        self, shapes: LinkShapes, times: FloatArray, states: FloatArray, parameters: FloatArray
+    ) -> LinkBehind | None:
+        """The link whose shape is deepest; None if none is behind."""
+        depths = self._depths_of_shapes(shapes, states, parameters, True)
+        if depths is None:
+            return None
+        names = [shapes.name(index) for index in range(shapes.count)]
+        return self._worst(times, np.maximum(depths, 0.0), names)
+
+    def nearest(
+        self,
+        times: FloatArray,
+        states: FloatArray,
+        parameters: FloatArray,
+        shapes: LinkShapes | None,
+    ) -> LeastDistance | None:
+        """The link that comes closest; None if none counts."""
+        depths, of_origin = None, True
+        if shapes:
+            depths, of_origin = self._depths_of_shapes(shapes, states, parameters, False), False
+            names = [shapes.name(index) for index in range(shapes.count)]
+        if depths is None or not np.isfinite(depths).any():
+            found, names, of_origin = self._origins_along(states, parameters), self._links, True
+            depths = None if found is None else np.where(found[2], found[0], -np.inf)
+        if depths is None or not np.isfinite(depths).any():
+            return None
+        row, column = divmod(int(np.argmax(depths)), len(names))
+        distance, time = -float(depths[row, column]), float(times[row])
+        return LeastDistance(names[column], self._name, True, of_origin, distance, time)
+
+    def _origins_along(
+        self, states: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Booleans] | None:
+        """How deep origins of links are, how far from the contact, and which count, by states."""
         if not self._links:
             return None
         values = [
@@ -149,34 +221,41 @@ class _Surface:
             for state, own in zip(states, parameters, strict=True)
         ]
         depths, to_contact, to_base = (np.array(each) for each in zip(*values, strict=True))
-        counts = (depths > SHARE * to_contact) & (to_contact < NEARER * to_base)
+        counts = to_contact < NEARER * to_base
         # What is at the contact itself is on the surface.
         counts &= to_contact > SHARE * to_contact.max(axis=1, keepdims=True)
-        return self._worst(times, np.where(counts, depths, 0.0), self._links)
+        return depths, to_contact, counts
 
-    def deepest_shape(
-        self, shapes: LinkShapes, times: FloatArray, states: FloatArray, parameters: FloatArray
-    ) -> LinkBehind | None:
-        """The link whose shape is deepest; None if none is behind."""
+    def _depths_of_shapes(
+        self, shapes: LinkShapes, states: FloatArray, parameters: FloatArray, behind: bool
+    ) -> FloatArray | None:
+        """How deep the shapes of links are, one row for each state; -inf where none counts.
+
+        Args:
+            shapes: The shapes.
+            states: x, one row for each moment.
+            parameters: The values of all parameters, one row for each moment.
+            behind: Whether only shapes count that are behind the surface by more than they touch.
+        """
         at_contact, at_base, found = shapes.moved_with(self._touch.frame), shapes.at_base(), []
         if shapes.links <= at_contact:
             return None
         for state, own in zip(states, parameters, strict=True):
             shapes.place(state)
-            row = np.zeros(shapes.count)
+            row = np.full(shapes.count, -np.inf)
             for index, points, radius in shapes.corners():
                 if index in at_contact:
                     continue
                 values = self._corner(points.T, state[: self._nq], own)
                 depth, to_contact, to_base, base = (np.array(each).ravel() for each in values)
                 counts = to_contact < NEARER * to_base
-                if index not in at_base:
-                    counts |= base < TOUCHING
-                counts &= depth + radius > np.maximum(TOUCHING, SHAPE * to_contact)
-                row[index] = max(row[index], np.max(np.where(counts, depth + radius, 0.0)))
+                if behind:
+                    if index not in at_base:
+                        counts |= base < TOUCHING
+                    counts &= depth + radius > np.maximum(TOUCHING, SHAPE * to_contact)
+                row[index] = max(row[index], np.max(np.where(counts, depth + radius, -np.inf)))
             found.append(row)
-        names = [shapes.name(index) for index in range(shapes.count)]
-        return self._worst(times, np.array(found), names)
+        return np.array(found)
 
     def _worst(
         self, times: FloatArray, depths: FloatArray, names: Sequence[str]

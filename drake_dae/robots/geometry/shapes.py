@@ -60,6 +60,31 @@ class Collision:
         return f"{self.first} and {self.second} collide {when}, by up to {self.depth:.3g} m"
 
 
+@dataclass(frozen=True)
+class LeastDistance:
+    """How near something of a robot comes to something else along a motion.
+
+    Attributes:
+        first, second: The names of two links, or of a link and of the constraint of a surface.
+        is_surface: Whether `second` is that of a surface.
+        of_origin: Whether the link is its origin, since links have no shapes.
+        distance: The distance in m; below 0 if they overlap.
+        time: When, in s.
+    """
+
+    first: str
+    second: str
+    is_surface: bool
+    of_origin: bool
+    distance: float
+    time: float
+
+    def __str__(self) -> str:
+        who = f"the origin of {self.first}" if self.of_origin else self.first
+        what = f"the surface of '{self.second}'" if self.is_surface else self.second
+        return f"{who} comes closest to {what} at {self.time:.4g} s, {self.distance:.3g} m"
+
+
 def moments(count: int, most: int = ROWS) -> np.ndarray:
     """Which of so many states are looked at, evenly."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
@@ -137,6 +162,21 @@ class LinkShapes:
             pair = min(first, second), max(first, second)
             if pair[0] >= 0:
                 found[pair] = max(found.get(pair, 0.0), each.depth)
+        return found
+
+    def distances(self) -> dict[tuple[int, int], float]:
+        """Pairs of links -> their distance now, in m, below 0 where they overlap.
+
+        Raises:
+            RuntimeError: Drake has no distance between two of the shapes.
+        """
+        query = self._scene_graph.get_query_output_port().Eval(self._of_scene)
+        found: dict[tuple[int, int], float] = {}
+        for each in query.ComputeSignedDistancePairwiseClosestPoints():
+            first, second = (self._body.get(one, -1) for one in (each.id_A, each.id_B))
+            pair = min(first, second), max(first, second)
+            if pair[0] >= 0 and pair[0] != pair[1]:
+                found[pair] = min(found.get(pair, np.inf), each.distance)
         return found
 
     def corners(self) -> Iterator[tuple[int, FloatArray, float]]:
@@ -221,6 +261,42 @@ def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tup
         deepest, since = map(float, times[at])
         collided.append(Collision(first, second, float(depths.max()), deepest, since))
     return tuple(sorted(collided, key=lambda one: -one.depth))
+
+
+def nearest_links(
+    shapes: LinkShapes, times: FloatArray, states: FloatArray
+) -> LeastDistance | None:
+    """The two links that come closest to each other along a motion.
+
+    Pairs with fewer than three joints between them, and those that a constraint brings together,
+    are close by design.
+
+    Args:
+        shapes: The shapes of the links.
+        times: The times of the motion in s, shape (k,).
+        states: x at these times, shape (k, n).
+
+    Returns:
+        None if no pair is left, or Drake has no distance between the shapes.
+    """
+    found: LeastDistance | None = None
+    if not shapes:
+        return None
+    skipped = shapes.held()
+    for index in moments(len(times)):
+        shapes.place(states[index])
+        try:
+            now = shapes.distances()
+        except RuntimeError:
+            return None
+        for pair, distance in now.items():
+            if pair in skipped or shapes.may_overlap(pair) == COARSE:
+                continue
+            if found is None or distance < found.distance:
+                first, second = map(shapes.name, pair)
+                time = float(times[index])
+                found = LeastDistance(first, second, False, False, distance, time)
+    return found
 
 
 def _corners(shape: object) -> tuple[FloatArray, float]:

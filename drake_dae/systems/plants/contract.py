@@ -76,6 +76,8 @@ class Plant(System):
     13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
     14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
+    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+        the law may not know; not negative.
     """
 
     __slots__ = ()
@@ -123,6 +125,14 @@ class Plant(System):
     def current_parameters(self, context: Context) -> FloatArray:
         """All parameters as `parameters`, with exogenous ones at the context's time."""
         return self.parameters(context)
+
+    def friction(self, context: Context) -> dict[str, float]:
+        """Name of a constraint -> its coefficient of friction, of those that have one."""
+        values, found = self.parameters(context), dict[str, float]()
+        for constraint in self.model.constraints if self.model is not None else ():
+            if (name := constraint.friction_parameter) is not None:
+                found[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
+        return found
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         """The parameters at the times of a run, in s, one row for each."""

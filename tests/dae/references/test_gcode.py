@@ -266,3 +266,48 @@ def test_a_tight_arc_does_not_slow_the_lines_beside_it(tmp_path):
     assert speeds.max() > 0.98 * 0.2
     assert speeds[values[:, 0, 0] > 0.203].max() < 0.1
     assert accelerations.max() <= 2.0 * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(("column", "factor"), [("feed", 1.0), ("speed", 1.0 / 60.0)])
+def test_points_with_speeds_are_the_same_lines_as_a_program(column, factor, tmp_path):
+    """In mm, feeds in mm/min as F is, speeds in mm/s; a point that repeats is no move."""
+    corners = [(0, 0, 1), (80, 0, 6000), (80, 0, 10), (80, 60, 4500), (10, 20, 3000)]
+    rows = [f"{x};{y};{factor * feed}" for x, y, feed in corners]
+    (tmp_path / "path.csv").write_text("\n".join([f"x;y;{column}", *rows]))
+    lines = [f"G1 X{x} Y{y} F{feed}" for x, y, feed in corners]
+    (tmp_path / "path.nc").write_text("\n".join(lines))
+    force = {"press": [15.0, 5.0]}
+    points = GCodeReference(str(tmp_path / "path.csv"), LIMITS, **force)
+    program = GCodeReference(str(tmp_path / "path.nc"), LIMITS, **force)
+    np.testing.assert_allclose(points.spline.points, program.spline.points, atol=1e-12)
+    assert points.spline.step == pytest.approx(program.spline.step, rel=1e-12)
+    assert points.deviation <= points.tolerance
+
+
+def test_points_without_speeds_go_at_the_limit_and_press_all_the_way(tmp_path):
+    (tmp_path / "path.csv").write_text("x,y\n0,0\n400,0\n")
+    reference = GCodeReference(str(tmp_path / "path.csv"), LIMITS, press=[15.0, 5.0])
+    times, values = samples(reference, 1)
+    middle = np.abs(times / times[-1] - 0.5) < 0.1
+    np.testing.assert_allclose(values[middle, 0, 1], LIMITS.speed, rtol=1e-2)
+    np.testing.assert_allclose(values[:, 2, 0], 15.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has the columns x and y in mm, .* got none"),
+        ("x,z\n1,2\n3,4", "has the columns x and y in mm, .* got x, z"),
+        ("x,y,speed,feed\n1,2,3,4\n1,3,3,4", "speed in mm/s or feed in mm/min"),
+        ("x,x,y\n1,2,3\n1,3,3", "got x, x, y"),
+        ("x,y,nx,ny,nz\n1,2,0,0,1\n1,3,0,0,1", "nx, ny, nz would not be followed"),
+        ("x,y,speed\n1,2,3\n1,3,0", "row 3: speed must be positive, got 0"),
+        ("x,y\n1,2\n1,2", "moves nothing"),
+        ("x,y\n1,2", "has 1 rows of numbers, 2 are needed"),
+        ("x,y\n1,2\n1,wide", "row 3, y: expected a number, got 'wide'"),
+    ],
+)
+def test_points_that_are_no_path_are_refused(text, message, tmp_path):
+    (tmp_path / "path.csv").write_text(text)
+    with pytest.raises(ReferenceSignalError, match=message):
+        _ = GCodeReference(str(tmp_path / "path.csv"), LIMITS).spline

@@ -1,6 +1,8 @@
 """Meshes that Drake cannot read or draw are left out by name; the rest of a robot is as it was."""
 
+import json
 import sys
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from vendors import COLLADA, binary_stl, write_panda, write_ur5
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
-from drake_dae.pictures.view import start_meshcat
+from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
@@ -255,3 +257,57 @@ def test_an_mjcf_body_that_weighs_what_its_mesh_does_is_refused(head: str, tmp_p
         ScenarioError, match=r"robot\.file: body 'a' has its mass from .*upper\.stl"
     ):
         build_scenario(load_scenario(path))
+
+
+def box_of_collada(file: Path, unit: float) -> None:
+    """A red box of 100 x 200 x 300 units as CAD programs write it."""
+    collada = pytest.importorskip("collada")
+    mesh = collada.Collada()
+    mesh.assetInfo.unitmeter = unit
+    mesh.assetInfo.unitname = "own"
+    effect = collada.material.Effect("paint", [], "phong", diffuse=(1.0, 0.0, 0.0, 1.0))
+    material = collada.material.Material("m", "m", effect)
+    mesh.effects.append(effect)
+    mesh.materials.append(material)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    source = collada.source.FloatSource("v", (signs * [50, 100, 150]).ravel(), ("X", "Y", "Z"))
+    geometry = collada.geometry.Geometry(mesh, "g", "g", [source])
+    inputs = collada.source.InputList()
+    inputs.addInput(0, "VERTEX", "#v")
+    faces = [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1]
+    faces += [2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
+    geometry.primitives.append(geometry.createTriangleSet(np.array(faces), inputs, "r"))
+    mesh.geometries.append(geometry)
+    bound = collada.scene.MaterialNode("r", material, inputs=[])
+    node = collada.scene.Node("n", [collada.scene.GeometryNode(geometry, [bound])])
+    scene = collada.scene.Scene("s", [node])
+    mesh.scenes.append(scene)
+    mesh.scene = scene
+    written = BytesIO()  # Its writer leaves files open.
+    mesh.write(written)
+    file.write_bytes(written.getvalue())
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.001])
+def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float, tmp_path: Path):
+    """Drake's renderer of films takes a .gltf and no .dae; a .gltf has y upward, Drake turns it."""
+    box_of_collada(tmp_path / "box.dae", unit)
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="r"><link name="a"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
+        'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'
+        '<mesh filename="box.dae" scale="2 1 1"/></geometry></visual></link></robot>'
+    )
+    scene_graph = SceneGraph()
+    read(tmp_path / "robot.urdf", scene_graph)
+    inspector = scene_graph.model_inspector()
+    (one,) = inspector.GetAllGeometryIds(Role.kPerception)
+    drawn = Path(inspector.GetShape(one).source().path())
+    assert drawn.name == "box.gltf"
+    (material,) = json.loads(drawn.read_text())["materials"]
+    assert material["pbrMetallicRoughness"]["baseColorFactor"] == [1.0, 0.0, 0.0, 1.0]
+    box = inspector.GetObbInGeometryFrame(one)
+    corners = box.pose().multiply(
+        np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1) * box.half_width()[:, None]
+    )
+    # .gltf has single precision; Drake's box has a margin of its own.
+    np.testing.assert_allclose(np.ptp(corners, axis=1), unit * np.array([200, 200, 300]), rtol=1e-3)

@@ -290,6 +290,14 @@ def test_a_plant_from_outside_springs_back_as_its_equation_says():
     np.testing.assert_allclose(k, k[0] * (1.0 + at) * np.exp(-at), atol=1e-6 * abs(k[0]))
 
 
+def test_rule_15_friction(plant):
+    context = plant.CreateDefaultContext()
+    names = [] if plant.model is None else [one.name for one in plant.model.constraints]
+    found = plant.friction(context)
+    assert set(found) <= set(names)
+    assert all(value >= 0.0 for value in found.values())
+
+
 @pytest.mark.slow
 def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monkeypatch):
     """Named in the file alone. Its errors are those of the package's plant, to the accuracy."""

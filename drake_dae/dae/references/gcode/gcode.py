@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
+from drake_dae.dae.references.gcode.points import read_points
 from drake_dae.dae.references.gcode.program import Move, Program, read_program
 from drake_dae.dae.references.paths import check_order
 from drake_dae.dae.references.splines import (
@@ -54,8 +55,12 @@ class GCodeReference(SplineReference):
     tells the rounding and the duration. With `press` there is a third output, a force that is
     smaller in G0 moves.
 
+    A .csv has the points of a path without times in place of a program: x and y in mm, and the
+    speed in mm/s or the feed in mm/min with which a point is reached, see `read_points`; without
+    speeds the limit of the speed holds. With `press` all of it has the first force.
+
     Attributes:
-        file: The program.
+        file: The program, or the points as a .csv.
         limits: The largest speed, acceleration and jerk of the two outputs, in m and s.
         origin: Where X0 Y0 is, shape (2,), in m.
         along: The direction of X, shape (2,): the change of the outputs per m.
@@ -95,6 +100,8 @@ class GCodeReference(SplineReference):
     @cached_property
     def program(self) -> Program:
         """The moves of the file."""
+        if Path(self.file).suffix.lower() == ".csv":
+            return read_points(self.file)
         try:
             return read_program(read_text(self.file), self.file)
         except (OSError, ValueError) as error:
@@ -158,7 +165,8 @@ class GCodeReference(SplineReference):
             allowed *= max(0.9 * self.tolerance / off, 0.25)
         points = np.asarray(self.origin) + path.at(along) @ np.array([self.along, self.up])
         if self.press is not None:
-            is_rapid = np.array([not isfinite(move.speed) for move in path.moves])
+            is_program = Path(self.file).suffix.lower() != ".csv"
+            is_rapid = np.array([is_program and not isfinite(m.speed) for m in path.moves])
             force = np.asarray(self.press)[is_rapid[path.moves_at(along)].astype(int)]
             points = np.column_stack([points, force])
         spline = spline_within(points, self.limits, self.start_time, self.order, among=2)

@@ -1,14 +1,28 @@
-"""Meshes that Drake neither reads nor draws, converted to .obj by the optional package trimesh."""
+"""Meshes that Drake neither reads nor draws everywhere, converted by the optional package trimesh.
 
+Drake's films draw .obj and .gltf, and its Meshcat .dae as well. So a .dae becomes a .gltf, with the
+colors and textures of its vendor, and others an .obj, which has the color of the robot's file.
+"""
+
+import re
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
 
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.mesh_file import read_mesh
 
 ORIGINALS: dict[Path, Path] = {}
 """A converted mesh -> its original."""
+
+_UPWARD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From z upward to y upward, as a .gltf has it."""
+
+_UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([-+.0-9eE]+)")
 
 
 def as_obj(mesh: Path) -> Path | None:
@@ -17,26 +31,74 @@ def as_obj(mesh: Path) -> Path | None:
     Returns:
         The file; None if the mesh cannot be read, or trimesh is not installed.
     """
+    return _copy(mesh, ".obj")
+
+
+def as_gltf(mesh: Path) -> Path | None:
+    """A .dae as a .gltf in m with its colors, in a file that lasts as long as this process.
+
+    As in ROS, its unit counts, and the axis that it calls upward does not.
+
+    Returns:
+        The file; None if the mesh cannot be read, or trimesh or pycollada is not installed.
+    """
+    return _copy(mesh, ".gltf")
+
+
+def _copy(mesh: Path, kind: str) -> Path | None:
     try:
         found = mesh.resolve().stat()
     except (OSError, ValueError):
         return None
-    return _converted(mesh.resolve(), found.st_mtime_ns, found.st_size)
+    return _converted(mesh.resolve(), kind, found.st_mtime_ns, found.st_size)
 
 
 @cache
-def _converted(mesh: Path, changed: int, size: int) -> Path | None:
+def _converted(mesh: Path, kind: str, changed: int, size: int) -> Path | None:
     try:
-        vertices, triangles = read_mesh(mesh)
+        text = _gltf(mesh) if kind == ".gltf" else _obj(mesh)
     except ModelError:
         return None
-    copy = Path(_folder().name).resolve() / str(len(ORIGINALS)) / f"{mesh.stem}.obj"
+    copy = Path(_folder().name).resolve() / str(len(ORIGINALS)) / f"{mesh.stem}{kind}"
     copy.parent.mkdir()
-    places = (f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices.tolist())
-    corners = (f"f {i} {j} {k}\n" for i, j, k in (triangles + 1).tolist())
-    copy.write_text("".join((*places, *corners)), "ascii")
+    copy.write_bytes(text)
     ORIGINALS[copy] = mesh
     return copy
+
+
+def _obj(mesh: Path) -> bytes:
+    """A mesh with a normal for each triangle, since Drake's films need some."""
+    vertices, triangles = read_mesh(mesh)
+    corners = vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.where(lengths > 0.0, lengths, 1.0)
+    rows = [
+        *("v {:.9g} {:.9g} {:.9g}\n".format(*place) for place in vertices.tolist()),
+        *("vn {:.5g} {:.5g} {:.5g}\n".format(*normal) for normal in normals.tolist()),
+        *(
+            f"f {i}//{number} {j}//{number} {k}//{number}\n"
+            for number, (i, j, k) in enumerate((triangles + 1).tolist(), start=1)
+        ),
+    ]
+    return "".join(rows).encode("ascii")
+
+
+def _gltf(mesh: Path) -> bytes:
+    if find_spec("collada") is None or find_spec("trimesh") is None:
+        raise ModelError(f"'{mesh.name}': pip install 'drake_dae[meshes]' converts it")
+    import trimesh
+
+    try:
+        scene: Any = trimesh.load_scene(mesh)
+        if scene.is_empty:
+            raise ModelError(f"no mesh in '{mesh.name}'")
+        unit = _UNIT.search(mesh.read_bytes())
+        scene.apply_transform(_UPWARD @ np.diag([*[float(unit[1]) if unit else 1.0] * 3, 1.0]))
+        written: Any = scene.export(file_type="gltf", merge_buffers=True, embed_buffers=True)
+        return bytes(written["model.gltf"])
+    except Exception as error:  # Neither package has exceptions of its own.
+        raise ModelError(f"no mesh in '{mesh.name}': {error}") from None
 
 
 @cache

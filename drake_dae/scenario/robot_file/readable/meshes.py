@@ -20,7 +20,7 @@ from pydrake.multibody.parsing import (
 )
 
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.readable.converted import as_obj
+from drake_dae.scenario.robot_file.readable.converted import as_gltf, as_obj
 from drake_dae.scenario.robot_file.readable.inertias import RepairedInertia, possible_inertias
 from drake_dae.scenario.robot_file.readable.mjcf import without_assets
 from drake_dae.scenario.robot_file.readable.placing import (
@@ -46,7 +46,7 @@ _MESH = {
 """The same, for meshes only."""
 
 DRAWN = (".obj", ".gltf", ".dae")
-"""The kinds of mesh that Drake's Meshcat draws."""
+"""The kinds of mesh that Drake's Meshcat draws; its films draw the first two."""
 
 
 @dataclass(frozen=True)
@@ -183,13 +183,13 @@ def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[st
 
 
 def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
-    """Replaces meshes that cannot be drawn by drawable copies, if there are any."""
+    """Replaces meshes that cannot be drawn everywhere by drawable copies, if there are any."""
 
     def drawn(found: re.Match[str]) -> str:
         mesh = _resolved(found[2], file, packages)
-        if mesh is None or mesh.suffix.lower() in DRAWN:
+        if mesh is None or mesh.suffix.lower() in DRAWN[:2]:
             return found[0]
-        copy = as_obj(mesh)
+        copy = as_gltf(mesh) if mesh.suffix.lower() == ".dae" else as_obj(mesh)
         return found[0] if copy is None else f"{found[1]}{copy}{found[3]}"
 
     return _MESH[file.suffix].sub(drawn, text)

@@ -162,6 +162,13 @@ class CompliantPlant(ParameterizedSystem, Plant):
             if signal is not FRICTION or self.material.friction is not None
         }
 
+    def friction(self, context: Context) -> dict[str, float]:
+        if FRICTION.name not in self.further_parameters:
+            return super().friction(context)
+        place = self.further_parameters[FRICTION.name][1]
+        value = float(context.get_numeric_parameter(0).GetAtIndex(place))
+        return {constraint.name: value for constraint in self.robot("friction").constraints}
+
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         along = super().parameters_along(context, times)
         return along[:, : self.dae.parameter_symbol.numel()]

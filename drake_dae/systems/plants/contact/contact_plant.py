@@ -128,7 +128,7 @@ class ContactPlant(Diagram, Plant):
         check_model(model)
         self.model: RobotModel = model
         self.dae, self.structure = model.dae, structure
-        self.time_step = material.time_step
+        self.time_step, self._friction = material.time_step, material.friction
         self._values = changed_parameters(model, parameters or {})
         if model.stages:
             check_step(model, material.time_step, self._values)
@@ -265,6 +265,11 @@ class ContactPlant(Diagram, Plant):
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         return {"contact_force": self.contact_force_signals}
+
+    def friction(self, context: Context) -> dict[str, float]:
+        if self._friction is None:
+            return super().friction(context)
+        return {constraint.name: self._friction for constraint in self.model.constraints}
 
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         contact = builder.AddSystem(ContactVisualizer(meshcat))

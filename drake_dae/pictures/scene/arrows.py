@@ -15,23 +15,27 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import axes_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
-_FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
-_MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
+FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
+MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
 
 PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
 
 _PIECE = 32
 """The number of points in a piece of a growing path."""
 
+_NEGLIGIBLE = 1e-6
+"""A moment is negligible below so much of the largest force at the length of the longest arrow."""
+
 LEAST_SCALE = 1e-3
 """The scale of an arrow without force: a transformation must not be zero."""
 
 
 class ForceArrows:
-    """Draws the force of each constraint on a robot: an arrow from its point of application.
+    """Draws the force of each constraint on a robot: an arrow whose tip is where it acts.
 
-    It points in the direction of the force, from a surface to its free side. A moment has its own
-    arrow with two heads, along its axis. Lengths are relative to the largest force so far.
+    It points in the direction of the force, from a surface to its free side, and so does not cover
+    the tool. A moment has its own arrow with two heads, along its axis. Lengths are relative to the
+    largest force so far.
 
     Args:
         meshcat: The Meshcat to draw in.
@@ -40,17 +44,19 @@ class ForceArrows:
 
     Attributes:
         largest_force, largest_moment: The force and moment of the longest arrow, N and N m.
+        has_moment: Whether some moment is not negligible beside the forces.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
         self.largest_force = self.largest_moment = 1e-6
+        self.has_moment, self._length = False, length
         self._meshcat, self._model = meshcat, model
         self._wrenches = ConstraintWrenches(model)
         pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
         for constraint, with_moment in pairs:
-            _add_arrow(meshcat, path_of(constraint, "force"), length, 1, _FORCE_COLOR)
+            _add_arrow(meshcat, path_of(constraint, "force"), length, 1, FORCE_COLOR)
             if with_moment:
-                _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
+                _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, MOMENT_COLOR)
 
     def draw(self, wrenches: Wrenches, time: float) -> None:
         """Draws the arrows.
@@ -90,7 +96,9 @@ class ForceArrows:
                 for rows in (wrenches.forces, wrenches.moments)
             )
             self.largest_force = max(self.largest_force, force)
-            self.largest_moment = max(self.largest_moment, moment)
+            least = _NEGLIGIBLE * self._length * self.largest_force
+            self.has_moment = self.has_moment or moment > least
+            self.largest_moment = max(self.largest_moment, moment, least)
 
     def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
         size = float(np.linalg.norm(arrow))
@@ -195,17 +203,17 @@ def path_of(constraint: Constraint, what: str) -> str:
 
 
 def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
-    """An arrow along z that begins at the origin, with one head behind the other."""
+    """An arrow along z that ends at the origin, with one head behind the other."""
     # A MeshcatCone has its tip at the origin: rotated, it points along +z.
     turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
     head, names = 0.2 * length, ["head", "second_head"][:heads]
     for number, name in enumerate(names):
         cone = f"{path}/arrow/{name}"
         meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
-        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, length - number * head]))
+        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, -number * head]))
     shaft = length - heads * head
     meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
-    middle = np.array([0.0, 0.0, shaft / 2])
+    middle = np.array([0.0, 0.0, shaft / 2 - length])
     meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
     # Drawn over everything, since the force in a joint acts inside bodies.
     for part in (*names, "shaft"):

@@ -1,7 +1,7 @@
 """The actual and desired motion of a robot in a run, frame by frame."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -10,8 +10,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
-from drake_dae.pictures.surroundings import scene_extent
-from drake_dae.pictures.view import FRAME_RATE
+from drake_dae.pictures.scene.framing import View, direction_of, framed
+from drake_dae.pictures.scene.surroundings import scene_points
+from drake_dae.pictures.scene.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import tangents
@@ -22,7 +23,7 @@ from drake_dae.systems.plants.contract import Plant
 STILL = 1e-4
 """A contact point whose path is shorter than this fraction of its distance has no path to draw."""
 
-_PLACES = 12
+_PLACES = 60
 """The number of states for the extent of a run."""
 
 
@@ -55,6 +56,7 @@ class RunMotion:
         acting: The constraint wrenches, for the parameters at the start.
         flashes: The brightness of each constraint's flash at an impact, 0 to 1, shape (k,
             constraints).
+        friction: Name of a constraint -> its coefficient of friction in the plant.
     """
 
     plant: Plant
@@ -67,6 +69,7 @@ class RunMotion:
     wanted: FloatArray
     acting: ConstraintWrenches
     flashes: FloatArray
+    friction: Mapping[str, float]
 
     @property
     def points(self) -> FloatArray:
@@ -80,6 +83,30 @@ class RunMotion:
         pairs = zip(self.wanted, self.parameters, strict=False)
         found = [self.acting(state, none, own).points for state, own in pairs]
         return np.array(found).reshape(len(found), len(self.acting.constraints), 3)
+
+    def arrow_tails(self, length: float) -> FloatArray:
+        """Where arrows of the forces begin, m, shape (k times constraints, 3).
+
+        Args:
+            length: The length of the longest one, in m.
+        """
+        forces = np.array([wrench.forces for wrench in self.wrenches])
+        largest = np.max(np.linalg.norm(forces, axis=2), initial=1e-6)
+        return (self.points - length * forces / largest).reshape(-1, 3)
+
+    @property
+    def normals(self) -> FloatArray:
+        """The normals of the surfaces, of any length, in the world, shape (k, constraints, 3).
+
+        At rest there is no friction, so that a force is along the normal.
+        """
+        model, links = self.model, self.model.links
+        ones = [np.array(constraint.is_unilateral, float) for constraint in model.constraints]
+        push = np.concatenate([np.zeros(0), *ones])
+        nq, nv = links.q.numel(), links.v.numel()
+        rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
+        pairs = zip(rest, self.parameters, strict=True)
+        return np.array([self.acting(state, push, own).forces for state, own in pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +141,9 @@ def follow(
     Raises:
         ModelError: There is no robot.
     """
-    plant = loop.plant
+    plant, own_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
     model = plant.robot("a picture of a run")
-    parameters = plant.parameters(plant.GetMyContextFromRoot(context))
+    parameters = plant.parameters(own_context)
     acting = ConstraintWrenches(model, parameters)
     times = frame_times(record.time[-1] - record.time[0], rate)
     states = _interpolated(record, "state", times)
@@ -126,10 +153,17 @@ def follow(
     if "exogenous" in record.signals:
         values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
     wrenches = [acting(*row) for row in zip(states, forces, values, strict=True)]
+    if "contact_force" in record.signals:  # With the friction of the plant, not the law's.
+        shape = (len(times), len(acting.constraints), 3)
+        whole = _interpolated(record, "contact_force", times).reshape(shape)
+        wrenches = [replace(one, forces=own) for one, own in zip(wrenches, whole, strict=True)]
     wanted = _desired_states(model, states, desired, values)
     begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
     bright = flashes(record.events, names, begin + times)
-    return RunMotion(plant, model, times, begin, states, values, wrenches, wanted, acting, bright)
+    friction = plant.friction(own_context)
+    return RunMotion(
+        plant, model, times, begin, states, values, wrenches, wanted, acting, bright, friction
+    )
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
@@ -145,7 +179,7 @@ def contact_paths(course: RunMotion) -> list[ContactPath]:
     """
     dae = course.model.dae
     size = float(np.max(np.abs(course.points), initial=0.0))
-    pushes = _pushes(course)
+    pushes = course.normals
     found = []
     for row, constraint in enumerate(course.acting.constraints):
         if not any(constraint.is_unilateral):
@@ -172,33 +206,37 @@ def contact_paths(course: RunMotion) -> list[ContactPath]:
     return found
 
 
-def run_extent(course: RunMotion, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
-    """The center and the size, in m, of the box around the robot over the run.
+def run_points(course: RunMotion, scene_graph: SceneGraph | None) -> FloatArray:
+    """Points that enclose the robot and its paths over the run, m, shape (k, 3).
 
     Args:
         course: The motion of the robot.
         scene_graph: The geometry of its links, or None.
     """
     some = course.states[:: max(1, len(course.states) // _PLACES)]
-    boxes = [scene_extent(course.model, course.acting, state, scene_graph) for state in some]
-    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
-    middles = np.array([middle for middle, _ in boxes])
-    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
-    return (low + high) / 2, float(np.linalg.norm(high - low))
+    paths = [course.points.reshape(-1, 3), course.wanted_points.reshape(-1, 3)]
+    return np.vstack([scene_points(course.model, course.acting, some, scene_graph), *paths])
 
 
-def _pushes(course: RunMotion) -> FloatArray:
-    """The normals of the surfaces, in the world, shape (k, constraints, 3).
+def run_view(
+    course: RunMotion, scene_graph: SceneGraph | None, view: View, arrow: float
+) -> tuple[FloatArray, FloatArray]:
+    """The eye of a camera that shows a whole run, and the point that it looks at, m.
 
-    At rest there is no friction, so that the force is along the normal.
+    Args:
+        course: The motion of the robot.
+        scene_graph: The geometry of its links, or None.
+        view: What the camera shows.
+        arrow: The length of the longest arrow of a force, in m.
     """
-    model, links = course.model, course.model.links
-    ones = [np.array(constraint.is_unilateral, float) for constraint in model.constraints]
-    push = np.concatenate([np.zeros(0), *ones])
-    nq, nv = links.q.numel(), links.v.numel()
-    rest = np.pad(course.states[:, :nq], ((0, 0), (0, nv)))
-    pairs = zip(rest, course.parameters, strict=True)
-    return np.array([course.acting(state, push, own).forces for state, own in pairs])
+    seen = run_points(course, scene_graph)
+    middle = len(course.times) // 2
+    now = scene_points(course.model, course.acting, course.states[middle][None], scene_graph)
+    normals = course.normals[middle]
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(lengths > 0.0, lengths, 1.0)
+    direction = direction_of(now, course.points[middle], normals)
+    return framed(np.vstack([seen, course.arrow_tails(arrow)]), direction, view)
 
 
 def _interpolated(record: Record, name: str, times: FloatArray) -> FloatArray:

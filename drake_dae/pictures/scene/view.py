@@ -18,8 +18,15 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.arrows import ConstraintForceVisualizer, ForceArrows, path_of
-from drake_dae.pictures.surroundings import Seen, scene_extent, surroundings
+from drake_dae.pictures.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
+from drake_dae.pictures.scene.floor import Floor, floor_below
+from drake_dae.pictures.scene.framing import View, direction_of, framed
+from drake_dae.pictures.scene.surroundings import (
+    Seen,
+    scene_extent,
+    scene_points,
+    surroundings,
+)
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.systems.plants.contract import Plant
 
@@ -29,6 +36,20 @@ FRAME_RATE = 32.0
 _ON_REQUEST = 1e9
 """A publish period so long that only a forced publish draws."""
 
+
+CAMERA_ANGLE = 0.7
+"""The vertical angle of view, in rad."""
+
+ASPECT = 4.0 / 3.0
+"""The ratio of width and height that the camera is placed for; a wider window shows more."""
+
+PIECE = 0.6
+"""The side of a drawn piece of an unbounded surface, relative to the size of the scene."""
+
+ARROW = 0.2
+"""The length of the longest arrow, relative to the size of the scene."""
+
+_FLOOR_COLOR = Rgba(0.8, 0.8, 0.8, 1.0)
 
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
@@ -100,22 +121,33 @@ def draw_scene(
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
     wrenches = ConstraintWrenches(model)
-    middle, size = scene_extent(model, wrenches, state, scene_graph)
+    _, size = scene_extent(model, wrenches, state, scene_graph)
     points = wrenches(state, np.zeros(len(dae.force_signals))).points[None]
-    draw_surroundings(meshcat, surroundings(model, wrenches, points, dae.parameter_values, size))
-    look_at(meshcat, middle, size)
-    return ForceArrows(meshcat, model, 0.2 * size)
+    touched = surroundings(model, wrenches, points, dae.parameter_values, PIECE * size)
+    draw_surroundings(meshcat, touched)
+    seen = scene_points(model, wrenches, state[None], scene_graph)
+    draw_floor(meshcat, floor_below(seen, touched))
+    direction = direction_of(seen, points[0], np.zeros_like(points[0]))
+    look_at(meshcat, *framed(seen, direction, View.of(CAMERA_ANGLE, ASPECT)))
+    return ForceArrows(meshcat, model, ARROW * size)
 
 
-def look_at(meshcat: Meshcat, middle: FloatArray, size: float) -> None:
-    """Places the camera from behind, the side and a little above.
+def look_at(meshcat: Meshcat, eye: FloatArray, at: FloatArray) -> None:
+    """Places the camera.
 
     Args:
         meshcat: The Meshcat.
-        middle: The center of the view, m, shape (3,).
-        size: The size of the view, in m.
+        eye: The place of the camera, m, shape (3,).
+        at: The point that it looks at, m, shape (3,).
     """
-    meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
+    meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", float(np.rad2deg(CAMERA_ANGLE)))
+    meshcat.SetCameraPose(eye, at)
+
+
+def draw_floor(meshcat: Meshcat, floor: Floor) -> None:
+    """Draws the grid below a robot."""
+    begin, end = (np.asfortranarray(each.T) for each in floor.lines)
+    meshcat.SetLineSegments("/floor", begin, end, 1.0, _FLOOR_COLOR)
 
 
 def view_of_links(

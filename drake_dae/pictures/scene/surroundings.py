@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import SceneGraph, Shape
+from pydrake.geometry import Box, SceneGraph, Shape
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 
@@ -29,6 +29,14 @@ class Seen:
     stands: RigidTransform
     picture: Picture
 
+    @property
+    def level(self) -> float | None:
+        """The height of a level plane, m; None of any other surface."""
+        pose, form = self.stands @ self.picture.pose, self.picture.form
+        if not isinstance(form, Box) or pose.rotation().matrix()[2, 2] < 1.0 - 1e-6:
+            return None
+        return float(pose.translation()[2] + form.height() / 2.0)
+
 
 def surroundings(
     model: RobotModel,
@@ -39,8 +47,8 @@ def surroundings(
 ) -> list[Seen]:
     """The surfaces in contact with a robot, each once, since coinciding ones would flicker.
 
-    An unbounded surface is drawn around the middle of its contact points, and at least as large as
-    their extent.
+    An unbounded surface is drawn around the middle of its contact points, and larger than their
+    extent.
 
     Args:
         model: The robot.
@@ -55,7 +63,7 @@ def surroundings(
         own = own_values(constraint, model.dae, parameters)
         low, high = touched.min(axis=0), touched.max(axis=0)
         nearest = np.argmin(np.linalg.norm(touched - (low + high) / 2, axis=1))
-        extent = max(size, 1.2 * float(np.linalg.norm(high - low)))
+        extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
         picture = constraint.picture(own, touched[nearest], extent)
         if picture is None:
             return None
@@ -109,34 +117,59 @@ def scene_extent(
         state: x, or only its first part, the link state (q, v).
         scene_graph: The geometry of its links, or None: then each link is its origin.
     """
-    links, dae = model.links, model.dae
-    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
-    landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
-    held = wrenches(state, np.zeros(len(dae.force_signals))).points
-    own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
-    places = np.vstack([np.zeros((1, 3)), own, held, _corners(model, state, scene_graph)])
+    places = scene_points(model, wrenches, state[None], scene_graph)
     low, high = places.min(axis=0), places.max(axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)), 1e-3)
 
 
-def _corners(model: RobotModel, state: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
-    """The corners of the bounding boxes of the links' geometry, m, shape (k, 3)."""
+def scene_points(
+    model: RobotModel,
+    wrenches: ConstraintWrenches,
+    states: FloatArray,
+    scene_graph: SceneGraph | None = None,
+) -> FloatArray:
+    """Points that enclose a robot and its constrained points, m, shape (k, 3).
+
+    Args:
+        model: The robot.
+        wrenches: Its constraint wrenches.
+        states: x, or only its first part, the link state (q, v), one row for each moment.
+        scene_graph: The geometry of its links, or None: then each link is its origin.
+    """
+    links, dae = model.links, model.dae
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+    # The world's own origin is no part of a robot.
+    own = [name != "world" for name in links.landmark_names]
+    kept = links.landmarks()[:, np.flatnonzero(own).tolist()] if any(own) else links.landmarks()
+    landmarks = TracedFunction("landmarks", inputs, {"points": kept})
+    none, found = np.zeros(len(dae.force_signals)), []
+    for state in states:
+        origins = landmarks(state[: links.q.numel()], dae.parameter_values)[0]
+        found.append(origins.reshape(3, -1, order="F").T)
+        found.append(wrenches(state, none).points)
+    return np.vstack([*found, _corners(model, states, scene_graph)])
+
+
+def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
+    """The corners of the bounding boxes of the links' geometry, and points between these, m."""
     drawn = model.links.plant
     if scene_graph is None or drawn is None or drawn.get_source_id() is None:
         return np.zeros((0, 3))
     inspector, context = scene_graph.model_inspector(), drawn.CreateDefaultContext()
-    drawn.SetPositions(context, state[: drawn.num_positions()])
-    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1)
-    found = []
+    signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1)
+    boxes = []
     for number in range(1, drawn.num_bodies()):
         body = drawn.get_body(BodyIndex(number))
-        pose = drawn.EvalBodyPoseInWorld(context, body)
         for geometry in drawn.GetVisualGeometriesForBody(body):
             try:
                 box = inspector.GetObbInGeometryFrame(geometry)
             except RuntimeError:  # A mesh that Drake does not read, or without extent.
                 continue
             if box is not None:
-                stands = pose @ inspector.GetPoseInFrame(geometry) @ box.pose()
-                found.append(stands.multiply(signs * box.half_width()[:, None]).T)
-    return np.vstack(found) if found else np.zeros((0, 3))
+                stands = inspector.GetPoseInFrame(geometry) @ box.pose()
+                boxes.append((body, stands.multiply(signs * box.half_width()[:, None])))
+    found = [np.zeros((0, 3))]
+    for state in states:
+        drawn.SetPositions(context, state[: drawn.num_positions()])
+        found += [drawn.EvalBodyPoseInWorld(context, body).multiply(box).T for body, box in boxes]
+    return np.vstack(found)

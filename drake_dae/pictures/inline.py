@@ -1,0 +1,11 @@
+"""Pages that a notebook shows in its own."""
+
+import html
+
+
+class InlinePage(str):
+    """An HTML page as text; a notebook shows it in its place."""
+
+    def _repr_html_(self) -> str:
+        page = html.escape(str(self), quote=True)
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 600px; border: 0"></iframe>'

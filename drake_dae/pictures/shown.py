@@ -1,0 +1,14 @@
+"""Figures that a notebook shows in its own."""
+
+from io import BytesIO
+
+from matplotlib.figure import Figure
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows, whether or not it has Matplotlib's inline mode."""
+
+    def _repr_png_(self) -> bytes:
+        file = BytesIO()
+        self.savefig(file, format="png", dpi=110)
+        return file.getvalue()
