@@ -26,6 +26,7 @@ from drake_dae.diagrams.parts import (
     contact_reference,
     hold_before,
     log_steps,
+    make_generator,
     open_holds,
 )
 from drake_dae.diagrams.settings import LoopSettings
@@ -93,7 +94,7 @@ def make_closed_loop(
         names = [signal.name for signal in law.system.output_signals]
         references = references_by_name(references, names, law.degrees)
     period = settings.period(plant.time_step)
-    reference = ReferenceGenerator(references, law.degrees)
+    reference = make_generator(references, law, settings)
     if settings.governed is not None:
         start = settings.start_time
         reference = PathGovernor(references, law, settings.governed, start, period)
@@ -102,7 +103,7 @@ def make_closed_loop(
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
     is_fed_back = (
-        settings.governed is None
+        reference.follows_time
         and plant.HasInputPort("feedback")
         and can_be_fed_back(law, settings.sampling, settings.control_limits)
     )
@@ -185,8 +186,10 @@ def wire_loop(
 
     # Exogenous signals go to the plant, and to the law as known there.
     own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
-    moving = add_exogenous(builder, plant, plant.dae, own)
-    known = add_exogenous(builder, controller, law.system, parts.exogenous)
+    degrees = *plant.exogenous_layout.degrees, *controller.exogenous_layout.degrees
+    lags = parts.commands, max(degrees, default=0) + 1
+    moving = add_exogenous(builder, plant, plant.dae, own, *lags)
+    known = add_exogenous(builder, controller, law.system, parts.exogenous, *lags)
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
     # updated while a contact is open or lost, or a drive is at its limit.
@@ -222,8 +225,10 @@ def wire_loop(
     if reference is not None:
         for name, signals in reference.further_signals.items():
             named[name] = (reference.GetOutputPort(name), signals)
-    by_time = reference is None or reference.num_input_ports() == 0
-    loggers = _logged(builder, plant, controller, control, named, by_time)
+    by_time = reference is None or reference.follows_time
+    loggers = _logged(builder, plant, controller, control, named, by_time, moving)
+    if known is not None:
+        builder.ExportOutput(known.get_output_port(), "known_exogenous")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -269,6 +274,7 @@ def _logged(
     control: OutputPort,
     named: Named,
     by_time: bool,
+    moving: ReferenceGenerator | None,
 ) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
     """Exports all signals, and logs those that do not follow from what is logged.
 
@@ -278,12 +284,15 @@ def _logged(
         control: What arrives at the plant.
         named: The signals.
         by_time: Whether references follow from the time.
+        moving: The generator of the plant's exogenous signals, if any.
     """
     available: set[str] = set()
     if plant.functions:
-        available = {*plant.functions, *(["reference"] if by_time else []), "exogenous"}
-        if controller.follows and control.get_system() is controller:
-            available.add("control")
+        available = {*plant.functions, *(["reference"] if by_time else [])}
+        if moving is None or moving.follows_time:
+            available.add("exogenous")
+            if controller.follows and control.get_system() is controller:
+                available.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
