@@ -97,8 +97,7 @@ class CommandedReferences(ReferenceGenerator):
             ),
             Computation.of(self.filter.rate, (STATE, PARAMETERS), (DERIVATIVE,)),
         )
-        signals = {"commands": self.commands}
-        return Block(self, computations, signals=signals, ports={"parameter": self.commands})
+        return Block(self, computations, signals={"commands": self.commands})
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(

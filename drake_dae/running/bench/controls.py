@@ -1,0 +1,248 @@
+"""What a person can change in a loop that runs: its numeric parameters, and what moves them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.tracking.gains import poles
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import GainError
+from drake_dae.running.export.steps.words import distinct, parameters_of_block
+from drake_dae.systems.control.command_filter import SPEED
+from drake_dae.systems.control.commanded import CommandedReferences
+
+PUSH = "push."
+"""Begins the names of the wrenches that push links."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """The numeric parameters of the blocks of a loop, below each other.
+
+    Attributes:
+        blocks: The blocks, each with numeric parameter 0, and where its entries begin.
+        names, units: Those of each entry.
+    """
+
+    blocks: Mapping[System, int]
+    names: Sequence[str]
+    units: Sequence[str]
+
+    @classmethod
+    def of(cls, loop: ClosedLoop) -> "Inputs":
+        """Those of generators, plant and controller."""
+        context = loop.diagram.CreateDefaultContext()
+        made = (loop.generator, loop.exogenous, loop.plant_exogenous, loop.plant, loop.controller)
+        blocks, signals = dict[System, int](), []
+        for block in made:
+            own = None if block is None else block.GetMyContextFromRoot(context)
+            if block is None or own is None or not own.num_numeric_parameter_groups():
+                continue
+            blocks[block] = len(signals)
+            signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
+        found = distinct(signals)
+        return cls(blocks, [s.name for s in found], [s.unit for s in found])
+
+    def values(self, context: Context) -> FloatArray:
+        """Their values in a context of the loop's diagram."""
+        own = (block.GetMyContextFromRoot(context) for block in self.blocks)
+        return np.concatenate([each.get_numeric_parameter(0).CopyToVector() for each in own])
+
+    def set(self, context: Context, changes: Mapping[int, float]) -> None:
+        """Changes entries in a context."""
+        for block, first in self.blocks.items():
+            own = block.GetMyMutableContextFromRoot(context)
+            size = own.get_numeric_parameter(0).size()
+            mine = {i - first: x for i, x in changes.items() if first <= i < first + size}
+            if mine:
+                values = own.get_numeric_parameter(0).CopyToVector()
+                values[list(mine)] = list(mine.values())
+                own.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
+@dataclass(frozen=True)
+class Control:
+    """A slider, or something that is dragged, and the inputs that it sets.
+
+    Attributes:
+        kind: "speed", "reference", "surface", "plant", "pole" or "push".
+        label, unit: What it is called.
+        low, high, value: The ends of the slider, and where it begins.
+        inputs: The entries of `Inputs` that it sets.
+        known: Those of the law's model with the same meaning, which it sets if the law is to know.
+        powers: For poles: each input is `factors[i] * |value| ** powers[i]`.
+    """
+
+    kind: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
+    inputs: tuple[int, ...]
+    known: tuple[int, ...] = ()
+    factors: tuple[float, ...] = ()
+    powers: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Controls:
+    """All controls of a loop, and the names of the rest.
+
+    Attributes:
+        inputs: The parameters.
+        sliders: The controls that are sliders.
+        pushes: Name of a link -> the first of six inputs: force, then moment.
+    """
+
+    inputs: Inputs
+    sliders: Sequence[Control]
+    pushes: Mapping[str, int] = field(default_factory=dict)
+
+    def data(self) -> list[dict[str, Any]]:
+        """The sliders as plain data."""
+        return [asdict(each) for each in self.sliders]
+
+
+def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
+    """The controls of a loop.
+
+    Args:
+        loop: The loop.
+        context: The context of its diagram at the start.
+        size: The size of the robot, in m.
+    """
+    inputs = Inputs.of(loop)
+    values = inputs.values(context)
+    plant, controller = loop.plant, loop.controller
+    first, of_law = inputs.blocks.get(plant, 0), inputs.blocks.get(controller)
+    known = {} if of_law is None else _places(controller.law.system, of_law)
+    found, pushes = [*_commands(loop, inputs, context, size)], dict[str, int]()
+    reach = {"m": 0.2 * size}
+    for name, place in _places(plant.dae, first).items():
+        if name.startswith(PUSH) and name.endswith(".force.0"):
+            pushes[name.removeprefix(PUSH).removesuffix(".force.0")] = place
+        unit, value = inputs.units[place], float(values[place])
+        is_friction = name.endswith((".friction.0", ".viscous_friction.0"))
+        if not is_friction and not (name.endswith(".mass.0") and unit == "kg"):
+            continue
+        high = {True: max(0.6, 2.0 * value), False: max(3.0 * value, 1.0)}[is_friction]
+        low = 0.0 if is_friction else 0.5 * value
+        label = name.removesuffix(".0")
+        also = (known[name],) if name in known else ()
+        found.append(Control("plant", label, unit, low, high, value, (place,), also))
+    found += _surfaces(loop, inputs, reach["m"])
+    if controller.follows and of_law is not None:
+        found += _pole(loop, inputs, values, of_law)
+    return Controls(inputs, found, pushes)
+
+
+def _places(dae: Any, first: int) -> dict[str, int]:
+    """Name and number of an entry of a system's parameters -> its place among the inputs."""
+    found = {}
+    for parameter in dae.parameters:
+        for k in range(parameter.value.size):
+            found[f"{parameter.name}.{k}"] = first + dae.parameter_slice(parameter.name).start + k
+    return found
+
+
+def _commands(
+    loop: ClosedLoop, inputs: Inputs, context: Context, size: float
+) -> list[Control]:
+    """The speed along the path, and a change of each reference."""
+    generator = loop.generator
+    if not isinstance(generator, CommandedReferences):
+        return []
+    first = inputs.blocks[generator]
+    layout = loop.controller.law.layout
+    now = generator.reference(context.get_time())[layout.lowest]
+    start = int(generator.commands[0] is SPEED)
+    found = [Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,))] * start
+    for i, signal in enumerate(generator.commands[start:]):
+        reach = {"m": 0.15 * size, "N": max(abs(now[i]), 10.0), "N m": max(abs(now[i]), 1.0)}
+        most = _round(reach.get(signal.unit, 0.5))
+        place = (first + start + i,)
+        found.append(Control("reference", signal.name, signal.unit, -most, most, 0.0, place))
+    return found
+
+
+def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
+    """The positions of surfaces, for plant and law."""
+    generators = loop.plant_exogenous, loop.exogenous
+    found = dict[str, list[int]]()
+    for generator in generators:
+        if isinstance(generator, CommandedReferences):
+            for i, signal in enumerate(generator.commands):
+                found.setdefault(signal.name, []).append(inputs.blocks[generator] + i)
+    most = _round(reach)
+    return [
+        Control("surface", name, inputs.units[places[0]], -most, most, 0.0, tuple(places))
+        for name, places in found.items()
+        if ".position" in name
+    ]
+
+
+def _pole(
+    loop: ClosedLoop, inputs: Inputs, values: FloatArray, first: int
+) -> list[Control]:
+    """One pole for all errors, where the gains are those of one pole."""
+    law = loop.controller.law
+    own = law.system.parameter_vector(None)
+    try:
+        at = {p: law.all_parameters(own, poles(-p))[own.size :] for p in (1.0, 2.0, 3.0)}
+    except GainError:
+        return []
+    places = [first + own.size + i for i in range(at[1.0].size)]
+    factors = at[1.0]
+    powers = np.round(np.log2(np.where(factors, at[2.0] / np.where(factors, factors, 1.0), 1.0)))
+    if not places or not np.allclose(factors * 3.0**powers, at[3.0], rtol=1e-9):
+        return []
+    slowest = -float(np.max(law.gains.poles.real))
+    with np.errstate(divide="ignore"):
+        now = values[places]
+    if not np.allclose(now, factors * slowest**powers, rtol=1e-6):
+        return []
+    given = tuple(places), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
+    most = _round(max(4.0 * slowest, 20.0))
+    return [Control("pole", "pole of all errors", "1/s", -most, -0.5, -slowest, *given)]
+
+
+def _round(value: float) -> float:
+    """A number of one or two digits near a value."""
+    return float(f"{value:.1g}")
+
+
+def prediction(loop: ClosedLoop, inputs: Inputs) -> dict[str, Any] | None:
+    """How the error is predicted: E of e' = E e (30), and which of e each output shows.
+
+    Returns:
+        "size"; "ends": the rows of E that hold gains; "gains": (row, column, input) of each; "shown":
+        (output, coordinate, whether its derivative is shown), without outputs whose error is zero.
+        None where the errors of a controller are no linear system.
+    """
+    controller = loop.controller
+    if not (controller.follows and loop.generator is not None and controller in inputs.blocks):
+        return None
+    law = controller.law
+    if law.system.num_states != loop.plant.dae.num_states:
+        return None
+    layout = law.gains.layout
+    first = inputs.blocks[controller] + law.system.parameter_vector(None).size
+    row_of = dict(zip(layout.dynamic.tolist(), layout.ends.tolist(), strict=True))
+    gains = [
+        (row_of[i], j, first + number)
+        for number, (i, j) in enumerate(
+            (i, j)
+            for j in range(layout.chain_size)
+            for i in np.flatnonzero(law.gains.matrix[:, j]).tolist()
+        )
+    ]
+    shown = [
+        (i, int(layout.starts[i]), i in law.integral.outputs) for i in layout.dynamic.tolist()
+    ]
+    ends = layout.ends.tolist()
+    return {"size": layout.chain_size, "ends": ends, "gains": gains, "shown": shown}

@@ -1,0 +1,120 @@
+/* What is dragged in the view: a green ball is the target, an orange one a surface, a link is pushed. */
+const NEAR = 24; /* pixels from a ball at which it is taken */
+const STIFF = 3; /* a pull by the robot's size is a push of so many of its weights */
+
+class Drag {
+  constructor(view, panel, latest, pushed) {
+    [this.view, this.panel, this.latest, this.pushed] = [view, panel, latest, pushed];
+    this.ray = new three.Raycaster();
+    const canvas = viewer.renderer.domElement;
+    canvas.addEventListener("pointerdown", (event) => this.begin(event), { capture: true });
+    canvas.addEventListener("pointermove", (event) => this.move(event), { capture: true });
+    for (const name of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(name, (event) => this.end(event), { capture: true });
+    }
+  }
+  aim({ clientX, clientY }) {
+    const box = viewer.renderer.domElement.getBoundingClientRect();
+    const at = new three.Vector2(2 * (clientX - box.left) / box.width - 1, 1 - 2 * (clientY - box.top) / box.height);
+    viewer.camera.updateMatrixWorld();
+    this.ray.setFromCamera(at, viewer.camera);
+  }
+  begin(event) {
+    this.aim(event);
+    this.held = this.ball(event) ?? this.link();
+    if (!this.held) return; /* The camera turns. */
+    this.swallow(event);
+    viewer.controls.enabled = false;
+    event.target.setPointerCapture?.(event.pointerId);
+    const ahead = viewer.camera.getWorldDirection(new three.Vector3());
+    this.plane = new three.Plane().setFromNormalAndCoplanarPoint(ahead, this.held.point);
+  }
+  move(event) {
+    if (!this.held) return;
+    this.swallow(event);
+    this.aim(event);
+    const { along, point } = this.held;
+    const pointer = this.ray.ray.intersectPlane(this.plane, new three.Vector3());
+    if (!pointer) return;
+    if (along) this.nearest(point, along, pointer);
+    this.held.follow(pointer);
+  }
+  end(event) {
+    if (!this.held) return;
+    this.swallow(event);
+    this.held.release?.();
+    this.held = undefined;
+    viewer.controls.enabled = true;
+  }
+  swallow(event) {
+    event.stopPropagation();
+    event.preventDefault();
+  }
+  /* The point of a line that is nearest to the pointer's ray; a line toward the eye is not followed. */
+  nearest(point, along, pointer) {
+    const { origin, direction } = this.ray.ray;
+    const away = point.clone().sub(origin), cosine = along.dot(direction);
+    const slope = 1 - cosine * cosine;
+    if (slope > 0.05) {
+      const length = (cosine * direction.dot(away) - along.dot(away)) / slope;
+      pointer.copy(point).addScaledVector(along, length);
+    } else {
+      pointer.copy(point).addScaledVector(along, along.dot(pointer.clone().sub(point)));
+    }
+  }
+  ball({ clientX, clientY }) {
+    const found = [];
+    const offer = (handle, make) => {
+      const place = handle.visible && this.view.on_screen(handle.position);
+      const off = place ? Math.hypot(place[0] - clientX, place[1] - clientY) : Infinity;
+      if (off < NEAR) found.push([off, make]);
+    };
+    data.targets.forEach(({ axes }, k) => offer(this.view.targets[k], () => this.mover(this.view.targets[k], axes)));
+    data.surfaces.forEach(({ controls, direction }, k) => {
+      const axes = controls.map((control, axis) => [axis, control]).filter(([, control]) => control !== null);
+      const along = direction && new three.Vector3(...direction);
+      offer(this.view.surfaces[k], () => this.mover(this.view.surfaces[k], axes, along));
+    });
+    return found.sort((one, other) => one[0] - other[0])[0]?.[1]();
+  }
+  /* Moves controls, one for each of some axes of the world, as far as the pointer. */
+  mover(handle, axes, along) {
+    const point = handle.position.clone();
+    const before = axes.map(([, control]) => this.panel.value(control));
+    const follow = (pointer) => axes.forEach(([axis, control], i) => {
+      const off = pointer.getComponent(axis) - point.getComponent(axis);
+      this.panel.set(control, before[i] + off);
+    });
+    return { point, along, follow };
+  }
+  /* A push on the link under the pointer, which pulls the point that was taken. */
+  link() {
+    for (const hit of this.ray.intersectObjects(data.bodies.map(({ path }) => node(path)), true)) {
+      const number = data.bodies.findIndex(({ path }) => {
+        for (let one = hit.object; one; one = one.parent) if (one === node(path)) return true;
+        return false;
+      });
+      const { name, path } = data.bodies[number];
+      if (!(name in data.pushes)) return undefined;
+      const local = node(path).worldToLocal(hit.point.clone());
+      const push = { name, path, local, pointer: hit.point.clone() };
+      return {
+        point: hit.point.clone(),
+        follow: (pointer) => (this.pushed(push), push.pointer.copy(pointer)),
+        release: () => this.pushed(null),
+      };
+    }
+    return undefined;
+  }
+}
+
+/* Force and moment of a push about the origin of its link's frame, in the world. */
+function wrench({ path, local, pointer }) {
+  const frame = node(path);
+  frame.updateWorldMatrix(true, false);
+  const point = frame.localToWorld(local.clone());
+  const force = pointer.clone().sub(point).multiplyScalar((STIFF * data.weight) / data.size);
+  force.clampLength(0, 2 * data.weight);
+  const lever = point.clone().sub(new three.Vector3().setFromMatrixPosition(frame.matrixWorld));
+  return { point, force, moment: lever.cross(force) };
+}
