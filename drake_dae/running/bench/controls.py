@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, System
+from pydrake.systems.framework import Context, LeafSystem, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.tracking.gains import poles
@@ -39,11 +39,13 @@ class Inputs:
         made = (loop.generator, loop.exogenous, loop.plant_exogenous, loop.plant, loop.controller)
         blocks, signals = dict[System, int](), []
         for block in made:
-            own = None if block is None else block.GetMyContextFromRoot(context)
-            if block is None or own is None or not own.num_numeric_parameter_groups():
+            # Drake's own contact is a Diagram, whose numbers are those of many blocks.
+            if not isinstance(block, LeafSystem):
                 continue
-            blocks[block] = len(signals)
-            signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
+            own = block.GetMyContextFromRoot(context)
+            if own.num_numeric_parameter_groups():
+                blocks[block] = len(signals)
+                signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
         found = distinct(signals)
         return cls(blocks, [s.name for s in found], [s.unit for s in found])
 
@@ -119,11 +121,14 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
     inputs = Inputs.of(loop)
     values = inputs.values(context)
     plant, controller = loop.plant, loop.controller
-    first, of_law = inputs.blocks.get(plant, 0), inputs.blocks.get(controller)
+    first, of_law = inputs.blocks.get(plant), inputs.blocks.get(controller)
+    of_plant = {} if first is None else _places(plant.dae, first)
+    for name, (_, place) in plant.further_parameters.items():
+        of_plant[f"{name}.0"] = (first or 0) + place
     known = {} if of_law is None else _places(controller.law.system, of_law)
     found, pushes = [*_commands(loop, inputs, context, size)], dict[str, int]()
     reach = {"m": 0.2 * size}
-    for name, place in _places(plant.dae, first).items():
+    for name, place in of_plant.items():
         if name.startswith(PUSH) and name.endswith(".force.0"):
             pushes[name.removeprefix(PUSH).removesuffix(".force.0")] = place
         unit, value = inputs.units[place], float(values[place])
@@ -182,7 +187,7 @@ def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
     return [
         Control("surface", name, inputs.units[places[0]], -most, most, 0.0, tuple(places))
         for name, places in found.items()
-        if ".position" in name
+        if ".position" in name and inputs.units[places[0]] == "m"
     ]
 
 

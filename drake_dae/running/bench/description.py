@@ -147,8 +147,10 @@ def shown_function(bench: Bench, columns: dict[str, ca.SX], given: ca.SX) -> ca.
 
     def own(block: Any, size: int, moving: str) -> ca.SX:
         """The parameters of a block, with those that move as they are now."""
-        first = inputs.blocks[block]
-        found = ca.SX(given[first : first + size])
+        found = ca.SX(block.dae.parameter_values[:size])
+        if block in inputs.blocks:
+            first = inputs.blocks[block]
+            found = ca.SX(given[first : first + size])
         if moving in columns:
             found[list(block.exogenous_places)] = columns[moving]
         return found

@@ -81,9 +81,9 @@ def write_page(
         code, text = module.read_bytes(), loader.read_text(encoding="utf-8")
     data = bench.data | {"kind": "page", "places": _places(bench, part)}
     encoded = base64.b64encode(code).decode()
-    parts = [text, f'const wasm = "{encoded}";', _text("page.js")]
+    parts = [text, f'const wasm = "{encoded}";', web_text("page.js")]
     target = Path(file)
-    page, bundle = with_bench(bench, data, parts), []
+    page, bundle = page_of(bench, data, parts), []
     if shared_bundle is not None:
         bundle = [Path(shared_bundle)]
         page = _with_shared_bundle(page, target, bundle[0])
@@ -92,7 +92,7 @@ def write_page(
     return [target, *bundle]
 
 
-def with_bench(bench: Bench, data: object, engine: Sequence[str], own: str = "") -> str:
+def page_of(bench: Bench, data: object, engine: Sequence[str], own: str = "") -> str:
     """Meshcat's page with the bench over it.
 
     Args:
@@ -101,8 +101,8 @@ def with_bench(bench: Bench, data: object, engine: Sequence[str], own: str = "")
         engine: The scripts before that of the bench, which define `makeEngine`.
         own: What the page may connect to, as in a Content-Security-Policy.
     """
-    script = "\n".join([f"const data = {as_script(data)};", *engine, *map(_text, SCRIPTS)])
-    added = f'<style>\n{_text("bench.css")}</style>\n{_text("bench.html")}'
+    script = "\n".join([f"const data = {as_script(data)};", *engine, *map(web_text, SCRIPTS)])
+    added = f'<style>\n{web_text("bench.css")}</style>\n{web_text("bench.html")}'
     added += f'<script type="module">\n{script}</script>\n'
     head = (
         f'<meta http-equiv="Content-Security-Policy" content="{_FROM_ELSEWHERE.format(own=own)}">\n'
@@ -113,7 +113,8 @@ def with_bench(bench: Bench, data: object, engine: Sequence[str], own: str = "")
     return before.replace("<title>Drake MeshCat</title>", head, 1) + added + mark + after
 
 
-def _text(name: str) -> str:
+def web_text(name: str) -> str:
+    """A file of the bench in a browser."""
     return (WEB / name).read_text("utf-8")
 
 

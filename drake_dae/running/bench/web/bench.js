@@ -60,6 +60,7 @@ function follow_push() {
   view.push.setLength((0.5 * data.size * size) / data.weight, 0.05 * data.size, 0.03 * data.size);
 }
 
+/* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
   if (bench.push) follow_push();
   try {
@@ -154,7 +155,7 @@ const force = data.outputs.findIndex(({ unit }) => unit === "N");
 element("signal").value = Math.max(force, 0);
 for (const name of ["signal", "error"]) element(name).addEventListener("change", () => (bench.fresh = true));
 viewer.gui.domElement.style.display = "none";
-new Drag(view, panel, () => bench.samples.at(-1), pushed);
+new Drag(view, panel, pushed);
 await restart();
-bench.isReady = true;
+Object.assign(bench, { advance, draw, isReady: true });
 requestAnimationFrame(picture);

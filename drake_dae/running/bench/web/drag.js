@@ -3,8 +3,8 @@ const NEAR = 24; /* pixels from a ball at which it is taken */
 const STIFF = 3; /* a pull by the robot's size is a push of so many of its weights */
 
 class Drag {
-  constructor(view, panel, latest, pushed) {
-    [this.view, this.panel, this.latest, this.pushed] = [view, panel, latest, pushed];
+  constructor(view, panel, pushed) {
+    [this.view, this.panel, this.pushed] = [view, panel, pushed];
     this.ray = new three.Raycaster();
     const canvas = viewer.renderer.domElement;
     canvas.addEventListener("pointerdown", (event) => this.begin(event), { capture: true });
@@ -17,7 +17,9 @@ class Drag {
     const box = viewer.renderer.domElement.getBoundingClientRect();
     const at = new three.Vector2(2 * (clientX - box.left) / box.width - 1, 1 - 2 * (clientY - box.top) / box.height);
     viewer.camera.updateMatrixWorld();
+    viewer.scene.updateMatrixWorld();
     this.ray.setFromCamera(at, viewer.camera);
+    this.line = this.ray.ray.clone().applyMatrix4(viewer.scene.matrixWorld.clone().invert());
   }
   begin(event) {
     this.aim(event);
@@ -26,7 +28,8 @@ class Drag {
     this.swallow(event);
     viewer.controls.enabled = false;
     event.target.setPointerCapture?.(event.pointerId);
-    const ahead = viewer.camera.getWorldDirection(new three.Vector3());
+    const origin = new three.Vector3(), ahead = viewer.camera.getWorldDirection(new three.Vector3());
+    ahead.copy(inside(ahead).sub(inside(origin)));
     this.plane = new three.Plane().setFromNormalAndCoplanarPoint(ahead, this.held.point);
   }
   move(event) {
@@ -34,7 +37,7 @@ class Drag {
     this.swallow(event);
     this.aim(event);
     const { along, point } = this.held;
-    const pointer = this.ray.ray.intersectPlane(this.plane, new three.Vector3());
+    const pointer = this.line.intersectPlane(this.plane, new three.Vector3());
     if (!pointer) return;
     if (along) this.nearest(point, along, pointer);
     this.held.follow(pointer);
@@ -52,7 +55,7 @@ class Drag {
   }
   /* The point of a line that is nearest to the pointer's ray; a line toward the eye is not followed. */
   nearest(point, along, pointer) {
-    const { origin, direction } = this.ray.ray;
+    const { origin, direction } = this.line;
     const away = point.clone().sub(origin), cosine = along.dot(direction);
     const slope = 1 - cosine * cosine;
     if (slope > 0.05) {
@@ -97,9 +100,9 @@ class Drag {
       const { name, path } = data.bodies[number];
       if (!(name in data.pushes)) return undefined;
       const local = node(path).worldToLocal(hit.point.clone());
-      const push = { name, path, local, pointer: hit.point.clone() };
+      const point = inside(hit.point), push = { name, path, local, pointer: point.clone() };
       return {
-        point: hit.point.clone(),
+        point,
         follow: (pointer) => (this.pushed(push), push.pointer.copy(pointer)),
         release: () => this.pushed(null),
       };
@@ -112,9 +115,10 @@ class Drag {
 function wrench({ path, local, pointer }) {
   const frame = node(path);
   frame.updateWorldMatrix(true, false);
-  const point = frame.localToWorld(local.clone());
+  const point = inside(frame.localToWorld(local.clone()));
   const force = pointer.clone().sub(point).multiplyScalar((STIFF * data.weight) / data.size);
   force.clampLength(0, 2 * data.weight);
-  const lever = point.clone().sub(new three.Vector3().setFromMatrixPosition(frame.matrixWorld));
+  const origin = inside(new three.Vector3().setFromMatrixPosition(frame.matrixWorld));
+  const lever = point.clone().sub(origin);
   return { point, force, moment: lever.cross(force) };
 }

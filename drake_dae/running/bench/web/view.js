@@ -1,6 +1,9 @@
 /* The robot, on the viewer of Meshcat: bodies, forces and surfaces follow a sample. */
 const three = MeshCat.THREE;
 const node = (path) => viewer.scene_tree.find(path).object;
+/* A point of the robot's world, as a copy; Meshcat turns that world in the one of three.js. */
+const inside = (point) => viewer.scene.worldToLocal(point.clone());
+const outside = (point) => viewer.scene.localToWorld(point.clone());
 const vector = (column, first) => new three.Vector3(...column.slice(first, first + 3));
 
 class View {
@@ -86,7 +89,8 @@ class View {
   /* Where a point of the scene is on the screen, in pixels of the window; null behind the camera. */
   on_screen(point) {
     const box = viewer.renderer.domElement.getBoundingClientRect();
-    const { x, y, z } = point.clone().project(viewer.camera);
+    viewer.camera.updateMatrixWorld();
+    const { x, y, z } = outside(point).project(viewer.camera);
     if (z > 1) return null;
     return [box.left + (0.5 + 0.5 * x) * box.width, box.top + (0.5 - 0.5 * y) * box.height];
   }
@@ -95,7 +99,8 @@ class View {
     data.constraints.forEach(({ name, force }, k) => {
       const size = vector(scene, at.forces + 3 * k).length();
       const label = this.labels[k];
-      const place = size && this.on_screen(node([...force, "arrow", "head"]).getWorldPosition(new three.Vector3()));
+      const head = node([...force, "arrow", "head"]).getWorldPosition(new three.Vector3());
+      const place = size && this.on_screen(inside(head));
       label.style.display = place ? "block" : "none";
       if (!place) return;
       label.textContent = `${data.constraints.length > 1 ? `${name} ` : ""}${size.toPrecision(3)} N`;

@@ -1,0 +1,91 @@
+"""Pages in a headless Chromium: a script runs in a page, and what it finds comes back."""
+
+import json
+import re
+import shutil
+import subprocess
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no Chromium")
+
+OPTIONS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+# What scripts of tests call. Balls and links are taken with pointer events, as a hand does.
+HELPERS = """
+const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
+const slider = (label) => document.querySelector(`input[data-control="${label}"]`);
+function slide(label, value) {
+  slider(label).value = value;
+  slider(label).dispatchEvent(new Event("input"));
+}
+function point(kind, [clientX, clientY]) {
+  const canvas = viewer.renderer.domElement;
+  const told = { clientX, clientY, pointerId: 1, bubbles: true, cancelable: true };
+  canvas.dispatchEvent(new PointerEvent(kind, told));
+}
+const now = () => bench.samples.at(-1);
+// The clock of a page stands still; time passes by these steps alone.
+async function run(seconds) {
+  await bench.advance(Math.round(seconds / bench.data.tick));
+  if (bench.failure) throw new Error(bench.failure);
+  bench.draw();
+}
+const place = (ball) => bench.view.on_screen(ball.position);
+const besides = ([x, y], dx, dy) => [x + dx, y + dy];
+"""
+
+_RESULT = re.compile(r'<pre id="result"[^>]*>(.*?)</pre>', re.DOTALL)
+
+
+def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 700, seconds: int = 60):
+    """Runs a script in a page of a bench, in virtual time; returns what it returns.
+
+    Args:
+        page: The text of the page.
+        body: The body of an async function, with `HELPERS`.
+        file: Where the page with the script is written; opened from file://.
+        width, height: The size of the window, in pixels.
+        seconds: How much virtual time there is.
+    """
+    script = (
+        f'<script type="module">{HELPERS}\n'
+        "const shown = document.createElement('pre');\nshown.id = 'result';\n"
+        "shown.style.display = 'none';\n"
+        "async function main() {\n"
+        "  while (!window.bench?.isReady) await sleep(20);\n"
+        "  bench.isRunning = false;\n  await sleep(100);\n"
+        f"{body}\n}}\n"
+        "main().catch((error) => ({ failed: String(error.stack) })).then((found) => {\n"
+        "  shown.textContent = JSON.stringify(found);\n  document.body.append(shown);\n});\n"
+        "</script>"
+    )
+    before, mark, after = page.rpartition("</body>")
+    file.write_text(before + script + mark + after, encoding="utf-8")
+    return opened(file.as_uri(), file.parent / "profile", width, height, f"--virtual-time-budget={1000 * seconds}")
+
+
+def opened(address: str, profile: Path, width: int, height: int, *more: str):
+    """What the script of a page found that Chromium opens."""
+    size, kept = f"--window-size={width},{height}", f"--user-data-dir={profile}"
+    command = [CHROMIUM, *OPTIONS, kept, size, *more, "--dump-dom", address]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    found = _RESULT.search(done.stdout)
+    assert found, f"the page has no result: {done.stderr[-2000:]}"
+    result = json.loads(unescape(found[1]))
+    assert not (isinstance(result, dict) and "failed" in result), result
+    return result
