@@ -12,6 +12,7 @@ from drake_dae.commands.options_of_studies import (
     add_json,
     add_sweep,
     path_option,
+    whole_option,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 

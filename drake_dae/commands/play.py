@@ -1,4 +1,4 @@
-"""What a browser shows: `drake-dae play` an animation, `page` a loop in it, `live` one from here."""
+"""What a browser shows: `drake-dae play` an animation, `page` and `live` a loop that runs."""
 
 import argparse
 import json
@@ -65,7 +65,9 @@ def _page(options: argparse.Namespace) -> int:
     try:
         files = write_page(*given, shared_bundle=options.shared_bundle)
     except ModelError as error:
-        raise ModelError(f"it cannot be a page: {error}; or see it by `drake-dae live`") from error
+        raise ModelError(
+            f"{name} cannot be a page ({error}); `drake-dae live {options.scenario}` runs it"
+        ) from error
     sizes = {str(each): each.stat().st_size for each in files}
     if options.json:
         print(json.dumps({"files": sizes, "left_out": list(built.left_out)}, indent=2))

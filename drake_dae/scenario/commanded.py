@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import Any
 
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import BodyIndex
@@ -78,7 +78,7 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario:
     """Surfaces whose positions are exogenous signals that stand still."""
     if scenario.task is not None or scenario.observer is not None or scenario.is_advised:
         return scenario
-    moving = {}
+    moving = dict[str, Any]()
     for constraint in scenario.constraints:
         if isinstance(constraint, PointOnSurface) and scenario.plant.material is None:
             position = constraint.parameters[0]

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
 
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no Chromium")
 
@@ -52,7 +54,9 @@ const besides = ([x, y], dx, dy) => [x + dx, y + dy];
 _RESULT = re.compile(r'<pre id="result"[^>]*>(.*?)</pre>', re.DOTALL)
 
 
-def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 700, seconds: int = 60):
+def in_page(
+    page: str, body: str, file: Path, width: int = 1000, height: int = 700, seconds: int = 60
+):
     """Runs a script in a page of a bench, in virtual time; returns what it returns.
 
     Args:
@@ -76,7 +80,13 @@ def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 7
     )
     before, mark, after = page.rpartition("</body>")
     file.write_text(before + script + mark + after, encoding="utf-8")
-    return opened(file.as_uri(), file.parent / "profile", width, height, f"--virtual-time-budget={1000 * seconds}")
+    return opened(
+        file.as_uri(),
+        file.parent / "profile",
+        width,
+        height,
+        f"--virtual-time-budget={1000 * seconds}",
+    )
 
 
 def opened(address: str, profile: Path, width: int, height: int, *more: str):

@@ -8,6 +8,8 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import GainError
@@ -17,6 +19,10 @@ from drake_dae.systems.control.commanded import CommandedReferences
 
 PUSH = "push."
 """Begins the names of the wrenches that push links."""
+
+
+_ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
+"""The order of sliders; others follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +43,7 @@ class Inputs:
         """Those of generators, plant and controller."""
         context = loop.diagram.CreateDefaultContext()
         made = (loop.generator, loop.exogenous, loop.plant_exogenous, loop.plant, loop.controller)
-        blocks, signals = dict[System, int](), []
+        blocks, signals = dict[System, int](), list[Signal]()
         for block in made:
             # Drake's own contact is a Diagram, whose numbers are those of many blocks.
             if not isinstance(block, LeafSystem):
@@ -120,44 +126,49 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
     """
     inputs = Inputs.of(loop)
     values = inputs.values(context)
-    plant, controller = loop.plant, loop.controller
-    first, of_law = inputs.blocks.get(plant), inputs.blocks.get(controller)
-    of_plant = {} if first is None else _places(plant.dae, first)
-    for name, (_, place) in plant.further_parameters.items():
-        of_plant[f"{name}.0"] = (first or 0) + place
-    known = {} if of_law is None else _places(controller.law.system, of_law)
-    found, pushes = [*_commands(loop, inputs, context, size)], dict[str, int]()
-    reach = {"m": 0.2 * size}
-    for name, place in of_plant.items():
-        if name.startswith(PUSH) and name.endswith(".force.0"):
-            pushes[name.removeprefix(PUSH).removesuffix(".force.0")] = place
-        unit, value = inputs.units[place], float(values[place])
-        is_friction = name.endswith((".friction.0", ".viscous_friction.0"))
-        if not is_friction and not (name.endswith(".mass.0") and unit == "kg"):
-            continue
-        high = {True: max(0.6, 2.0 * value), False: max(3.0 * value, 1.0)}[is_friction]
-        low = 0.0 if is_friction else 0.5 * value
-        label = name.removesuffix(".0")
-        also = (known[name],) if name in known else ()
-        found.append(Control("plant", label, unit, low, high, value, (place,), also))
-    found += _surfaces(loop, inputs, reach["m"])
-    if controller.follows and of_law is not None:
-        found += _pole(loop, inputs, values, of_law)
+    found = _commands(loop, inputs, context, size) + _surfaces(loop, inputs, 0.2 * size)
+    found += _plant(loop, inputs, values) + _pole(loop, inputs, values)
+    places = _places(loop.plant.dae, inputs.blocks.get(loop.plant))
+    pushes = {
+        name.removeprefix(PUSH).removesuffix(".force.0"): place
+        for name, place in places.items()
+        if name.startswith(PUSH) and name.endswith(".force.0")
+    }
     return Controls(inputs, found, pushes)
 
 
-def _places(dae: Any, first: int) -> dict[str, int]:
+def _places(dae: DaeSystem, first: int | None) -> dict[str, int]:
     """Name and number of an entry of a system's parameters -> its place among the inputs."""
-    found = {}
-    for parameter in dae.parameters:
-        for k in range(parameter.value.size):
-            found[f"{parameter.name}.{k}"] = first + dae.parameter_slice(parameter.name).start + k
-    return found
+    return {
+        f"{parameter.name}.{k}": first + dae.parameter_slice(parameter.name).start + k
+        for parameter in dae.parameters
+        for k in range(parameter.value.size)
+        if first is not None
+    }
 
 
-def _commands(
-    loop: ClosedLoop, inputs: Inputs, context: Context, size: float
-) -> list[Control]:
+def _plant(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]:
+    """Frictions and masses: first frictions, then links from the tool on."""
+    plant, first = loop.plant, inputs.blocks.get(loop.plant)
+    known = _places(loop.controller.law.system, inputs.blocks.get(loop.controller))
+    places = _places(plant.dae, first)
+    if first is not None:
+        further = plant.further_parameters.items()
+        places |= {f"{name}.0": first + place for name, (_, place) in further}
+    frictions, masses = list[Control](), list[Control]()
+    for name, place in reversed(places.items()):
+        unit, value, label = inputs.units[place], float(values[place]), name.removesuffix(".0")
+        given = (place,), (known[name],) if name in known else ()
+        if label.endswith((".friction", ".viscous_friction")):
+            most = _round(max(0.6, 2.0 * value))
+            frictions.append(Control("plant", label, unit, 0.0, most, value, *given))
+        elif label.endswith(".mass") and unit == "kg":
+            most = _round(max(3.0 * value, 1.0))
+            masses.append(Control("plant", label, unit, 0.5 * value, most, value, *given))
+    return frictions + masses
+
+
+def _commands(loop: ClosedLoop, inputs: Inputs, context: Context, size: float) -> list[Control]:
     """The speed along the path, and a change of each reference."""
     generator = loop.generator
     if not isinstance(generator, CommandedReferences):
@@ -166,13 +177,15 @@ def _commands(
     layout = loop.controller.law.layout
     now = generator.reference(context.get_time())[layout.lowest]
     start = int(generator.commands[0] is SPEED)
-    found = [Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,))] * start
+    found = []
+    if start:
+        found.append(Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,)))
     for i, signal in enumerate(generator.commands[start:]):
         reach = {"m": 0.15 * size, "N": max(abs(now[i]), 10.0), "N m": max(abs(now[i]), 1.0)}
         most = _round(reach.get(signal.unit, 0.5))
         place = (first + start + i,)
         found.append(Control("reference", signal.name, signal.unit, -most, most, 0.0, place))
-    return found
+    return sorted(found, key=lambda each: _ORDER.get((each.kind, each.unit), 3))
 
 
 def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
@@ -191,11 +204,12 @@ def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
     ]
 
 
-def _pole(
-    loop: ClosedLoop, inputs: Inputs, values: FloatArray, first: int
-) -> list[Control]:
+def _pole(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]:
     """One pole for all errors, where the gains are those of one pole."""
-    law = loop.controller.law
+    controller, law = loop.controller, loop.controller.law
+    if not controller.follows or controller not in inputs.blocks:
+        return []
+    first = inputs.blocks[controller]
     own = law.system.parameter_vector(None)
     try:
         at = {p: law.all_parameters(own, poles(-p))[own.size :] for p in (1.0, 2.0, 3.0)}
@@ -207,9 +221,7 @@ def _pole(
     if not places or not np.allclose(factors * 3.0**powers, at[3.0], rtol=1e-9):
         return []
     slowest = -float(np.max(law.gains.poles.real))
-    with np.errstate(divide="ignore"):
-        now = values[places]
-    if not np.allclose(now, factors * slowest**powers, rtol=1e-6):
+    if not np.allclose(values[places], factors * slowest**powers, rtol=1e-6):
         return []
     given = tuple(places), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
     most = _round(max(4.0 * slowest, 20.0))
@@ -225,9 +237,9 @@ def prediction(loop: ClosedLoop, inputs: Inputs) -> dict[str, Any] | None:
     """How the error is predicted: E of e' = E e (30), and which of e each output shows.
 
     Returns:
-        "size"; "ends": the rows of E that hold gains; "gains": (row, column, input) of each; "shown":
-        (output, coordinate, whether its derivative is shown), without outputs whose error is zero.
-        None where the errors of a controller are no linear system.
+        "size"; "ends": the rows of E that hold gains; "gains": (row, column, input) of each;
+        "shown": (output, coordinate, whether its derivative is shown), without outputs whose error
+        is zero. None where the errors of a controller are no linear system.
     """
     controller = loop.controller
     if not (controller.follows and loop.generator is not None and controller in inputs.blocks):
@@ -246,8 +258,6 @@ def prediction(loop: ClosedLoop, inputs: Inputs) -> dict[str, Any] | None:
             for i in np.flatnonzero(law.gains.matrix[:, j]).tolist()
         )
     ]
-    shown = [
-        (i, int(layout.starts[i]), i in law.integral.outputs) for i in layout.dynamic.tolist()
-    ]
+    shown = [(i, int(layout.starts[i]), i in law.integral.outputs) for i in layout.dynamic.tolist()]
     ends = layout.ends.tolist()
     return {"size": layout.chain_size, "ends": ends, "gains": gains, "shown": shown}

@@ -61,9 +61,7 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
     state = plant.state(plant.GetMyContextFromRoot(context))
     values = inputs.values(context)
     signals = plant.dae.output_signals
-    sliders = {
-        (each.kind, each.label): number for number, each in enumerate(controls.sliders)
-    }
+    sliders = {(each.kind, each.label): number for number, each in enumerate(controls.sliders)}
     model = plant.robot("a bench")
     surfaces = []
     for each in scene.surfaces:

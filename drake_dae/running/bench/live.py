@@ -1,4 +1,4 @@
-"""A loop that runs in this process, by Drake's Simulator, while a person changes it in a browser."""
+"""A loop that runs in this process, while a person changes it in a browser."""
 
 import errno
 import json
@@ -63,6 +63,8 @@ class Server(HTTPServer):
         save: Callable[[HandRun], str] | None = None,
         port: int = 0,
     ) -> None:
+        if not 0 <= port <= 65535:
+            raise ModelError(f"a port is a number from 0, for any, to 65535, got {port}")
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -76,7 +78,9 @@ class Server(HTTPServer):
             self._save = save
             self.path = f"/{secrets.token_urlsafe(12)}/"
             self.address = f"http://{HOST}:{self.server_port}{self.path}"
-            self.page = page_of(bench, bench.data | {"kind": "live"}, [web_text("live.js")], "'self'")
+            self.page = page_of(
+                bench, bench.data | {"kind": "live"}, [web_text("live.js")], "'self'"
+            )
             self.start()
         except BaseException:
             self.server_close()

@@ -19,6 +19,7 @@ from drake_dae.running.export.steps.boundary import Part, loop_part
 from drake_dae.running.export.steps.integrated import write_integrated
 from drake_dae.running.export.steps.parts import LOOP
 from drake_dae.running.export.wasm.wasm import write_module
+from drake_dae.systems.blocks.traced import Traced
 
 WEB = Path(__file__).with_name("web")
 
@@ -72,6 +73,8 @@ def write_page(
         MachineCodeError: There is no zig, as of `pip install 'drake_dae[compiler]'`, or it fails.
         OSError: A file cannot be written.
     """
+    if isinstance(loop.plant, Traced) and loop.plant.traced().stepped is not None:
+        raise ModelError("the plant has Drake's own contact, which no export knows")
     further = ["known_exogenous"] if loop.exogenous is not None else []
     part = loop_part(loop, context, further)
     bench = bench_of(loop, context, title or loop.plant.dae.name, notes)
@@ -102,7 +105,7 @@ def page_of(bench: Bench, data: object, engine: Sequence[str], own: str = "") ->
         own: What the page may connect to, as in a Content-Security-Policy.
     """
     script = "\n".join([f"const data = {as_script(data)};", *engine, *map(web_text, SCRIPTS)])
-    added = f'<style>\n{web_text("bench.css")}</style>\n{web_text("bench.html")}'
+    added = f"<style>\n{web_text('bench.css')}</style>\n{web_text('bench.html')}"
     added += f'<script type="module">\n{script}</script>\n'
     head = (
         f'<meta http-equiv="Content-Security-Policy" content="{_FROM_ELSEWHERE.format(own=own)}">\n'

@@ -185,7 +185,14 @@ class Sampler:
     def __init__(self, bench: Bench) -> None:
         loop, self._bench = bench.loop, bench
         diagram = loop.diagram
-        names = ["state", "constraint_force", "reference", "integral", "exogenous", "known_exogenous"]
+        names = [
+            "state",
+            "constraint_force",
+            "reference",
+            "integral",
+            "exogenous",
+            "known_exogenous",
+        ]
         self._ports = {n: diagram.GetOutputPort(n) for n in names if diagram.HasOutputPort(n)}
         columns = {name: ca.SX.sym(name, port.size()) for name, port in self._ports.items()}
         given = ca.SX.sym("inputs", len(bench.controls.inputs.names))
@@ -210,7 +217,6 @@ class Sampler:
             "coordinates": _plain(shown[size:]),
             "phase": changes[-1].phase if changes else "",
         }
-
 
     def _compared(self, context: Context) -> tuple[FloatArray, FloatArray]:
         """z and r."""

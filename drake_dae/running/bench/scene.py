@@ -131,9 +131,7 @@ def _function(
     links, dae = model.links, model.dae
     force = ca.SX.sym("force", wrenches.function.sizes[2])
     column = [
-        part
-        for body in bodies
-        for part in (ca.vec(links.rotation(body)), links.position(body))
+        part for body in bodies for part in (ca.vec(links.rotation(body)), links.position(body))
     ]
     parameters = dae.parameter_symbol
     column += wrenches.function.function.call([links.q, links.v, force, parameters])[:3]
@@ -158,7 +156,9 @@ def surface_direction(model: RobotModel, constraint: Constraint, state: FloatArr
     wrenches = ConstraintWrenches(model)
     row = list(wrenches.constraints).index(constraint)
     rest = np.concatenate([state[: model.links.q.numel()], np.zeros(model.links.v.numel())])
-    push = np.concatenate([np.zeros(0), *(np.ones(len(c.force_signals)) for c in model.constraints)])
+    push = np.concatenate(
+        [np.zeros(0), *(np.ones(len(c.force_signals)) for c in model.constraints)]
+    )
     force = wrenches(rest, push).forces[row]
     return np.asarray(force / np.linalg.norm(force))
 

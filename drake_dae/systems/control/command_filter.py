@@ -5,9 +5,9 @@ through mu + 1 lags of rate w, the first of limited speed:
 
     y_0' = sat(w (c - y_0), V),    y_j' = w (y_(j-1) - y_j),    j = 1, ..., mu,    r = y_mu.
 
-Then r, r', ..., r^(mu) are continuous: r^(k) is a sum of y_(mu-k), ..., y_mu. It does not overshoot,
-and it is within limits: |y_0'| <= V, and a lag is a mean with positive weights, so that |r'| <= V and
-|r^(k)| <= (2 w)^(k-1) V.
+Then r, r', ..., r^(mu) are continuous: r^(k) is a sum of y_(mu-k), ..., y_mu. They are within
+limits: |y_0'| <= V, and a lag is a mean with positive weights, so that r does not overshoot,
+|r'| <= V, and |r^(k)| <= (2 w)^(k-1) V.
 
 The time s along the path is such a number as well: its speed s' is c behind lags, s' = 1 at first.
 """
@@ -44,9 +44,7 @@ class CommandLimits:
     """
 
     rates: Mapping[str, float] = field(default_factory=lambda: {"N": 40.0, "N m": 40.0})
-    speeds: Mapping[str, float] = field(
-        default_factory=lambda: {"m": 0.4, "N": 400.0, "N m": 40.0}
-    )
+    speeds: Mapping[str, float] = field(default_factory=lambda: {"m": 0.4, "N": 400.0, "N m": 40.0})
     rate: float = 12.0
     speed: float = 1.0
 

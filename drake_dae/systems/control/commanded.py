@@ -10,7 +10,6 @@ from drake_dae.dae.references import Reference
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import weakly
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
     PARAMETERS,
@@ -92,9 +91,7 @@ class CommandedReferences(ReferenceGenerator):
         given = ca.Function("base", [time, state], [base(s)])
         computations = (
             Computation(given, (TIME, STATE), ("base",)),
-            Computation.of(
-                self.filter.stacked, (TIME, STATE, PARAMETERS, "base"), ("reference",)
-            ),
+            Computation.of(self.filter.stacked, (TIME, STATE, PARAMETERS, "base"), ("reference",)),
             Computation.of(self.filter.rate, (STATE, PARAMETERS), (DERIVATIVE,)),
         )
         return Block(self, computations, signals={"commands": self.commands})

@@ -25,7 +25,7 @@ class View {
   }
   /* A ball that is dragged; it is seen through what is before it. */
   handle(color) {
-    const form = new three.SphereGeometry(0.018 * data.size, 20, 14);
+    const form = new three.SphereGeometry(0.022 * data.size, 20, 14);
     const look = new three.MeshBasicMaterial({ color, transparent: true, opacity: 0.8, depthTest: false });
     const made = new three.Mesh(form, look);
     made.renderOrder = 2;
@@ -73,9 +73,8 @@ class View {
     if (row < 0) return place;
     const point = vector(scene, View.places().points + 3 * row);
     const normal = new three.Vector3(...(data.surfaces[k].direction ?? [0, 0, 1]));
-    const up = Math.abs(normal.z) < 0.9 ? new three.Vector3(0, 0, 1) : new three.Vector3(0, 1, 0);
-    const aside = new three.Vector3().crossVectors(normal, up).normalize();
-    return point.addScaledVector(aside, 0.16 * data.size);
+    const up = new three.Vector3(0.3, 0.5, Math.abs(normal.z) < 0.7 ? 1 : 0).projectOnPlane(normal);
+    return point.addScaledVector(up.normalize(), 0.25 * data.size);
   }
   arrow(path, point, force, kind) {
     const size = force.length();

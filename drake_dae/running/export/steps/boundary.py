@@ -117,9 +117,7 @@ def plant_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
     return _part(compiled, _known_signals(loop, plant))
 
 
-def loop_part(
-    loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()
-) -> Part:
+def loop_part(loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()) -> Part:
     """A loop as a whole, which has no inputs. Its outputs are those of the record.
 
     Args:
