@@ -64,7 +64,9 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
             for add in parts.values():
                 found = add(found)
             completed, loop = build_completed(found, commands=limits)
-            context = start_scenario(completed.scenario, loop)
+            # At rest, where the scenario itself starts at rest.
+            begun = replace(completed.scenario, exogenous=scenario.exogenous)
+            context = start_scenario(begun, loop)
             return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
         except DrakeDaeError as error:
             if not parts:

@@ -27,6 +27,9 @@ OPTIONS = (
     "--disable-sync",
 )
 
+# How long a page has, in ms of its own time, which passes as fast as it computes.
+BUDGET = "--virtual-time-budget=60000"
+
 # What scripts of tests call. Balls and links are taken with pointer events, as a hand does.
 HELPERS = """
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -43,7 +46,9 @@ function point(kind, [clientX, clientY]) {
 const now = () => bench.samples.at(-1);
 // The clock of a page stands still; time passes by these steps alone.
 async function run(seconds) {
-  await bench.advance(Math.round(seconds / bench.data.tick));
+  for (let ticks = Math.round(seconds / bench.data.tick); ticks > 0; ticks -= 30) {
+    await bench.advance(Math.min(ticks, 30));
+  }
   if (bench.failure) throw new Error(bench.failure);
   bench.draw();
 }
@@ -54,18 +59,8 @@ const besides = ([x, y], dx, dy) => [x + dx, y + dy];
 _RESULT = re.compile(r'<pre id="result"[^>]*>(.*?)</pre>', re.DOTALL)
 
 
-def in_page(
-    page: str, body: str, file: Path, width: int = 1000, height: int = 700, seconds: int = 60
-):
-    """Runs a script in a page of a bench, in virtual time; returns what it returns.
-
-    Args:
-        page: The text of the page.
-        body: The body of an async function, with `HELPERS`.
-        file: Where the page with the script is written; opened from file://.
-        width, height: The size of the window, in pixels.
-        seconds: How much virtual time there is.
-    """
+def with_script(page: str, body: str) -> str:
+    """The text of a page of a bench with the body of an async function, which has `HELPERS`."""
     script = (
         f'<script type="module">{HELPERS}\n'
         "const shown = document.createElement('pre');\nshown.id = 'result';\n"
@@ -79,20 +74,26 @@ def in_page(
         "</script>"
     )
     before, mark, after = page.rpartition("</body>")
-    file.write_text(before + script + mark + after, encoding="utf-8")
-    return opened(
-        file.as_uri(),
-        file.parent / "profile",
-        width,
-        height,
-        f"--virtual-time-budget={1000 * seconds}",
-    )
+    return before + script + mark + after
 
 
-def opened(address: str, profile: Path, width: int, height: int, *more: str):
-    """What the script of a page found that Chromium opens."""
-    size, kept = f"--window-size={width},{height}", f"--user-data-dir={profile}"
-    command = [CHROMIUM, *OPTIONS, kept, size, *more, "--dump-dom", address]
+def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 700):
+    """What a script returns in a page that is opened from file://.
+
+    Args:
+        page: The text of the page.
+        body: As of `with_script`.
+        file: Where the page with the script is written.
+        width, height: The size of the window, in pixels.
+    """
+    file.write_text(with_script(page, body), encoding="utf-8")
+    return opened(file.as_uri(), file.parent / "profile", width, height)
+
+
+def opened(address: str, profile: Path, width: int = 1000, height: int = 700):
+    """What the script of a page returns that Chromium opens, in virtual time."""
+    more = f"--window-size={width},{height}", f"--user-data-dir={profile}", BUDGET
+    command = [CHROMIUM, *OPTIONS, *more, "--dump-dom", address]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     found = _RESULT.search(done.stdout)
     assert found, f"the page has no result: {done.stderr[-2000:]}"

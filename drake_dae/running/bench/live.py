@@ -3,11 +3,12 @@
 import errno
 import json
 import secrets
+import threading
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ PATIENCE = 0.5
 """How often, in s, a server without requests looks whether it should end."""
 
 
-class Server(HTTPServer):
+class Server(ThreadingHTTPServer):
     """Serves the page of a bench to this machine, and runs its loop as the page asks.
 
     The page's address has a secret, so that no other page of the browser can reach it.
@@ -52,6 +53,8 @@ class Server(HTTPServer):
         ModelError: The plant is no robot.
         OSError: The port is in use.
     """
+
+    daemon_threads = True
 
     def __init__(
         self,
@@ -75,7 +78,7 @@ class Server(HTTPServer):
             bench = bench_of(loop, context, title or loop.plant.dae.name, notes)
             self._sampler = Sampler(bench)
             self._made = loop, context, config
-            self._save = save
+            self._save, self._lock = save, threading.Lock()
             self.path = f"/{secrets.token_urlsafe(12)}/"
             self.address = f"http://{HOST}:{self.server_port}{self.path}"
             self.page = page_of(
@@ -98,6 +101,10 @@ class Server(HTTPServer):
             ModelError: It asks for what there is not.
             DrakeDaeError: The loop cannot go on.
         """
+        with self._lock:  # A browser keeps several connections, each of which has a thread.
+            return self._answer(what, told)
+
+    def _answer(self, what: str, told: Any) -> dict[str, Any]:
         if what == "start":
             return self.start()
         if what == "save" and self._save is not None:
@@ -131,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_ours(self.server.path, is_whole=False):
             return
         size = int(self.headers.get("Content-Length") or 0)
-        if size > MOST:
+        if not 0 <= size <= MOST:
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
         try:

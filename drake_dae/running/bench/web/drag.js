@@ -30,7 +30,9 @@ class Drag {
     event.target.setPointerCapture?.(event.pointerId);
     const origin = new three.Vector3(), ahead = viewer.camera.getWorldDirection(new three.Vector3());
     ahead.copy(inside(ahead).sub(inside(origin)));
-    this.plane = new three.Plane().setFromNormalAndCoplanarPoint(ahead, this.held.point);
+    const { across } = this.held; /* In a plane that is seen from its edge nothing is aimed at. */
+    const normal = across && Math.abs(across.dot(ahead)) > 0.15 ? across : ahead;
+    this.plane = new three.Plane().setFromNormalAndCoplanarPoint(normal, this.held.point);
   }
   move(event) {
     if (!this.held) return;
@@ -72,7 +74,13 @@ class Drag {
       const off = place ? Math.hypot(place[0] - clientX, place[1] - clientY) : Infinity;
       if (off < NEAR) found.push([off, make]);
     };
-    data.targets.forEach(({ axes }, k) => offer(this.view.targets[k], () => this.mover(this.view.targets[k], axes)));
+    const unit = (axis) => new three.Vector3().setComponent(axis, 1);
+    data.targets.forEach(({ axes }, k) => {
+      const others = [0, 1, 2].filter((axis) => !axes.some(([own]) => own === axis));
+      const along = axes.length === 1 ? unit(axes[0][0]) : undefined;
+      const across = others.length === 1 ? unit(others[0]) : undefined;
+      offer(this.view.targets[k], () => this.mover(this.view.targets[k], axes, along, across));
+    });
     data.surfaces.forEach(({ controls, direction }, k) => {
       const axes = controls.map((control, axis) => [axis, control]).filter(([, control]) => control !== null);
       const along = direction && new three.Vector3(...direction);
@@ -81,14 +89,14 @@ class Drag {
     return found.sort((one, other) => one[0] - other[0])[0]?.[1]();
   }
   /* Moves controls, one for each of some axes of the world, as far as the pointer. */
-  mover(handle, axes, along) {
+  mover(handle, axes, along, across) {
     const point = handle.position.clone();
     const before = axes.map(([, control]) => this.panel.value(control));
     const follow = (pointer) => axes.forEach(([axis, control], i) => {
       const off = pointer.getComponent(axis) - point.getComponent(axis);
       this.panel.set(control, before[i] + off);
     });
-    return { point, along, follow };
+    return { point, along, across, follow };
   }
   /* A push on the link under the pointer, which pulls the point that was taken. */
   link() {
