@@ -17,13 +17,10 @@ from pydrake.systems.primitives import (
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.control.command_filter import CommandLimits
-from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -43,65 +40,6 @@ def add_block(builder: DiagramBuilder, block: Block) -> Block:
         raise WiringError(
             f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
         ) from None
-
-
-def make_generator(
-    references: Sequence[Reference], law: TrackingLaw, parts: LoopSettings
-) -> ReferenceGenerator:
-    """The generator of a law's references, which are commanded if the settings say so.
-
-    Raises:
-        WiringError: References are to be governed and commanded.
-        ReferenceSignalError: They do not fit the law.
-    """
-    if parts.commands is None:
-        return ReferenceGenerator(references, law.degrees)
-    if parts.governed is not None:
-        raise WiringError("references that are governed cannot be commanded: leave one out")
-    signals = law.system.output_signals
-    return CommandedReferences(references, law.degrees, signals, parts.commands, parts.start_time)
-
-
-def add_exogenous(
-    builder: DiagramBuilder,
-    block: Plant | Controller,
-    dae: DaeSystem,
-    exogenous: Sequence[Reference],
-    commands: CommandLimits | None = None,
-    depth: int = 0,
-) -> ReferenceGenerator | None:
-    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
-
-    Args:
-        builder: The builder of the diagram.
-        block: The block.
-        dae: The block's system.
-        exogenous: The references, in the order of the signals.
-        commands: How fast they follow what is commanded; None if nothing is.
-        depth: The least number of lags of these; plant and law have the same.
-
-    Raises:
-        WiringError: The number of references differs from that of the signals.
-    """
-    names = [signal.name for signal in dae.exogenous.signals]
-    size = sum(reference.size for reference in exogenous)
-    if exogenous and size != len(names):
-        raise WiringError(
-            f"the references of exogenous signals cover {size}, '{dae.name}' has "
-            f"{len(names)}: {', '.join(names) or 'none'}"
-        )
-    if not exogenous:
-        return None
-    degrees, signals = block.exogenous_layout.degrees, dae.exogenous.signals
-    made = ReferenceGenerator(exogenous, degrees)
-    if commands is not None:
-        made = CommandedReferences(
-            exogenous, degrees, signals, commands, has_speed=False, depth=depth
-        )
-    generator = builder.AddSystem(made)
-    generator.set_name(f"{block.get_name()}_exogenous")
-    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
-    return generator
 
 
 def add_signals(

@@ -1,6 +1,6 @@
 """The wiring of a closed loop: plant, references and controller."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
@@ -17,7 +17,6 @@ from drake_dae.diagrams.observing import Observer, add_observer
 from drake_dae.diagrams.parts import (
     add_block,
     add_drives,
-    add_exogenous,
     add_feasible,
     add_hold,
     add_signals,
@@ -26,10 +25,10 @@ from drake_dae.diagrams.parts import (
     contact_reference,
     hold_before,
     log_steps,
-    make_generator,
     open_holds,
 )
 from drake_dae.diagrams.settings import LoopSettings
+from drake_dae.diagrams.sources import add_exogenous, make_generator
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.view import add_live_view
@@ -185,11 +184,7 @@ def wire_loop(
         builder.Connect(control, controller.GetInputPort("acting_control"))
 
     # Exogenous signals go to the plant, and to the law as known there.
-    own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
-    degrees = *plant.exogenous_layout.degrees, *controller.exogenous_layout.degrees
-    lags = parts.commands, max(degrees, default=0) + 1
-    moving = add_exogenous(builder, plant, plant.dae, own, *lags)
-    known = add_exogenous(builder, controller, law.system, parts.exogenous, *lags)
+    moving, known = add_exogenous(builder, plant, controller, parts)
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
     # updated while a contact is open or lost, or a drive is at its limit.
@@ -225,10 +220,9 @@ def wire_loop(
     if reference is not None:
         for name, signals in reference.further_signals.items():
             named[name] = (reference.GetOutputPort(name), signals)
-    by_time = reference is None or reference.follows_time
-    loggers = _logged(builder, plant, controller, control, named, by_time, moving)
-    if known is not None:
-        builder.ExportOutput(known.get_output_port(), "known_exogenous")
+    sources = {"reference": reference, "exogenous": moving}
+    by_time = {name for name, each in sources.items() if each is None or each.follows_time}
+    loggers = _logged(builder, plant, controller, control, named, by_time)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -273,8 +267,7 @@ def _logged(
     controller: Controller,
     control: OutputPort,
     named: Named,
-    by_time: bool,
-    moving: ReferenceGenerator | None,
+    by_time: Set[str],
 ) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
     """Exports all signals, and logs those that do not follow from what is logged.
 
@@ -283,16 +276,13 @@ def _logged(
         plant, controller: The blocks.
         control: What arrives at the plant.
         named: The signals.
-        by_time: Whether references follow from the time.
-        moving: The generator of the plant's exogenous signals, if any.
+        by_time: The signals that follow from the time.
     """
     available: set[str] = set()
     if plant.functions:
-        available = {*plant.functions, *(["reference"] if by_time else [])}
-        if moving is None or moving.follows_time:
-            available.add("exogenous")
-            if controller.follows and control.get_system() is controller:
-                available.add("control")
+        available = {*plant.functions, *by_time}
+        if "exogenous" in by_time and controller.follows and control.get_system() is controller:
+            available.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)

@@ -17,16 +17,22 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.observing import control_lag
-from drake_dae.diagrams.parts import hold_before, make_generator
+from drake_dae.diagrams.parts import hold_before
 from drake_dae.diagrams.settings import LoopSettings
+from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import Timed, timed
+from drake_dae.scenario.controllers.adaptive import adaptive_controller, check_adaptive
+from drake_dae.scenario.controllers.task_controller import (
+    check_task,
+    opening_contact,
+    task_controller,
+)
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
@@ -36,7 +42,6 @@ from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
 from drake_dae.systems.cascade.cascade import SpringCascade
 from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.sampling import Sampling
