@@ -92,11 +92,6 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         }
         for each in scene.targets
     ]
-    masses = [
-        parameter.value.sum()
-        for parameter in plant.dae.parameters
-        if parameter.name.endswith(".mass")
-    ]
     layout = loop.controller.law.layout
     data = {
         "title": title,
@@ -104,7 +99,7 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "start": context.get_time(),
         "tick": TICK,
         "size": scene.size,
-        "weight": 9.81 * float(np.sum(masses)) or 10.0,
+        "push": _largest_push(loop),
         "outputs": [
             {"name": s.name, "unit": s.unit, "lowest": int(k)}
             for s, k in zip(signals, layout.lowest, strict=True)
@@ -130,6 +125,18 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "notes": list(notes),
     }
     return Bench(loop, context, scene, controls, data)
+
+
+def _largest_push(loop: ClosedLoop) -> float:
+    """The force of the strongest push, N: it moves the robot by some of its size.
+
+    A law with poles at -p holds a mass m as a spring of m p^2 does.
+    """
+    dae, gains = loop.plant.dae, loop.controller.law.gains
+    masses = [p.value.sum() for p in dae.parameters if p.name.endswith(".mass")]
+    slowest = float(np.min(-gains.poles.real)) if gains.poles.size else 4.0
+    share = min(max((slowest / 12.0) ** 2, 0.05), 1.0)
+    return 9.81 * share * (float(np.sum(masses)) or 1.0)
 
 
 def shown_function(bench: Bench, columns: dict[str, ca.SX], given: ca.SX) -> ca.SX:

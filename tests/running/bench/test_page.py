@@ -78,6 +78,12 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
   point("pointerup", at);
   await run(1);
   found.off.push(bench.off);
+  // A gamepad, of which this browser has none.
+  navigator.getGamepads = () => [null, { axes: [0, -1, 0, 0.1] }];
+  const offset = () => bench.panel.value(bench.data.targets[0].axes[0][1]);
+  found.stick = [offset()];
+  bench.gamepad(0.1);
+  found.stick.push(offset());
   found.failure = bench.failure;
   return found;
 """,
@@ -94,6 +100,7 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
     assert found["target"][1] - found["target"][0] == pytest.approx(0.1, abs=5e-3)
     assert found["isPushed"]
     assert found["pushed"] > 1e-3
+    assert found["stick"][1] > found["stick"][0]
     assert not found["failure"]
 
 

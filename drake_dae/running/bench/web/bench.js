@@ -4,6 +4,10 @@
    set(input, value) changes a number before the next. A sample has the time, outputs z, references
    r, the column of the scene, and the coordinates of the error. */
 const element = (id) => document.getElementById(`bench-${id}`);
+if (typeof viewer === "undefined") {
+  element("state").textContent = "this browser has no WebGL, which the view needs";
+  element("state").className = "wrong";
+}
 const sizes = {
   scene: 12 * data.bodies.length + 9 * data.constraints.length + 12 * data.surfaces.length +
     3 * data.targets.length,
@@ -57,7 +61,7 @@ function follow_push() {
   if (!size) return;
   view.push.position.copy(point);
   view.push.setDirection(force.clone().normalize());
-  view.push.setLength((0.5 * data.size * size) / data.weight, 0.05 * data.size, 0.03 * data.size);
+  view.push.setLength((FULL * data.size * size) / data.push, 0.05 * data.size, 0.03 * data.size);
 }
 
 /* Runs some ticks, with the push of the pointer as it is now. */
@@ -94,6 +98,22 @@ function draw() {
   element("run").textContent = bench.isRunning ? "pause" : "run";
 }
 
+/* Sticks of a gamepad move the target along its axes; the last axis changes the first force. */
+function gamepad(seconds) {
+  const pad = Array.from(navigator.getGamepads?.() ?? []).find(Boolean);
+  if (!pad) return;
+  const turned = pad.axes.map((value) => (Math.abs(value) < 0.15 ? 0 : value));
+  const move = (control, value) => {
+    const { high, low } = data.controls[control];
+    if (value) panel.set(control, panel.value(control) + 0.5 * seconds * value * (high - low));
+  };
+  const [first, second] = data.targets[0]?.axes ?? [];
+  if (first) move(first[1], second ? turned[0] ?? 0 : -(turned[1] ?? 0));
+  if (second) move(second[1], -(turned[1] ?? 0));
+  const pressed = data.controls.findIndex(({ kind, unit }) => kind === "reference" && unit === "N");
+  if (pressed >= 0) move(pressed, -(turned[3] ?? 0));
+}
+
 let before = performance.now(), owed = 0, isBusy = false;
 async function picture(now) {
   requestAnimationFrame(picture);
@@ -101,6 +121,7 @@ async function picture(now) {
   const passed = (now - before) / 1000;
   before = now;
   if (bench.isRunning) {
+    gamepad(passed);
     const wanted = passed * RATES[bench.rate];
     owed = Math.min(owed + wanted, MOST);
     const ticks = Math.floor(owed / data.tick);
@@ -157,5 +178,5 @@ for (const name of ["signal", "error"]) element(name).addEventListener("change",
 viewer.gui.domElement.style.display = "none";
 new Drag(view, panel, pushed);
 await restart();
-Object.assign(bench, { advance, draw, isReady: true });
+Object.assign(bench, { advance, draw, gamepad, isReady: true });
 requestAnimationFrame(picture);

@@ -1,6 +1,6 @@
 /* What is dragged in the view: a green ball is the target, an orange one a surface, a link is pushed. */
 const NEAR = 24; /* pixels from a ball at which it is taken */
-const STIFF = 3; /* a pull by the robot's size is a push of so many of its weights */
+const FULL = 0.4; /* a pull by this share of the robot's size is the strongest push */
 
 class Drag {
   constructor(view, panel, pushed) {
@@ -124,8 +124,8 @@ function wrench({ path, local, pointer }) {
   const frame = node(path);
   frame.updateWorldMatrix(true, false);
   const point = inside(frame.localToWorld(local.clone()));
-  const force = pointer.clone().sub(point).multiplyScalar((STIFF * data.weight) / data.size);
-  force.clampLength(0, 2 * data.weight);
+  const force = pointer.clone().sub(point).multiplyScalar(data.push / (FULL * data.size));
+  force.clampLength(0, data.push);
   const origin = inside(new three.Vector3().setFromMatrixPosition(frame.matrixWorld));
   const lever = point.clone().sub(origin);
   return { point, force, moment: lever.cross(force) };
