@@ -210,22 +210,23 @@ def _pole(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]
     if not controller.follows or controller not in inputs.blocks:
         return []
     first = inputs.blocks[controller]
-    own = law.system.parameter_vector(None)
+    size = law.system.parameter_vector(None).size
     try:
-        at = {p: law.all_parameters(own, poles(-p))[own.size :] for p in (1.0, 2.0, 3.0)}
+        at = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
     except GainError:
         return []
-    places = [first + own.size + i for i in range(at[1.0].size)]
+    places = [first + size + i for i in range(at[1.0].size)]
     factors = at[1.0]
     powers = np.round(np.log2(np.where(factors, at[2.0] / np.where(factors, factors, 1.0), 1.0)))
     if not places or not np.allclose(factors * 3.0**powers, at[3.0], rtol=1e-9):
         return []
-    slowest = -float(np.max(law.gains.poles.real))
-    if not np.allclose(values[places], factors * slowest**powers, rtol=1e-6):
+    # The mean of all poles; eigenvalues that coincide are not found exactly.
+    own = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
+    if not np.allclose(values[places], factors * own**powers, rtol=1e-9):
         return []
     given = tuple(places), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
-    most = _round(max(4.0 * slowest, 20.0))
-    return [Control("pole", "pole of all errors", "1/s", -most, -0.5, -slowest, *given)]
+    most = _round(max(4.0 * own, 20.0))
+    return [Control("pole", "pole of all errors", "1/s", -most, -0.5, -own, *given)]
 
 
 def _round(value: float) -> float:

@@ -103,7 +103,10 @@ class View {
       label.style.display = place ? "block" : "none";
       if (!place) return;
       label.textContent = `${data.constraints.length > 1 ? `${name} ` : ""}${size.toPrecision(3)} N`;
-      let [left, top] = [place[0] + 6, place[1] - 28];
+      /* Beyond the head, as seen from the point of application, so that it covers no tool. */
+      const foot = this.on_screen(vector(scene, at.points + 3 * k)) ?? place;
+      let left = place[0] < foot[0] ? place[0] - label.offsetWidth - 12 : place[0] + 12;
+      let top = place[1] + (place[1] < foot[1] ? -30 : 10);
       while (taken.some(([x, y]) => Math.abs(x - left) < 120 && Math.abs(y - top) < 18)) top += 18;
       taken.push([left, top]);
       left = Math.min(Math.max(left, box.left), box.right - label.offsetWidth - 2);
