@@ -115,7 +115,8 @@ def build_loop(
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
         motion: The time-optimal motion, from `timed`; None for the scenario's references.
-        commands: How fast references follow what is commanded; None if nothing is.
+        commands: How fast references follow what is commanded; signals for which a task waits are
+            then inputs of the diagram. None if nothing is commanded.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -162,7 +163,7 @@ def build_loop(
         plant_exogenous=plant_exogenous,
         governed=None if motion is None else motion.governed,
         tolerances=scenario.tolerances,
-        signals={} if task is None else task.signals,
+        signals={} if task is None or commands is not None else task.signals,
         commands=commands,
         start_time=scenario.integrator.start_time,
     )

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, LeafSystem, System
+from pydrake.systems.framework import Context, InputPort, LeafSystem, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
@@ -16,6 +16,7 @@ from drake_dae.errors import GainError
 from drake_dae.running.export.steps.words import distinct, parameters_of_block
 from drake_dae.systems.control.command_filter import SPEED
 from drake_dae.systems.control.commanded import CommandedReferences
+from drake_dae.systems.control.contract import SIGNAL
 
 PUSH = "push."
 """Begins the names of the wrenches that push links."""
@@ -27,14 +28,16 @@ _ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """The numeric parameters of the blocks of a loop, below each other.
+    """The numeric parameters of the blocks of a loop, below each other, and signals it waits for.
 
     Attributes:
         blocks: The blocks, each with numeric parameter 0, and where its entries begin.
+        ports: The signals for which a task waits: input port of the diagram -> its entry.
         names, units: Those of each entry.
     """
 
     blocks: Mapping[System, int]
+    ports: Mapping[InputPort, int]
     names: Sequence[str]
     units: Sequence[str]
 
@@ -52,13 +55,21 @@ class Inputs:
             if own.num_numeric_parameter_groups():
                 blocks[block] = len(signals)
                 signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
+        diagram, ports = loop.diagram, dict[InputPort, int]()
+        for i in range(diagram.num_input_ports()):
+            port = diagram.get_input_port(i)
+            if port.get_name().startswith(SIGNAL):
+                ports[port] = len(signals)
+                signals.append(Signal(port.get_name()))
         found = distinct(signals)
-        return cls(blocks, [s.name for s in found], [s.unit for s in found])
+        return cls(blocks, ports, [s.name for s in found], [s.unit for s in found])
 
     def values(self, context: Context) -> FloatArray:
         """Their values in a context of the loop's diagram."""
         own = (block.GetMyContextFromRoot(context) for block in self.blocks)
-        return np.concatenate([each.get_numeric_parameter(0).CopyToVector() for each in own])
+        parts = [each.get_numeric_parameter(0).CopyToVector() for each in own]
+        given = [port.Eval(context) if port.HasValue(context) else [0.0] for port in self.ports]
+        return np.concatenate([*parts, *given])
 
     def set(self, context: Context, changes: Mapping[int, float]) -> None:
         """Changes entries in a context."""
@@ -70,6 +81,9 @@ class Inputs:
                 values = own.get_numeric_parameter(0).CopyToVector()
                 values[list(mine)] = list(mine.values())
                 own.get_mutable_numeric_parameter(0).SetFromVector(values)
+        for port, place in self.ports.items():
+            if place in changes:
+                port.FixValue(context, [changes[place]])
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,7 @@ class Control:
     """A slider, or something that is dragged, and the inputs that it sets.
 
     Attributes:
-        kind: "speed", "reference", "surface", "plant", "pole" or "push".
+        kind: "speed", "reference", "surface", "signal", "plant" or "pole".
         label, unit: What it is called.
         low, high, value: The ends of the slider, and where it begins.
         inputs: The entries of `Inputs` that it sets.
@@ -127,6 +141,10 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
     inputs = Inputs.of(loop)
     values = inputs.values(context)
     found = _commands(loop, inputs, context, size) + _surfaces(loop, inputs, 0.2 * size)
+    found += [
+        Control("signal", port.get_name().removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (place,))
+        for port, place in inputs.ports.items()
+    ]
     found += _plant(loop, inputs, values) + _pole(loop, inputs, values)
     places = _places(loop.plant.dae, inputs.blocks.get(loop.plant))
     pushes = {

@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import path_of
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.running.bench.controls import Controls, controls_of, prediction
 from drake_dae.running.bench.scene import (
     Scene,
@@ -92,6 +93,7 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         }
         for each in scene.targets
     ]
+    links = _links_in_contact(loop, controls)
     layout = loop.controller.law.layout
     data = {
         "title": title,
@@ -108,11 +110,13 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "constraints": [
             {
                 "name": each.name,
+                "link": links.get(each.name),
                 "force": path_of(each, "force").strip("/").split("/"),
                 "moment": path_of(each, "moment").strip("/").split("/") if turns else None,
             }
             for each, turns in zip(scene.constraints, scene.with_moment, strict=True)
         ],
+        "opens": bool(set(plant.contacts) & set(links)),
         "surfaces": surfaces,
         "targets": targets,
         "controls": controls.data(),
@@ -125,6 +129,19 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "notes": list(notes),
     }
     return Bench(loop, context, scene, controls, data)
+
+
+def _links_in_contact(loop: ClosedLoop, controls: Controls) -> dict[str, str]:
+    """Constraint -> the link that can be pushed on which it acts."""
+    wrenches = ConstraintWrenches(loop.plant.robot("a bench"))
+    drawn = loop.plant.robot("a bench").links.plant
+    found = {}
+    for constraint, frame in zip(wrenches.constraints, wrenches.frames, strict=True):
+        if drawn is not None and isinstance(frame, str) and drawn.HasFrameNamed(frame):
+            link = drawn.GetFrameByName(frame).body().scoped_name().get_full()
+            if link in controls.pushes:
+                found[constraint.name] = link
+    return found
 
 
 def _largest_push(loop: ClosedLoop) -> float:

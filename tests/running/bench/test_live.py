@@ -50,9 +50,9 @@ def built():
 
 
 @contextmanager
-def serving(built, **more):
+def serving(built, name="two_link_wall", **more):
     """A server in a thread of its own."""
-    config = scenario("two_link_wall").integrator
+    config = scenario(name).integrator
     with Server(built.loop, built.context, config, "arm", **more) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
@@ -188,3 +188,37 @@ def test_the_command_runs_commands_again(tmp_path, built, capsys):
     with np.load(tmp_path / "again" / "record.npz") as again:
         np.testing.assert_array_equal(again["state"], run.record()["state"])
     assert run.record()["constraint_force"][-1, 0] > 30.0
+
+
+@pytest.mark.thorough
+def test_a_signal_that_is_given_by_hand_ends_a_phase():
+    own = build_commanded(scenario("wall_guarded"))
+    run = HandRun(own.loop, own.context, scenario("wall_guarded").integrator)
+    (place,) = run.inputs.ports.values()
+    assert run.inputs.names[place] == "signal_ready"
+    phases = []
+    for k in range(270):
+        if k == 240:
+            run.set({place: 1.0})
+        run.advance()
+        phases.append(own.loop.changes(run.context)[-1].phase)
+    assert phases[239] == "Wait"
+    assert phases[-1] == "slide"
+
+
+@needs_chromium
+@pytest.mark.thorough
+def test_a_contact_that_is_lost_is_searched_again(tmp_path):
+    own = build_commanded(scenario("wall_polish"))
+    body = """
+  await run(5);
+  const before = now().phase;
+  document.getElementById("bench-lose").click();
+  await run(0.4);
+  const force = bench.data.bodies.length * 12 + 3;
+  return { before, after: now().phase, force: now().scene[force], failure: bench.failure };
+"""
+    with serving(own, "wall_polish") as server:
+        server.page = with_script(server.page, body)
+        found = opened(server.address, tmp_path / "profile")
+    assert found == {"before": "Move 2", "after": "Approach", "force": 0, "failure": ""}

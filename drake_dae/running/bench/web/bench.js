@@ -27,6 +27,7 @@ const prediction = data.prediction && new Prediction(data.prediction, (input) =>
 const plots = { signal: new Plot(element("signal-plot")), error: new Plot(element("error-plot")) };
 const bench = (window.bench = {
   data, engine, panel, view, samples: [], isRunning: true, rate: 3, restarts: true, off: 0, speed: 1, failure: "",
+  pulled: [],
 });
 
 /* What follows from a sample: error, and the predicted one. */
@@ -64,9 +65,30 @@ function follow_push() {
   view.push.setLength((FULL * data.size * size) / data.push, 0.05 * data.size, 0.03 * data.size);
 }
 
+/* Pulls each tool off its surface for a moment, harder than it presses. */
+const PULL = 0.15;
+function lose() {
+  const { scene, time } = bench.samples.at(-1), at = View.places();
+  data.constraints.forEach(({ link }, k) => {
+    const force = vector(scene, at.forces + 3 * k), size = force.length();
+    if (!link || !size) return;
+    const body = 12 * data.bodies.findIndex(({ name }) => name === link) + 9;
+    force.multiplyScalar(1 + data.push / size);
+    const lever = vector(scene, at.points + 3 * k).sub(vector(scene, body));
+    give(link, [...force.toArray(), ...lever.cross(force).toArray()], "push");
+    bench.pulled.push({ link, until: time + PULL });
+  });
+}
+function let_go() {
+  const isOver = ({ until }) => bench.samples.at(-1).time >= until;
+  for (const { link } of bench.pulled.filter(isOver)) give(link, [0, 0, 0, 0, 0, 0], "released");
+  bench.pulled = bench.pulled.filter((one) => !isOver(one));
+}
+
 /* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
   if (bench.push) follow_push();
+  if (bench.pulled.length) let_go();
   try {
     (await engine.advance(ticks)).forEach(taken);
   } catch (error) {
@@ -145,7 +167,7 @@ async function picture(now) {
 async function restart() {
   panel.reset();
   pushed(null);
-  Object.assign(bench, { samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
+  Object.assign(bench, { pulled: [], samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
   taken(await engine.start());
 }
 const change_rate = (by) => {
@@ -157,6 +179,7 @@ const act = {
   step: () => (bench.isRunning = false, bench.failure || advance(1)),
   slower: () => change_rate(-1),
   faster: () => change_rate(1),
+  lose,
   restart,
   async save() {
     element("state").textContent = `saved: ${await engine.save()}`;
@@ -164,6 +187,7 @@ const act = {
 };
 for (const [name, action] of Object.entries(act)) element(name).addEventListener("click", action);
 
+element("lose").hidden = !data.opens;
 element("title").textContent = data.title;
 data.outputs.forEach(({ name, unit }, i) => element("signal").append(new Option(unit ? `${name} [${unit}]` : name, i)));
 const units = [...new Set(data.outputs.map(({ unit }) => unit))];

@@ -2,6 +2,7 @@
 const GROUPS = [
   ["reference", "References", true],
   ["surface", "Surfaces", false],
+  ["signal", "Signals that the task waits for", true],
   ["plant", "Plant", true],
   ["pole", "Law", true],
 ];
@@ -34,7 +35,8 @@ class Panel {
     const label = document.createElement("label"), name = document.createElement("span");
     const slider = document.createElement("input"), shown = document.createElement("output");
     name.textContent = `${control.label}${control.kind === "reference" ? ", change" : ""}`;
-    Object.assign(slider, { type: "range", min: control.low, max: control.high, step: "any" });
+    const step = control.kind === "signal" ? 1 : "any";
+    Object.assign(slider, { type: "range", min: control.low, max: control.high, step });
     slider.dataset.control = control.label;
     slider.addEventListener("input", () => this.set(i, Number(slider.value)));
     label.append(name, shown, slider);
