@@ -61,7 +61,7 @@ def _page(options: argparse.Namespace) -> int:
     name, scenario, built = _built(options)
     file = options.out or Path(f"{name}.html")
     title = scenario.description or name
-    given = built.loop, built.context, file, scenario.integrator, title, built.left_out
+    given = built.loop, built.context, file, None, title, built.left_out
     try:
         files = write_page(*given, shared_bundle=options.shared_bundle)
     except ModelError as error:

@@ -46,7 +46,8 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
     """The loop of a scenario with `CommandedReferences`, surfaces that move, and links to push.
 
     What nobody commands is as in the scenario: surfaces stand still, wrenches and friction are
-    zero. Signals for which a task waits are inputs of the diagram, to be given by hand. Where a part does not fit the scenario, it is left out.
+    zero. Signals for which a task waits are inputs of the diagram, to be given by hand. Where a
+    part does not fit the scenario, it is left out.
 
     Args:
         scenario: What `load_scenario` returns.

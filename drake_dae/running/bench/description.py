@@ -8,8 +8,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
+from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import path_of
@@ -21,6 +23,9 @@ from drake_dae.running.bench.scene import (
     scene_of,
     surface_direction,
 )
+
+SHARE = 0.15
+"""How far the strongest push moves a robot, as a share of its size."""
 
 TICK = 1.0 / 120.0
 """Commands take effect at multiples of this time after the start, in s."""
@@ -94,6 +99,7 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         for each in scene.targets
     ]
     links = _links_in_contact(loop, controls)
+    strongest = _strongest_pushes(loop, state, list(controls.pushes), scene.size)
     layout = loop.controller.law.layout
     data = {
         "title": title,
@@ -101,7 +107,6 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "start": context.get_time(),
         "tick": TICK,
         "size": scene.size,
-        "push": _largest_push(loop),
         "outputs": [
             {"name": s.name, "unit": s.unit, "lowest": int(k)}
             for s, k in zip(signals, layout.lowest, strict=True)
@@ -120,7 +125,10 @@ def bench_of(loop: ClosedLoop, context: Context, title: str, notes: Sequence[str
         "surfaces": surfaces,
         "targets": targets,
         "controls": controls.data(),
-        "pushes": dict(controls.pushes),
+        "pushes": {
+            name: {"input": place, "most": strongest[name]}
+            for name, place in controls.pushes.items()
+        },
         "prediction": prediction(loop, inputs),
         "inputs": [
             {"name": name, "unit": unit, "value": value}
@@ -144,16 +152,32 @@ def _links_in_contact(loop: ClosedLoop, controls: Controls) -> dict[str, str]:
     return found
 
 
-def _largest_push(loop: ClosedLoop) -> float:
-    """The force of the strongest push, N: it moves the robot by some of its size.
+def _strongest_pushes(
+    loop: ClosedLoop, state: FloatArray, links: Sequence[str], size: float
+) -> dict[str, float]:
+    """Link -> the force of the strongest push on it, N.
 
-    A law with poles at -p holds a mass m as a spring of m p^2 does.
+    A law with poles at -p holds a mass m as a spring of stiffness m p^2 does, and the mass felt at
+    the link's origin is 1 / (J M^-1 J^T). The push moves it by `SHARE` of the robot's size.
     """
-    dae, gains = loop.plant.dae, loop.controller.law.gains
-    masses = [p.value.sum() for p in dae.parameters if p.name.endswith(".mass")]
+    drawn, gains = loop.plant.robot("a bench").links.plant, loop.controller.law.gains
+    if drawn is None or not links:
+        return {}
     slowest = float(np.min(-gains.poles.real)) if gains.poles.size else 4.0
-    share = min(max((slowest / 12.0) ** 2, 0.05), 1.0)
-    return 9.81 * share * (float(np.sum(masses)) or 1.0)
+    context = drawn.CreateDefaultContext()
+    drawn.SetPositions(context, state[: drawn.num_positions()])
+    mass, world, found = drawn.CalcMassMatrix(context), drawn.world_frame(), {}
+    for name in links:
+        instance, _, body = name.rpartition("::")
+        frame = drawn.GetBodyByName(body, drawn.GetModelInstanceByName(instance)).body_frame()
+        J = drawn.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, frame, np.zeros(3), world, world
+        )
+        # The direction in which it is lightest; a base that turns about its origin is not moved.
+        lightest = float(np.linalg.eigvalsh(J @ np.linalg.solve(mass, J.T))[-1])
+        felt = 1.0 / max(lightest, 1.0 / float(np.trace(mass)))
+        found[name] = felt * slowest**2 * SHARE * size
+    return found
 
 
 def shown_function(bench: Bench, columns: dict[str, ca.SX], given: ca.SX) -> ca.SX:

@@ -59,7 +59,8 @@ def write_page(
         loop: The loop.
         context: The context of its diagram at the start; not changed.
         file: Where to write.
-        config: Drake's settings; steps are fixed, as of `export_wasm`.
+        config: Drake's settings, whose fixed steps it takes, as `export_wasm` does; for None,
+            steps of at most 1 ms by `runge_kutta5`.
         title: The title; the robot's name if empty.
         notes: Sentences that the page shows, such as what cannot be changed.
         shared_bundle: Where to write Meshcat's bundle of 2.2 MB, for several pages; None to have it

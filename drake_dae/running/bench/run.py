@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, describe_os_error
 from drake_dae.files import read_text
 from drake_dae.running.bench.controls import Inputs
 from drake_dae.running.bench.description import TICK, Bench, shown_function
@@ -26,6 +26,7 @@ MOST = 100_000_000
 """The longest file of commands, in bytes."""
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Commands:
     """What was changed in a run, and when.
@@ -46,13 +47,18 @@ class Commands:
 
     def __post_init__(self) -> None:
         before = 0
-        for k, name, value in self.commands:
-            if not before <= k <= self.end or not np.isfinite(value):
+        for one in self.commands:
+            try:
+                (k, name, value) = one
+                is_right = before <= k <= self.end and str(name) == name and np.isfinite(value)
+            except (TypeError, ValueError):
+                is_right = False
+            if not is_right:
                 raise ModelError(
-                    f"commands: a value that is finite, at a tick from {before} to {self.end}, is "
-                    f"needed for {brief(name)}, got {value} at {k}"
+                    f"commands: (tick, name, value), at a tick from {before} to {self.end}, is "
+                    f"needed, got {brief(repr(one))}"
                 )
-            before = k
+            before = one[0]
         if not (np.isfinite(self.tick) and self.tick > 0.0):
             raise ModelError(f"commands: the tick is a positive time in s, got {self.tick}")
 
@@ -65,13 +71,14 @@ class Commands:
         """Those of a file, of a live bench or of a page.
 
         Raises:
-            ModelError: It has no commands.
-            OSError: It cannot be read.
+            ModelError: It cannot be read, or has no commands.
         """
         try:
             found = json.loads(read_text(path, MOST))
             commands = [(int(k), str(name), float(value)) for k, name, value in found["commands"]]
             return cls(commands, int(found["end"]), float(found["tick"]))
+        except OSError as error:
+            raise ModelError(f"commands: {describe_os_error(error)}") from error
         except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
             raise ModelError(f"'{path}' has no commands of a bench: {error!r}") from None
 

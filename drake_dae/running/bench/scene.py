@@ -1,5 +1,6 @@
 """What a bench draws: Meshcat's page of a robot, and what its parts follow, as functions."""
 
+import gc
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -72,25 +73,13 @@ def scene_of(loop: ClosedLoop, context: Context) -> Scene:
     wrenches = ConstraintWrenches(model)
     surfaces = [each for each in model.constraints if _moves(each)]
     targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
-    own = plant.GetMyContextFromRoot(context)
-    state = plant.state(own)
-    with _quiet():
-        meshcat = start_meshcat()
-    meshcat.SetProperty("/Background", "visible", True)
-    for part in ("top_color", "bottom_color"):
-        color = [_BACKGROUND.r(), _BACKGROUND.g(), _BACKGROUND.b()]
-        meshcat.SetProperty("/Background/<object>", part, color)
-    draw_scene(plant, meshcat, loop.scene_graph)
-    links = view_of_links(plant, loop.scene_graph, meshcat)
-    if links is not None:
-        shown = links.CreateDefaultContext()
-        port = links.get_input_port()
-        port.FixValue(shown, state[: port.size()])
-        links.ForcedPublish(shown)
+    state = plant.state(plant.GetMyContextFromRoot(context))
     middle, size = scene_extent(model, wrenches, state, loop.scene_graph)
-    look_at(meshcat, middle, size)
+    page = _static_page(loop, state, middle, size)
+    # Drake's Meshcat ends the process if another thread, as of a server, collects it.
+    gc.collect()
     return Scene(
-        meshcat.StaticHtml(),
+        page,
         [(name, path) for name, path, _ in drawn],
         wrenches.constraints,
         wrenches.with_moment,
@@ -99,6 +88,25 @@ def scene_of(loop: ClosedLoop, context: Context) -> Scene:
         size,
         _function(model, wrenches, [frame for _, _, frame in drawn], surfaces, targets),
     )
+
+
+def _static_page(loop: ClosedLoop, state: FloatArray, middle: FloatArray, size: float) -> str:
+    """Meshcat's page of a robot in a state, from a server that is gone afterwards."""
+    with _quiet():
+        meshcat = start_meshcat()
+    meshcat.SetProperty("/Background", "visible", True)
+    for part in ("top_color", "bottom_color"):
+        color = [_BACKGROUND.r(), _BACKGROUND.g(), _BACKGROUND.b()]
+        meshcat.SetProperty("/Background/<object>", part, color)
+    draw_scene(loop.plant, meshcat, loop.scene_graph)
+    links = view_of_links(loop.plant, loop.scene_graph, meshcat)
+    if links is not None:
+        shown = links.CreateDefaultContext()
+        port = links.get_input_port()
+        port.FixValue(shown, state[: port.size()])
+        links.ForcedPublish(shown)
+    look_at(meshcat, middle, size)
+    return str(meshcat.StaticHtml())
 
 
 def _drawn_bodies(loop: ClosedLoop) -> list[tuple[str, tuple[str, ...], Frame]]:

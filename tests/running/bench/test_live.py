@@ -160,8 +160,9 @@ def test_what_no_export_knows_runs_too(name):
 
 
 def test_commands_are_checked(tmp_path, built):
-    for wrong in ([(2, "x", 1.0), (1, "x", 1.0)], [(11, "x", 1.0)], [(1, "x", np.inf)]):
-        with pytest.raises(ModelError, match="a value that is finite, at a tick"):
+    late, early = (2, "x", 1.0), (1, "x", 1.0)
+    for wrong in ([late, early], [(11, "x", 1.0)], [(1, "x", np.inf)], [(1, 2, 1.0)], [1]):
+        with pytest.raises(ModelError, match="commands"):
             Commands(wrong, 10)
     with pytest.raises(ModelError, match="the tick is a positive time"):
         Commands([], 1, 0.0)

@@ -53,7 +53,7 @@ function pushed(push) {
   view.push.visible = Boolean(push);
 }
 function give(name, values, kind) {
-  values.forEach((value, k) => panel.give(data.pushes[name] + k, value, kind));
+  values.forEach((value, k) => panel.give(data.pushes[name].input + k, value, kind));
 }
 function follow_push() {
   const { point, force, moment } = wrench(bench.push);
@@ -62,7 +62,7 @@ function follow_push() {
   if (!size) return;
   view.push.position.copy(point);
   view.push.setDirection(force.clone().normalize());
-  view.push.setLength((FULL * data.size * size) / data.push, 0.05 * data.size, 0.03 * data.size);
+  view.push.setLength((FULL * data.size * size) / data.pushes[bench.push.name].most, 0.05 * data.size, 0.03 * data.size);
 }
 
 /* Pulls each tool off its surface for a moment, harder than it presses. */
@@ -73,7 +73,7 @@ function lose() {
     const force = vector(scene, at.forces + 3 * k), size = force.length();
     if (!link || !size) return;
     const body = 12 * data.bodies.findIndex(({ name }) => name === link) + 9;
-    force.multiplyScalar(1 + data.push / size);
+    force.multiplyScalar(1 + data.pushes[link].most / size);
     const lever = vector(scene, at.points + 3 * k).sub(vector(scene, body));
     give(link, [...force.toArray(), ...lever.cross(force).toArray()], "push");
     bench.pulled.push({ link, until: time + PULL });
@@ -139,7 +139,7 @@ function gamepad(seconds) {
 let before = performance.now(), owed = 0, isBusy = false;
 async function picture(now) {
   requestAnimationFrame(picture);
-  if (isBusy) return;
+  if (isBusy || !bench.samples.length) return;
   const passed = (now - before) / 1000;
   before = now;
   if (bench.isRunning) {
@@ -162,6 +162,7 @@ async function picture(now) {
     bench.fresh = false;
     draw();
   }
+  view.place_labels(bench.samples.at(-1));
 }
 
 async function restart() {

@@ -120,12 +120,13 @@ class Drag {
 }
 
 /* Force and moment of a push about the origin of its link's frame, in the world. */
-function wrench({ path, local, pointer }) {
+function wrench({ name, path, local, pointer }) {
   const frame = node(path);
   frame.updateWorldMatrix(true, false);
   const point = inside(frame.localToWorld(local.clone()));
-  const force = pointer.clone().sub(point).multiplyScalar(data.push / (FULL * data.size));
-  force.clampLength(0, data.push);
+  const { most } = data.pushes[name];
+  const force = pointer.clone().sub(point).multiplyScalar(most / (FULL * data.size));
+  force.clampLength(0, most);
   const origin = inside(new three.Vector3().setFromMatrixPosition(frame.matrixWorld));
   const lever = point.clone().sub(origin);
   return { point, force, moment: lever.cross(force) };

@@ -64,7 +64,6 @@ class View {
       if (moment) this.arrow(moment, point, vector(scene, at.moments + 3 * k), "moment");
     });
     viewer.set_dirty();
-    this.place_labels(scene, at);
   }
   /* A handle of a surface stands beside the contact point of the surface, if it has one. */
   besides(scene, first, k) {
@@ -93,8 +92,9 @@ class View {
     if (z > 1) return null;
     return [box.left + (0.5 + 0.5 * x) * box.width, box.top + (0.5 - 0.5 * y) * box.height];
   }
-  place_labels(scene, at) {
-    const taken = [], box = viewer.renderer.domElement.getBoundingClientRect();
+  /* In each picture, since the camera turns while the robot stands still. */
+  place_labels({ scene }) {
+    const at = View.places(), taken = [], box = viewer.renderer.domElement.getBoundingClientRect();
     data.constraints.forEach(({ name, force }, k) => {
       const size = vector(scene, at.forces + 3 * k).length();
       const label = this.labels[k];
