@@ -15,6 +15,7 @@ const sizes = {
 };
 const RATES = [0.1, 0.25, 0.5, 1, 2];
 const RESTARTS = ["pole", "known", "parameter", "released"];
+const [DESIRED, PREDICTED] = ["#1a9933", "#e08a00"];
 const MOST = 0.1; /* s of the clock that are made up for in one picture */
 
 const engine = await makeEngine();
@@ -32,7 +33,7 @@ const bench = (window.bench = {
 
 /* What follows from a sample: error, and the predicted one. */
 function taken(sample) {
-  sample.error = sample.z.map((z, i) => z - sample.r[i]);
+  sample.error = sample.z.map((z, i) => (z === null || sample.r[i] === null ? null : z - sample.r[i]));
   if (prediction) {
     if (bench.restarts) {
       prediction.restart(sample);
@@ -101,15 +102,17 @@ function draw() {
   const last = bench.samples.at(-1);
   view.show(last);
   const chosen = Number(element("signal").value), { unit } = data.outputs[chosen];
-  plots.signal.draw(bench.samples, ({ z, r }) => [
-    { value: z[chosen], color: COLORS[1] }, { value: r[chosen], color: "#1a9933", dashed: true },
-  ], unit, [["actual", COLORS[1], false], ["desired", "#1a9933", true]]);
+  plots.signal.draw(bench.samples, [
+    { value: ({ z }) => z[chosen], color: COLORS[1] },
+    { value: ({ r }) => r[chosen], color: DESIRED, dashed: true },
+  ], unit, [["actual", COLORS[1], false], ["desired", DESIRED, true]]);
   const errors = element("error").value.split(",").map(Number);
-  const color = (k) => COLORS[k % COLORS.length];
-  plots.error.draw(bench.samples, ({ error, predicted }) => errors.flatMap((i, k) => [
-    { value: error[i], color: color(k) },
-    ...(predicted ? [{ value: predicted[i], color: "#e08a00", dashed: true }] : []),
-  ]), data.outputs[errors[0]].unit, [["error", color(0), false], ...(prediction ? [["predicted", "#e08a00", true]] : [])]);
+  const legend = [["error", COLORS[0], false]];
+  if (prediction) legend.push(["predicted", PREDICTED, true]);
+  plots.error.draw(bench.samples, errors.flatMap((i, k) => [
+    { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
+    ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
+  ]), data.outputs[errors[0]].unit, legend);
   const slow = bench.isRunning && bench.speed < 0.95 ? `, runs at ${bench.speed.toFixed(2)} of that` : "";
   const rate = RATES[bench.rate] === 1 ? "real time" : `${RATES[bench.rate]} x real time`;
   element("clock").textContent = `t = ${last.time.toFixed(2)} s, ${rate}${slow}` +

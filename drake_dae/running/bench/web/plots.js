@@ -3,10 +3,10 @@ const SECONDS = 8;
 const COLORS = ["#1a5fb4", "#c01c28", "#8833bb", "#9c6a00", "#0a7d6c", "#555"];
 
 class Plot {
-  /* curves: sample -> [{ value, color, dashed }]; unit: text at the axis. */
   constructor(canvas) {
     this.canvas = canvas;
   }
+  /* curves: [{ value: sample -> number, color, dashed }]. */
   draw(samples, curves, unit, legend) {
     const { canvas } = this;
     const ratio = window.devicePixelRatio || 1;
@@ -19,9 +19,13 @@ class Plot {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     if (samples.length < 2) return;
-    const rows = samples.map((sample) => curves(sample));
-    const values = rows.flatMap((row) => row.map(({ value }) => value)).filter(Number.isFinite);
-    let [low, high] = [Math.min(...values), Math.max(...values)];
+    const columns = curves.map(({ value }) => samples.map(value));
+    let [low, high] = [Infinity, -Infinity];
+    for (const value of columns.flat()) {
+      if (value === null || !Number.isFinite(value)) continue;
+      [low, high] = [Math.min(low, value), Math.max(high, value)];
+    }
+    if (low > high) return;
     const least = Math.max(1e-12, 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
     if (high - low < least) [low, high] = [low - least, high + least];
     const [left, right, top, bottom] = [58, width - 8, 30, height - 18];
@@ -60,12 +64,14 @@ class Plot {
       }
       place += pen.measureText(text).width + 12;
     }
-    rows[0].forEach(({ color, dashed }, i) => {
+    curves.forEach(({ color, dashed }, i) => {
       pen.strokeStyle = color;
       pen.setLineDash(dashed ? [6, 5] : []);
       pen.lineWidth = dashed ? 2.2 : 1.6;
       pen.beginPath();
-      samples.forEach(({ time }, k) => time >= first && pen.lineTo(x(time), y(rows[k][i].value)));
+      samples.forEach(({ time }, k) => {
+        if (time >= first && columns[i][k] !== null) pen.lineTo(x(time), y(columns[i][k]));
+      });
       pen.stroke();
     });
     pen.setLineDash([]);
