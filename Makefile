@@ -17,6 +17,7 @@ VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
 PICTURES := examples/pictures
 HOUSE := $(PICTURES)/house.png
+BOOK ?= build/book
 
 # Tests start some hundred processes, which compile all of the code again where none is kept.
 unexport PYTHONDONTWRITEBYTECODE
@@ -29,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots benches unknowns friction peers house equations pictures clean lint
+.PHONY: help demo check test processor benchmark campaign robots benches unknowns friction peers house equations pictures docs gallery clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -48,6 +49,8 @@ help:
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
+	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
+	@echo 'make gallery     run all scenarios and show them on one page, in build/gallery/; some minutes'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -125,6 +128,12 @@ pictures: $(VENV)/installed
 	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png
 	cp runs/pictures/errors.png $(PICTURES)/seven_joint_wall_errors.png
 
+docs: $(VENV)/installed-docs
+	$(BIN)/python examples/book --out $(BOOK)
+
+gallery: $(VENV)/installed
+	$(BIN)/python examples/gallery
+
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +
@@ -147,4 +156,10 @@ $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 	$(WHOLE)
 	@echo 'Installing drake_dae and its tools into $(VENV): the first time this takes minutes.'
 	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
+	touch $(VENV)/installed $@
+
+$(VENV)/installed-docs: pyproject.toml | $(BIN)/python
+	$(WHOLE)
+	@echo 'Installing drake_dae and what makes its book into $(VENV): the first time this takes minutes.'
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[docs]'
 	touch $(VENV)/installed $@

@@ -44,6 +44,10 @@ def test_the_first_scenario_runs_as_printed(tmp_path, capsys):
     assert "\nTracked as predicted:" in capsys.readouterr().out
 
 
+def test_it_is_read_to_its_end():
+    assert len(README.splitlines()) <= 150
+
+
 def test_named_files_exist():
     names = re.findall(r"\]\((?!http)([^)]+)\)|`(drake_dae/[\w/]+\.py)`", README)
     for name in (a or b for a, b in names):

@@ -98,6 +98,10 @@ class Record:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
         return self.signals[name].values
 
+    def __contains__(self, name: object) -> bool:
+        """Whether the record has a signal of this name."""
+        return name in self.signals
+
     def __repr__(self) -> str:
         found = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
         return f"Record({self._extent()}, signals={found})"

@@ -172,6 +172,8 @@ assert not any(name.startswith(("drake_dae", "pydrake")) for name in sys.modules
 
 
 def test_what_is_no_record(tmp_path):
+    assert "state" in small()
+    assert "sate" not in small()
     with pytest.raises(ModelError, match="no signal 'sate' in the record; it has state, constr"):
         small()["sate"]
     (tmp_path / "text.npz").write_text("hello")

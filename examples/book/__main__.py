@@ -1,0 +1,67 @@
+"""Makes the site of the book: runs its pages, writes the reference, calls Sphinx."""
+
+import argparse
+import hashlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+BOOK = Path(__file__).parent
+sys.path.insert(0, str(BOOK.parent))
+
+import drake_dae  # noqa: E402
+from book.generated import generated_pages  # noqa: E402
+from book.pages import pages, run_page  # noqa: E402
+
+
+def main() -> int:
+    """Makes the site; a page runs again only if it, or the library, has changed."""
+    parser = argparse.ArgumentParser(prog="python examples/book", description=main.__doc__)
+    parser.add_argument("--out", type=Path, default=Path("build/book"), help="the folder")
+    out = parser.parse_args().out
+    source, site = out / "source", out / "site"
+    library = _digest(*sorted(Path(drake_dae.__file__).parent.rglob("*.py")))
+    texts = {page.relative_to(BOOK): page.read_text("utf-8") for page in pages()}
+    texts |= {Path(name): text for name, text in generated_pages().items()}
+    for old in set(source.rglob("*.md")) - {source / name for name in texts}:
+        old.unlink()
+    for page in pages():
+        _run(page, source / page.relative_to(BOOK), library)
+    for name, text in texts.items():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_text(text, "utf-8")
+    shutil.copy(BOOK / "conf.py", source)
+    shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    code = subprocess.run([*command, source, site]).returncode
+    # Pages that a page frames: Sphinx copies pictures only.
+    for live in source.rglob("*.html"):
+        framed = site / live.relative_to(source)
+        framed.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(live, framed)
+    if not code:
+        print(f"open {site / 'index.html'}")
+    return code
+
+
+def _run(page: Path, place: Path, library: str) -> None:
+    """Runs a page in a folder of its name, beside the place of its copy."""
+    folder, stamp = place.with_suffix(""), place.with_suffix(".stamp")
+    state = f"{library} {_digest(page)}"
+    if not (stamp.exists() and stamp.read_text() == state):
+        print(f"runs {page.relative_to(BOOK)}", flush=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        run_page(page, folder)
+        stamp.write_text(state)
+
+
+def _digest(*files: Path) -> str:
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,97 @@
+"""Sphinx's settings of the book; `make docs` builds it."""
+
+import re
+from typing import Any
+
+from docutils import nodes
+from latex2mathml.converter import convert
+
+import drake_dae
+
+project = "drake_dae"
+copyright = "the drake_dae developers"
+release = drake_dae.__version__
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+myst_enable_extensions = ["dollarmath", "colon_fence", "attrs_inline"]
+myst_heading_anchors = 3
+default_role = "code"
+html_theme = "furo"
+html_title = "drake_dae"
+html_copy_source = False
+html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["book.css"]
+html_math_renderer = "mathml"
+napoleon_use_ivar = True
+add_module_names = False
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+copybutton_prompt_text = "$ "
+python_use_unqualified_type_names = True
+
+
+def _inline(translator: Any, node: nodes.math) -> None:
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _display(translator: Any, node: nodes.math_block) -> None:
+    translator.body.append(f"<p>{convert(node.astext(), display='block')}</p>")
+    raise nodes.SkipNode
+
+
+_ITEM = re.compile(r"\s*(-|\d+\.)\s")
+_SECTION = re.compile(r"\s*(Args|Attributes|Raises|Returns|Yields|Warns):$")
+
+
+def _plain_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text: what is indented, as ports and equations, stays so."""
+    found: list[str] = []
+    indent = -1  # Of the line that a literal block follows; -1 outside of one, -2 in a section.
+    for i, line in enumerate(lines):
+        depth = len(line) - len(line.lstrip())
+        if _SECTION.match(line):
+            indent = -2
+        elif indent >= 0 and line.strip() and depth <= indent:
+            indent = -1
+        if indent < 0:
+            line = re.sub(r"([|*]|(?<=\w)_(?!\w))", r"\\\1", re.sub(r"``?", "`", line))
+            following = next((other for other in lines[i + 1 :] if other.strip()), "")
+            deeper = len(following) - len(following.lstrip()) > depth
+            if indent == -1 and line.strip() and deeper and not _ITEM.match(line):
+                line = line.rstrip() + (":" if line.rstrip().endswith(":") else " ::")
+                found += [line, ""]
+                indent = depth
+                continue
+        found.append(line)
+    lines[:] = found
+
+
+_ARRAY_LIKE = re.compile(r"_Buffer \| .*?_NestedSequence\[complex \| bytes \| str\]")
+
+
+def _signature(
+    app: Any, what: str, name: str, value: Any, options: Any, text: str | None, result: str | None
+) -> tuple[str | None, str | None]:
+    """NumPy's union of all that makes an array has a name."""
+    return text and _ARRAY_LIKE.sub("ArrayLike", text), result and _ARRAY_LIKE.sub(
+        "ArrayLike", result
+    )
+
+
+def _bases(app: Any, name: str, value: Any, options: Any, bases: list[Any]) -> None:
+    """That a class is an object goes without saying."""
+    bases[:] = [base for base in bases if base is not object]
+
+
+def setup(app: Any) -> None:
+    """Equations are MathML, which browsers show without a script or a font."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
+    app.connect("autodoc-process-docstring", _plain_text, priority=400)
+    app.connect("autodoc-process-signature", _signature)
+    app.connect("autodoc-process-bases", _bases)

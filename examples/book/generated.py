@@ -1,0 +1,134 @@
+"""The reference pages that follow from the code: public names, keys and commands."""
+
+import ast
+import contextlib
+import io
+import re
+import sys
+from collections import defaultdict
+from pathlib import Path
+from unittest.mock import patch
+
+import drake_dae
+from book.pages import BOOK, blocks, pages
+from drake_dae.commands.options import parse_options
+from drake_dae.scenario.manual.page import keys_page
+
+ROOT = BOOK.parents[1]
+sys.path.append(str(ROOT / "tests" / "support"))
+
+TOPICS = {
+    "dae": "Systems, laws and theory",
+    "analysis": "Analysis",
+    "robots": "Robots",
+    "systems": "Blocks of a diagram",
+    "diagrams": "Closed loops",
+    "simulation": "Runs and records",
+    "running": "Rollouts and exports",
+    "compiler": "Diagrams as functions",
+    "symbolic": "From symbolic expressions",
+    "scenario": "Scenarios",
+    "studies": "Studies",
+    "pictures": "Pictures",
+    "errors": "Errors",
+}
+"""Room of the library -> title of the part of the reference that has its public names."""
+
+
+def generated_pages() -> dict[str, str]:
+    """Path below the book -> text of the page."""
+    return {
+        "reference/names.md": names_page(),
+        "reference/keys.md": keys_page(),
+        "reference/commands.md": commands_page(),
+        "reference/equations.md": equations_page(),
+    }
+
+
+def public_names() -> dict[str, str]:
+    """Public name -> module that it stands in."""
+    stub = ast.parse(Path(drake_dae.__file__).with_suffix(".pyi").read_text("utf-8"))
+    return {
+        alias.asname or alias.name: f"drake_dae.{node.module}"
+        for node in ast.walk(stub)
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+
+
+def uses() -> dict[str, list[Path]]:
+    """Public name -> the pages and examples that run with it."""
+    names, found = set(public_names()), defaultdict(list)
+    sources = {page: "\n".join(b.text for b in blocks(page)) for page in pages()}
+    for path in sorted(ROOT.glob("examples/*.py")):
+        sources[path] = path.read_text("utf-8")
+    for path, text in sources.items():
+        for name in sorted(names & set(re.findall(r"\b[A-Za-z_]\w+\b", text))):
+            found[name].append(path)
+    return found
+
+
+def names_page() -> str:
+    """All public names by topic: signature, docstring, and the pages that run with it."""
+    modules, used, by_topic = public_names(), uses(), defaultdict(list)
+    for name, module in modules.items():
+        by_topic[module.split(".")[1]].append(name)
+    lines = ["# Public names", "", "Each is a name of `drake_dae`: `import drake_dae as dd`."]
+    for topic, title in TOPICS.items():
+        lines += ["", f"## {title}", ""]
+        for name in sorted(by_topic[topic], key=str.lower):
+            lines += _entry(name, modules[name], used.get(name, []))
+    return "\n".join(lines) + "\n"
+
+
+def _entry(name: str, module: str, used: list[Path]) -> list[str]:
+    value = getattr(drake_dae, name)
+    kind = "autoclass" if isinstance(value, type) else "autofunction"
+    members = ["   :members:", "   :show-inheritance:"] if kind == "autoclass" else []
+    links = ", ".join(_link(path) for path in used)
+    return [
+        f"(name-{name})=",
+        "```{eval-rst}",
+        f".. {kind}:: {module}.{name}",
+        *members,
+        "```",
+        *([f"Used in: {links}", ""] if used else [""]),
+    ]
+
+
+def _link(path: Path) -> str:
+    if path.suffix == ".md":
+        title = path.read_text("utf-8").split("\n", 1)[0].removeprefix("# ")
+        return f"[{title}](/{path.relative_to(BOOK)})"
+    return f"`{path.relative_to(ROOT)}`"
+
+
+def commands_page() -> str:
+    """What `--help` prints of each command."""
+    names = re.search(r"\{([\w,]+)\}", _help([]))
+    assert names is not None
+    lines = ["# Commands", "", "```text", _help([]).strip(), "```"]
+    for name in names[1].split(","):
+        lines += ["", f"## {name}", "", "```text", _help([name]).strip(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def _help(arguments: list[str]) -> str:
+    printed = io.StringIO()
+    with (
+        patch.dict("os.environ", COLUMNS="88"),
+        contextlib.redirect_stdout(printed),
+        contextlib.suppress(SystemExit),
+    ):
+        parse_options([*arguments, "--help"])
+    return printed.getvalue()
+
+
+def equations_page() -> str:
+    """Where each equation of the paper is computed, and which test proves it."""
+    from equations import table
+
+    return (
+        "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the "
+        f"test that proves it. `make equations` prints the same.\n\n{table()}\n"
+    )

@@ -1,0 +1,173 @@
+"""Pages of the book: Markdown files whose blocks are run from the first to the last.
+
+What the fences of a page mean:
+
+- ```python: run in the page's namespace. A ```text block right after it is what it prints.
+- ```console: lines that begin with "$ " are commands; the lines after one are what it prints.
+- ```yaml, ```xml and others whose first line is a comment with a file's name write that file.
+- Everything else, such as ```sh, is only shown.
+
+What is printed has to agree with the page: words and integers exactly, white space aside; other
+numbers within one unit of the last digit that the page shows; "..." stands for anything. Where that
+makes the place of a number ambiguous, the first place counts.
+"""
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drake_dae.cli import main
+
+BOOK = Path(__file__).parent
+
+KINDS = ("tutorials", "how_to", "explanations", "reference")
+
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_FILE = re.compile(r"^(?:#|//|<!--)\s+([\w.-]+\.\w+)(?:\s+-->)?\n")
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_PART = re.compile(rf"\.\.\.|(?<![\w.]){_NUMBER.pattern}|\s+")
+
+
+class PageError(Exception):
+    """A block that fails, or prints something else than the page shows."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its language, its text, and its first line in the file."""
+
+    language: str
+    text: str
+    line: int
+    follows: bool
+    """Whether nothing but white space is between the block before and this one."""
+
+
+def pages() -> list[Path]:
+    """All pages that may be run."""
+    return [
+        BOOK / "index.md",
+        *(path for kind in KINDS for path in sorted((BOOK / kind).glob("*.md"))),
+    ]
+
+
+def blocks(page: Path) -> list[Block]:
+    """The fenced blocks of a page, in their order."""
+    text = page.read_text("utf-8")
+    found, end = [], 0
+    for match in _FENCE.finditer(text):
+        line = text.count("\n", 0, match.start()) + 2
+        follows = not text[end : match.start()].strip()
+        found.append(Block(match[1], match[2], line, follows))
+        end = match.end()
+    return found
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """Runs the blocks of a page in a folder.
+
+    Raises:
+        PageError: If a block fails or prints something else; the message has the block's line.
+    """
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    folder.mkdir(parents=True, exist_ok=True)
+    all_blocks = blocks(page)
+    with contextlib.chdir(folder):
+        for block, following in zip(all_blocks, [*all_blocks[1:], None], strict=True):
+            try:
+                if block.language == "python":
+                    printed = _run_python(block, page, namespace)
+                    if following and following.language == "text" and following.follows:
+                        compare(following.text, printed)
+                elif block.language == "console":
+                    _run_commands(block)
+                elif name := _FILE.match(block.text):
+                    Path(name[1]).write_text(block.text[name.end() :], "utf-8")
+            except Exception as error:
+                raise PageError(f"{page.relative_to(BOOK)}, line {block.line}: {error}") from error
+
+
+def compare(shown: str, printed: str) -> None:
+    """Compares what was printed with what a page shows.
+
+    Raises:
+        PageError: If they differ.
+    """
+    pattern, numbers, end = "", [], 0
+    for part in _PART.finditer(shown.strip()):
+        pattern += re.escape(shown.strip()[end : part.start()])
+        if part[0] == "...":
+            pattern += r".*?"
+        elif part[0].isspace():
+            pattern += r"\s+"
+        elif part[0].lstrip("-").isdigit():
+            pattern += rf"{re.escape(part[0])}(?!\.?\d)"
+        else:
+            pattern += f"({_NUMBER.pattern})"
+            numbers.append(part[0])
+        end = part.end()
+    pattern += re.escape(shown.strip()[end:])
+    match = re.fullmatch(pattern, printed.strip(), re.DOTALL)
+    if match is None:
+        raise PageError(f"the page shows\n{shown}\nbut this was printed:\n{printed}")
+    for number, found in zip(numbers, match.groups(), strict=True):
+        if abs(float(found) - float(number)) > 1.0000001 * _unit(number):
+            raise PageError(f"the page shows {number}, but {found} was printed in\n{printed}")
+
+
+def _unit(number: str) -> float:
+    """One unit of the last digit of a number."""
+    digits, _, exponent = number.lower().partition("e")
+    return 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
+
+
+def _run_python(block: Block, page: Path, namespace: dict[str, Any]) -> str:
+    # As many lines before the code as in the page: a traceback names the page's line.
+    code = compile("\n" * (block.line - 1) + block.text, str(page), "exec")
+    with _printed() as printed:
+        exec(code, namespace)
+    return printed.getvalue()
+
+
+def _run_commands(block: Block) -> None:
+    for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
+        lines = part.splitlines()
+        last = next(i for i, line in enumerate(lines) if not line.endswith("\\"))
+        command = " ".join(line.removesuffix("\\") for line in lines[: last + 1])
+        code, printed = _run_command(command)
+        if shown := "\n".join(lines[last + 1 :]).strip():
+            compare(shown, printed)
+        elif code:
+            raise PageError(f"{command} ended with exit code {code}:\n{printed}")
+
+
+def _run_command(command: str) -> tuple[int, str]:
+    """The exit code of a command, and what it prints; `drake-dae` runs in this process."""
+    words = shlex.split(command)
+    if words[0] == "drake-dae" and not set("|<>&;*$") & set(command):
+        with _printed() as printed:
+            return main(words[1:]), printed.getvalue()
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    finished = subprocess.run(
+        ["bash", "-c", command],
+        env={**os.environ, "PATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    return finished.returncode, finished.stdout
+
+
+@contextlib.contextmanager
+def _printed() -> Iterator[io.StringIO]:
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+        yield text

@@ -1,0 +1,129 @@
+"""Every page of the book runs and prints what it shows."""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from book.generated import public_names, uses
+from book.pages import BOOK, PageError, compare, pages, run_page
+
+SLOW: set[str] = set()
+"""Pages that take long: left to `make campaign` and to `make docs`."""
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(BOOK))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=named(page), marks=[pytest.mark.thorough] * (named(page) in SLOW))
+        for page in pages()
+    ],
+)
+def test_page_runs_as_shown(page, tmp_path):
+    run_page(page, tmp_path / page.stem)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("0.35 m", "0.354 m"),
+        ("1.2e-3", "0.0012"),
+        ("a ... b", "a 1\n2 b"),
+        ("joint2 at 1.5", "joint2  at 1.49"),
+        ("12 steps", "12 steps\n"),
+    ],
+)
+def test_equal_to_the_digits_shown(shown, printed):
+    compare(shown, printed)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("0.35 m", "0.362 m"),
+        ("12 steps", "13 steps"),
+        ("joint2 at 1.5", "joint3 at 1.5"),
+        ("a ... b", "a 1"),
+        ("1.2e-3", "0.0015"),
+        ("12 steps", "12.5 steps"),
+        ("", "something"),
+    ],
+)
+def test_what_differs_is_found(shown, printed):
+    with pytest.raises(PageError):
+        compare(shown, printed)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("# T\n\n```python\nx = 1\n1 / 0\n```\n", 4),
+        ("# T\n\n```python\nprint(1)\n```\n\n```text\n2\n```\n", 4),
+        ("# T\n\n```console\n$ drake-dae print no_such_scenario\n```\n", 4),
+        ("# T\n\n```console\n$ false\n```\n", 4),
+    ],
+)
+def test_block_that_fails_is_named_by_its_line(text, line, tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text(text, "utf-8")
+    monkeypatch.setattr("book.pages.BOOK", tmp_path)
+    with pytest.raises(PageError, match=rf"page.md, line {line}: "):
+        run_page(page, tmp_path / "page")
+
+
+def test_files_commands_and_code_share_a_folder(tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# T\n\n```yaml\n# one.yaml\nvalue: 3\n```\n\n"
+        "```console\n$ cat one.yaml | wc -l\n1\n```\n\n"
+        "```python\nfrom pathlib import Path\nprint(Path('one.yaml').read_text())\n```\n\n"
+        "```text\nvalue: 3\n```\n",
+        "utf-8",
+    )
+    run_page(page, tmp_path / "page")
+    assert (tmp_path / "page" / "one.yaml").read_text() == "value: 3\n"
+
+
+def test_links_lead_to_pages_files_and_headings():
+    made = {BOOK / "reference" / f"{name}.md" for name in ("names", "keys", "commands")}
+    for page in pages():
+        text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for target in re.findall(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)", text):
+            if target.startswith(("http://", "https://", "mailto:")):
+                continue
+            path, _, heading = target.partition("#")
+            file = (page.parent / path).resolve() if path else page
+            assert file in made or file.exists(), f"{named(page)}: {target}"
+            if heading and file not in made:
+                titles = re.findall(r"^#+ (.*)$", file.read_text("utf-8"), flags=re.MULTILINE)
+                slugs = {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
+                assert heading in slugs, f"{named(page)}: {target}"
+
+
+def test_pages_are_in_the_contents():
+    contents = (BOOK / "index.md").read_text("utf-8")
+    for page in pages()[1:]:
+        name = named(page).removesuffix(".md")
+        assert f"\n{name}\n" in contents or f"\n{page.parent.name}/*\n" in contents, name
+
+
+def test_every_public_name_is_used_in_a_page_or_an_example_that_runs():
+    assert sorted(set(public_names()) - set(uses())) == []
+
+
+@pytest.mark.thorough
+def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
+    pytest.importorskip("furo", reason="pip install -e '.[docs]'")
+    made = subprocess.run(["make", "docs", f"BOOK={tmp_path}"], cwd=BOOK.parents[1], env=os.environ)
+    assert made.returncode == 0
+    for html in (tmp_path / "site").rglob("*.html"):
+        text = html.read_text("utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe)[^>]+src=\"(http[^\"]+)\"", text)
+        loaded += re.findall(r"<link[^>]+rel=\"stylesheet\"[^>]+href=\"(http[^\"]+)\"", text)
+        assert loaded == [], html
