@@ -145,7 +145,14 @@ def test_a_port_in_use_is_told(built):
         Server(built.loop, built.context, port=70000)
 
 
-@pytest.mark.parametrize("name", ["wall_polish", "wall_bounce", "wall_point_contact"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("wall_polish", marks=pytest.mark.thorough),
+        "wall_bounce",
+        pytest.param("wall_point_contact", marks=pytest.mark.thorough),
+    ],
+)
 @pytest.mark.slow
 def test_what_no_export_knows_runs_too(name):
     own = build_commanded(scenario(name))

@@ -3,6 +3,7 @@
 import re
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 from browser import in_page, needs_chromium
 from runs import scenario
@@ -66,13 +67,21 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
   await run(1.5);
   found.target.push(now().r[0]);
   found.off.push(bench.off);
-  // The first link, which is pulled away from the wall, against the law.
-  const { path } = bench.data.bodies[0];
-  const link = viewer.scene_tree.find(path).object.getWorldPosition(new MeshCat.THREE.Vector3());
-  const at = bench.view.on_screen(viewer.scene.worldToLocal(link));
+  // The second link, at its middle, which is pulled upwards, against the law.
+  const { name } = bench.data.bodies[1];
+  const origin = () => now().scene.slice(12 + 9, 12 + 12);
+  const half = bench.view.targets[0].position.clone();
+  half.add({ x: origin()[0], y: origin()[1], z: origin()[2] }).multiplyScalar(0.5);
+  const at = bench.view.on_screen(half);
+  found.origin = origin();
   point("pointerdown", at);
   point("pointermove", besides(at, 0, -70));
   found.isPushed = Boolean(bench.push);
+  await run(1 / 120);
+  const { input } = bench.data.pushes[name];
+  found.wrench = bench.panel.present.slice(input, input + 6);
+  found.point = bench.view.push.position.toArray();
+  found.half = half.toArray();
   await run(0.4);
   found.pushed = bench.off;
   point("pointerup", at);
@@ -99,6 +108,13 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
     assert tool_after[0] - tool[0] == pytest.approx(wall_after[0] - wall[0], abs=1e-6)
     assert found["target"][1] - found["target"][0] == pytest.approx(0.1, abs=5e-3)
     assert found["isPushed"]
+    # At the point that was taken, on the surface of the link whose radius is 3 cm.
+    np.testing.assert_allclose(found["point"], found["half"], atol=0.06)
+    force, moment = np.split(np.array(found["wrench"]), 2)
+    lever = np.array(found["point"]) - found["origin"]
+    np.testing.assert_allclose(moment, np.cross(lever, force), atol=1e-9)
+    assert np.linalg.norm(lever) > 0.3
+    assert force[2] > 1.0
     assert found["pushed"] > 1e-3
     assert found["stick"][1] > found["stick"][0]
     assert not found["failure"]
@@ -148,7 +164,7 @@ def test_a_page_is_small_and_loads_nothing(page):
 
 @needs_chromium
 @needs_zig
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_pages_share_a_bundle(tmp_path):
     built = build_commanded(scenario("two_link_wall"))
     files = write_page(
