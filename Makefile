@@ -30,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet benches clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -42,6 +42,7 @@ help:
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
+	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
@@ -87,6 +88,10 @@ campaign: $(VENV)/installed-dev
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
 robots: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/real_robots.py $(ARGS)
+
+# To be looked at; needs Chromium.
+benches: $(VENV)/installed-dev
+	$(BIN)/python tests/campaign/benches.py --out runs/benches $(ARGS)
 
 # Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
 # all the same ends its run, with the reason.

@@ -86,6 +86,7 @@ from .robots.force_outputs import ForceOutput as ForceOutput
 from .robots.force_outputs import NamedForce as NamedForce
 from .robots.force_outputs import Squeeze as Squeeze
 from .robots.known_forces import KnownForce as KnownForce
+from .robots.known_forces import KnownWrench as KnownWrench
 from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
@@ -105,6 +106,10 @@ from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
+from .running.bench.live import live as live
+from .running.bench.page import write_page as write_page
+from .running.bench.run import Commands as Commands
+from .running.bench.run import replay as replay
 from .running.export.export import export_code as export_code
 from .running.export.fmu.fmu import export_fmu as export_fmu
 from .running.export.steps.controller import export_controller as export_controller
@@ -115,6 +120,7 @@ from .running.rollout.gradient.gradient import rollout_tangent as rollout_tangen
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
 from .scenario.build import build_scenario as build_scenario
+from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario
 from .scenario.model import complete_scenario as complete_scenario
 from .scenario.new.new_scenario import new_scenario as new_scenario
@@ -139,6 +145,8 @@ from .symbolic import from_symbolic as from_symbolic
 from .systems.adaptive.controller import AdaptiveController as AdaptiveController
 from .systems.adaptive.law import AdaptiveLaw as AdaptiveLaw
 from .systems.cascade.cascade import SpringCascade as SpringCascade
+from .systems.control.command_filter import CommandLimits as CommandLimits
+from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.limits import ControlLimits as ControlLimits

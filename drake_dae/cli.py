@@ -35,6 +35,8 @@ _MODULES = {
     "schema": "keys",
     "print": "keys",
     "cache": "keys",
+    "page": "play",
+    "live": "play",
     "render": "plot",
     "diagram": "plot",
     "excite": "identify",

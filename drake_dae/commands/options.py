@@ -12,6 +12,7 @@ from drake_dae.commands.options_of_studies import (
     add_json,
     add_sweep,
     path_option,
+    whole_option,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 
@@ -150,6 +151,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="folder for the files (default: <scenario>_<format>, _c99 for c)",
     )
     add_json(written, "print the names of the files as JSON")
+    _add_benches(commands, named)
     film = commands.add_parser(
         "render",
         help="render a run into a GIF, an MP4 or a strip of pictures",
@@ -217,6 +219,49 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.command == "simulate" and options.rollout and options.meshcat:
         parser.error("--rollout shows nothing while it runs; leave out --meshcat")
     return options
+
+
+def _add_benches(commands: Any, named: argparse.ArgumentParser) -> None:
+    """The commands whose robot is dragged, pushed and steered."""
+    page = commands.add_parser(
+        "page",
+        parents=[named],
+        help="write a scenario as one HTML file in which it runs",
+        description="Writes plant, law and references as WebAssembly into one HTML file that needs "
+        "neither server nor network: sliders, a target and surfaces that are dragged, links that "
+        "are pushed, plots of force and error with the prediction. It needs drake_dae[compiler].",
+    )
+    page.add_argument("--out", type=path_option, metavar="FILE", help="(default: <scenario>.html)")
+    page.add_argument(
+        "--shared-bundle",
+        type=path_option,
+        metavar="FILE",
+        help="where to write the bundle that draws, 2.2 MB, for several pages; without, it is in "
+        "the page",
+    )
+    page.add_argument("--open", action="store_true", help="open the page in a browser")
+    add_json(page, "print the files with their sizes as JSON")
+    bench = commands.add_parser(
+        "live",
+        parents=[named],
+        help="run a scenario in real time, and change it in a browser meanwhile",
+        description="The bench of `page`, run here by Drake's Simulator, for every scenario, also "
+        "with Drake's own contact, contacts that open, and tasks. Only this machine reaches it. "
+        "Its button save writes the record, the scenario and what was commanded.",
+    )
+    bench.add_argument(
+        "--port", type=whole_option, default=0, help="(default: any port that is free)"
+    )
+    bench.add_argument("--no-browser", action="store_true", help="print the address alone")
+    bench.add_argument(
+        "--replay",
+        type=path_option,
+        metavar="FILE",
+        help="run what was commanded in a bench again, commands.json, and write its record",
+    )
+    bench.add_argument(
+        "--out", type=path_option, help="folder for what is saved (default: live/<scenario>-<time>)"
+    )
 
 
 def _add_new(commands: Any) -> None:

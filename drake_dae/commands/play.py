@@ -1,16 +1,30 @@
-"""`drake-dae play`: opens the animation of a run in the browser."""
+"""What a browser shows: `drake-dae play` an animation, `page` and `live` a loop that runs."""
 
 import argparse
+import json
 import webbrowser
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drake_dae.commands.run_folder import ANIMATION, load_run, run_label, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.side_by_side import side_by_side
 
+if TYPE_CHECKING:
+    from drake_dae.running.bench.run import HandRun
+    from drake_dae.scenario.commanded import Commanded
+    from drake_dae.scenario.scenario import Scenario
+
 
 def run_command(options: argparse.Namespace) -> int:
-    """Opens the animations of the folders that the options name; returns the exit code."""
+    """Shows what the options name; returns the exit code."""
+    return {"play": _play, "page": _page, "live": _live}[options.command](options)
+
+
+def _play(options: argparse.Namespace) -> int:
+    """Opens the animations of the folders that the options name."""
     if options.out is None and len(options.runs) == 1:
         show(options.runs[0])
         return 0
@@ -46,6 +60,11 @@ def show(folder: Path) -> None:
 
 
 def _open(page: Path) -> None:
+    """Opens a file in the browser.
+
+    Raises:
+        ModelError: There is no browser.
+    """
     address = page.resolve().as_uri()
     try:
         opened = webbrowser.open(address)
@@ -54,6 +73,95 @@ def _open(page: Path) -> None:
     if not opened:
         raise ModelError(f"found no browser here; open {address} in one")
     print(f"opened {address}")
+
+
+def _page(options: argparse.Namespace) -> int:
+    """Writes a page."""
+    from drake_dae.running.bench.page import write_page
+
+    name, scenario, built = _built(options)
+    file = options.out or Path(f"{name}.html")
+    title = scenario.description or name
+    given = built.loop, built.context, file, None, title, built.left_out
+    try:
+        files = write_page(*given, shared_bundle=options.shared_bundle)
+    except ModelError as error:
+        raise ModelError(
+            f"{name} cannot be a page ({error}); `drake-dae live {options.scenario}` runs it"
+        ) from error
+    sizes = {str(each): each.stat().st_size for each in files}
+    if options.json:
+        print(json.dumps({"files": sizes, "left_out": list(built.left_out)}, indent=2))
+        return 0
+    print(f"written: {', '.join(f'{each} ({size / 1e6:.2f} MB)' for each, size in sizes.items())}")
+    for note in built.left_out:
+        print(f"not in it: {note}")
+    if options.open:
+        _open(file)
+    return 0
+
+
+def _live(options: argparse.Namespace) -> int:
+    """Runs a live bench, or what was commanded in one."""
+    from drake_dae.running.bench.live import live
+    from drake_dae.running.bench.run import Commands, replay
+    from drake_dae.simulation.real_time import attainable_rate
+
+    name, scenario, built = _built(options)
+    made = built.loop, built.context, scenario.integrator
+    folder = options.out or Path("live") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    if options.replay is not None:
+        commands = Commands.load(options.replay)
+        record = replay(built.loop, built.context, commands, scenario.integrator)
+        folder.mkdir(parents=True, exist_ok=True)
+        record.save(folder / "record.npz")
+        print(f"{record.time[-1] - record.time[0]:g} s run again, to {folder}/record.npz")
+        return 0
+    for note in built.left_out:
+        print(f"not in it: {note}")
+    rate = attainable_rate(built.loop.diagram, built.context, 1.0, scenario.integrator)
+    if rate is not None and rate < 1.0:
+        print(
+            f"this machine runs it at {rate:.2g} of real time, and so the bench will; "
+            "--compiled true may help"
+        )
+    title = scenario.description or name
+    live(
+        *made,
+        title=title,
+        notes=built.left_out,
+        port=options.port,
+        opens=not options.no_browser,
+        save=_saver(scenario, folder),
+    )
+    return 0
+
+
+def _saver(scenario: "Scenario", folder: Path) -> Callable[["HandRun"], str]:
+    """What saves a run of a live bench."""
+    from drake_dae.scenario.files import save_scenario
+
+    def save(run: "HandRun") -> str:
+        folder.mkdir(parents=True, exist_ok=True)
+        run.record().save(folder / "record.npz")
+        run.commands.save(folder / "commands.json")
+        save_scenario(scenario, folder / "scenario.yaml")
+        line = f"drake-dae live {folder}/scenario.yaml --replay {folder}/commands.json"
+        print(f"saved to {folder}/; again by `{line}`")
+        return str(folder)
+
+    return save
+
+
+def _built(options: argparse.Namespace) -> "tuple[str, Scenario, Commanded]":
+    """Name, scenario and commanded loop that the options name."""
+    from drake_dae.scenario.commanded import build_commanded
+    from drake_dae.scenario.files import load_scenario
+    from drake_dae.scenario.shipped import find_scenario
+
+    path = find_scenario(options.scenario)
+    scenario = load_scenario(path, options.settings)
+    return path.stem, scenario, build_commanded(scenario)
 
 
 def _missing(folder: Path) -> str:

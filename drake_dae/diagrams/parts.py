@@ -17,7 +17,6 @@ from pydrake.systems.primitives import (
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
@@ -41,38 +40,6 @@ def add_block(builder: DiagramBuilder, block: Block) -> Block:
         raise WiringError(
             f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
         ) from None
-
-
-def add_exogenous(
-    builder: DiagramBuilder,
-    block: Plant | Controller,
-    dae: DaeSystem,
-    exogenous: Sequence[Reference],
-) -> ReferenceGenerator | None:
-    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
-
-    Args:
-        builder: The builder of the diagram.
-        block: The block.
-        dae: The block's system.
-        exogenous: The references, in the order of the signals.
-
-    Raises:
-        WiringError: The number of references differs from that of the signals.
-    """
-    names = [signal.name for signal in dae.exogenous.signals]
-    size = sum(reference.size for reference in exogenous)
-    if exogenous and size != len(names):
-        raise WiringError(
-            f"the references of exogenous signals cover {size}, '{dae.name}' has "
-            f"{len(names)}: {', '.join(names) or 'none'}"
-        )
-    if not exogenous:
-        return None
-    generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
-    generator.set_name(f"{block.get_name()}_exogenous")
-    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
-    return generator
 
 
 def add_signals(

@@ -9,6 +9,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import WiringError
+from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
@@ -45,6 +46,8 @@ class LoopSettings:
         signals: Name -> reference of a signal for which a controller waits, as phases of a task do;
             it has come where it is above 1/2. One that is not given is an input port signal_<name>
             of the loop.
+        commands: How fast references and exogenous signals follow what a person commands while the
+            loop runs; see `CommandedReferences`. None for references that nobody changes.
         start_time: The start of a run, in s: the zero dynamics are judged at the references then.
     """
 
@@ -58,6 +61,7 @@ class LoopSettings:
     governed: MotionLimits | None = None
     tolerances: Tolerances | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
+    commands: CommandLimits | None = None
     start_time: float = 0.0
 
     def period(self, step: float) -> float:

@@ -1,6 +1,6 @@
 """The wiring of a closed loop: plant, references and controller."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
@@ -17,7 +17,6 @@ from drake_dae.diagrams.observing import Observer, add_observer
 from drake_dae.diagrams.parts import (
     add_block,
     add_drives,
-    add_exogenous,
     add_feasible,
     add_hold,
     add_signals,
@@ -29,6 +28,7 @@ from drake_dae.diagrams.parts import (
     open_holds,
 )
 from drake_dae.diagrams.settings import LoopSettings
+from drake_dae.diagrams.sources import add_exogenous, make_generator
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.scene.view import add_live_view
@@ -93,7 +93,7 @@ def make_closed_loop(
         names = [signal.name for signal in law.system.output_signals]
         references = references_by_name(references, names, law.degrees)
     period = settings.period(plant.time_step)
-    reference = ReferenceGenerator(references, law.degrees)
+    reference = make_generator(references, law, settings)
     if settings.governed is not None:
         start = settings.start_time
         reference = PathGovernor(references, law, settings.governed, start, period)
@@ -102,7 +102,7 @@ def make_closed_loop(
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
     is_fed_back = (
-        settings.governed is None
+        reference.follows_time
         and plant.HasInputPort("feedback")
         and can_be_fed_back(law, settings.sampling, settings.control_limits)
     )
@@ -184,9 +184,7 @@ def wire_loop(
         builder.Connect(control, controller.GetInputPort("acting_control"))
 
     # Exogenous signals go to the plant, and to the law as known there.
-    own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
-    moving = add_exogenous(builder, plant, plant.dae, own)
-    known = add_exogenous(builder, controller, law.system, parts.exogenous)
+    moving, known = add_exogenous(builder, plant, controller, parts)
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
     # updated while a contact is open or lost, or a drive is at its limit.
@@ -222,7 +220,8 @@ def wire_loop(
     if reference is not None:
         for name, signals in reference.further_signals.items():
             named[name] = (reference.GetOutputPort(name), signals)
-    by_time = reference is None or reference.num_input_ports() == 0
+    sources = {"reference": reference, "exogenous": moving}
+    by_time = {name for name, each in sources.items() if each is None or each.follows_time}
     loggers = _logged(builder, plant, controller, control, named, by_time)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -268,7 +267,7 @@ def _logged(
     controller: Controller,
     control: OutputPort,
     named: Named,
-    by_time: bool,
+    by_time: Set[str],
 ) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
     """Exports all signals, and logs those that do not follow from what is logged.
 
@@ -277,12 +276,12 @@ def _logged(
         plant, controller: The blocks.
         control: What arrives at the plant.
         named: The signals.
-        by_time: Whether references follow from the time.
+        by_time: The signals that follow from the time.
     """
     available: set[str] = set()
     if plant.functions:
-        available = {*plant.functions, *(["reference"] if by_time else []), "exogenous"}
-        if controller.follows and control.get_system() is controller:
+        available = {*plant.functions, *by_time}
+        if "exogenous" in by_time and controller.follows and control.get_system() is controller:
             available.add("control")
     loggers = {}
     for name, (port, signals) in named.items():

@@ -41,6 +41,7 @@ class ConstraintWrenches:
         constraints: The constraints that act at a point.
         frames: The frame that each of these acts on.
         with_moment: Whether each of these has a moment besides its force.
+        function: (q, v, lambda, parameters) -> points, forces and moments, shapes (3, k).
     """
 
     def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
@@ -55,7 +56,7 @@ class ConstraintWrenches:
             "forces": [a.force(force[part]) for _, part, a in acting],
             "moments": [ca.mtimes(a.moment_axes, force[part]) for _, part, a in acting],
         }
-        self._function = TracedFunction(
+        self.function = TracedFunction(
             "constraint loads",
             {"q": links.q, "v": links.v, "force": force, "parameters": model.dae.parameter_symbol},
             {
@@ -79,7 +80,7 @@ class ConstraintWrenches:
         nq, nv = self._sizes
         q, v = state[:nq], state[nq : nq + nv]
         values = self._parameters if parameters is None else parameters
-        found = self._function(q, v, constraint_force, values)
+        found = self.function(q, v, constraint_force, values)
         return Wrenches(*(columns.reshape(3, -1, order="F").T for columns in found))
 
 

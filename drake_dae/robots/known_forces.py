@@ -45,6 +45,29 @@ class KnownForce:
 
 @checked(ModelError)
 @dataclass(frozen=True)
+class KnownWrench(KnownForce):
+    """A force F on a point of a frame and a moment M on the frame.
+
+    The parameters "<name>.force" and "<name>.moment" are F in N and M in N m, in the world, zero by
+    default: so any point of the body can be pushed.
+    """
+
+    name: str = "wrench"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        moment = Parameter(f"{self.name}.moment", np.zeros(3), "N m")
+        object.__setattr__(self, "parameters", (*self.parameters, moment))
+
+    def reaction(self, kinematics: Kinematics) -> Reaction:
+        force, moment = (parameter.symbol for parameter in self.parameters)
+        velocity = kinematics.velocity(self.frame, self.point)
+        turning = kinematics.angular_velocity(self.frame)
+        return kinematics.reaction(ca.dot(force, velocity) + ca.dot(moment, turning))
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
 class ScaledForce(KnownForce):
     """A force s(t) F on a point of a frame, whose course s is an exogenous signal.
 

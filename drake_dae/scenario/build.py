@@ -19,14 +19,20 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.observing import control_lag
 from drake_dae.diagrams.parts import hold_before
 from drake_dae.diagrams.settings import LoopSettings
+from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import Timed, timed
+from drake_dae.scenario.controllers.adaptive import adaptive_controller, check_adaptive
+from drake_dae.scenario.controllers.task_controller import (
+    check_task,
+    opening_contact,
+    task_controller,
+)
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
@@ -36,9 +42,8 @@ from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
 from drake_dae.systems.cascade.cascade import SpringCascade
-from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
 
@@ -61,11 +66,11 @@ def build_scenario(
 
 
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None
+    scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
 ) -> tuple[Completed, ClosedLoop]:
     """The completed scenario and its loop, which `start_scenario` can start repeatedly.
 
-    The arguments and errors are those of `build_scenario`.
+    The arguments and errors are those of `build_scenario` and `build_loop`.
     """
     if scenario.task is not None:
         check_task(scenario)
@@ -80,7 +85,13 @@ def build_completed(
     notes = (*completed.notes, *chosen.notes, *in_time.notes)
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(
-        completed.scenario, model, structure, scene_graph, meshcat, motion=motion
+        completed.scenario,
+        model,
+        structure,
+        scene_graph,
+        meshcat,
+        motion=motion,
+        commands=commands,
     )
 
 
@@ -92,6 +103,7 @@ def build_loop(
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
     motion: Timed | None = None,
+    commands: CommandLimits | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -103,6 +115,8 @@ def build_loop(
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
         motion: The time-optimal motion, from `timed`; None for the scenario's references.
+        commands: How fast references follow what is commanded; signals for which a task waits are
+            then inputs of the diagram. None if nothing is commanded.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -149,7 +163,8 @@ def build_loop(
         plant_exogenous=plant_exogenous,
         governed=None if motion is None else motion.governed,
         tolerances=scenario.tolerances,
-        signals={} if task is None else task.signals,
+        signals={} if task is None or commands is not None else task.signals,
+        commands=commands,
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)
@@ -165,7 +180,7 @@ def build_loop(
         with at("law"):
             period = settings.period(plant.time_step)
             adapts = adaptive_controller(scenario.law, model, structure, period)
-            generator = ReferenceGenerator(references, law.degrees)
+            generator = make_generator(references, law, settings)
             return wire_loop(
                 plant, adapts, generator, settings, scene_graph=scene_graph, meshcat=meshcat
             )
@@ -173,7 +188,7 @@ def build_loop(
     if loop is not None:
         with at("law"):
             cascade = _cascade(loop, law, model, plant, sampling)
-            generator = ReferenceGenerator(references, law.degrees)
+            generator = make_generator(references, law, settings)
             return wire_loop(
                 plant, cascade, generator, settings, scene_graph=scene_graph, meshcat=meshcat
             )

@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 import pytest
-from browser import needs_browser, shown
+from browser import needs_chromium, shown
 from runs import scenario
 
 from drake_dae import build_scenario, make_animation, simulate
@@ -41,7 +41,7 @@ def page_of(name, path, *settings):
     return path
 
 
-@needs_browser
+@needs_chromium
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "size"), [("biped", "900,700"), ("three_fingers", "420,760")])
 def test_labels_cover_neither_each_other_nor_where_forces_act(name, size, tmp_path):
@@ -60,7 +60,7 @@ def test_labels_cover_neither_each_other_nor_where_forces_act(name, size, tmp_pa
         assert bottom <= said["bar"]
 
 
-@needs_browser
+@needs_chromium
 @pytest.mark.slow
 def test_pages_beside_each_other_are_told_one_time(tmp_path):
     """Two pages that answer with what they are told stand in for animations."""

@@ -1,5 +1,6 @@
 """Known forces on frames, against MultibodyPlant."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, error_controlled, parse
@@ -12,6 +13,7 @@ from drake_dae import (
     ExpressionReference,
     FlexibleJoints,
     KnownForce,
+    KnownWrench,
     LoopSettings,
     RobotModel,
     RobotPlant,
@@ -72,6 +74,35 @@ def test_a_force_acts_as_drake_applies_it():
         drake.EvalTimeDerivatives(own).CopyToVector(),
         rtol=1e-11,
     )
+
+
+def test_a_wrench_acts_as_a_force_at_another_point_of_the_link():
+    """v' of the arm on its wall: round-off."""
+    known, levers = arm("two_link").model, (np.zeros(3), np.array([0.05, 0.0, 0.1]))
+    force, state = np.array([3.0, -2.0, 7.0]), known.configuration([0.3], [1.2, -1.6])
+    found = []
+    for lever, kind in zip(levers, (KnownWrench, KnownForce), strict=True):
+        load = kind("tool", lever, name="push")
+        model = RobotModel.from_multibody(
+            parse("two_link_arm"),
+            known.constraints,
+            known.outputs,
+            [1.2, -1.6],
+            known_forces=[load],
+        )
+        plant = RobotPlant(model)
+        context = plant.CreateDefaultContext()
+        plant.set_parameter(context, "push.force", force)
+        if kind is KnownWrench:
+            rotation = model.links.rotation("tool")
+            turned = ca.Function("R", [model.links.q], [rotation])(state).full()
+            plant.set_parameter(context, "push.moment", np.cross(turned @ levers[1], force))
+        plant.set_state(context, [*state, 0.0, 0.0])
+        plant.GetInputPort("control").FixValue(context, [1.0, -2.0])
+        rate = plant.EvalTimeDerivatives(context).CopyToVector()
+        found.append(np.append(rate, plant.GetOutputPort("constraint_force").Eval(context)))
+    assert_allclose(found[0], found[1], rtol=1e-11, atol=1e-12)
+    assert np.abs(found[0]).max() > 0.1
 
 
 @pytest.mark.slow

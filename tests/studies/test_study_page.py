@@ -5,7 +5,7 @@ import re
 import shlex
 
 import pytest
-from browser import needs_browser, shown
+from browser import needs_chromium, shown
 
 from drake_dae import Study, load_scenario
 from drake_dae.cli import main
@@ -105,7 +105,7 @@ def test_a_sweep_writes_the_page_and_its_commands_run(tmp_path, monkeypatch, cap
     capsys.readouterr()
 
 
-@needs_browser
+@needs_chromium
 @pytest.mark.slow
 def test_a_page_sorts_keeps_a_part_and_shows_a_run(tmp_path):
     study(40).save(tmp_path, "t", [f"command {k}" for k in range(40)])

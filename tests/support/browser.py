@@ -1,21 +1,106 @@
-"""Pages in a browser without a screen: what stands in them when they are shown."""
+"""Pages in a headless Chromium: a script runs in a page, and what it finds comes back."""
 
+import json
 import re
 import shutil
 import subprocess
 import tempfile
+from html import unescape
 from pathlib import Path
 
 import pytest
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-
-needs_browser = pytest.mark.skipif(BROWSER is None, reason="needs Chromium: apt install chromium")
-
-_WORDS = (
-    "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run "
-    "--disable-background-networking --disable-component-update --disable-sync"
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
+
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="needs Chromium: apt install chromium")
+
+OPTIONS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+# How long a page has, in ms of its own time, which passes as fast as it computes.
+BUDGET = "--virtual-time-budget=60000"
+
+# What scripts of tests call. Balls and links are taken with pointer events, as a hand does.
+HELPERS = """
+const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
+const slider = (label) => document.querySelector(`input[data-control="${label}"]`);
+function slide(label, value) {
+  slider(label).value = value;
+  slider(label).dispatchEvent(new Event("input"));
+}
+function point(kind, [clientX, clientY]) {
+  const canvas = viewer.renderer.domElement;
+  const told = { clientX, clientY, pointerId: 1, bubbles: true, cancelable: true };
+  canvas.dispatchEvent(new PointerEvent(kind, told));
+}
+const now = () => bench.samples.at(-1);
+// The clock of a page stands still; time passes by these steps alone.
+async function run(seconds) {
+  for (let ticks = Math.round(seconds / bench.data.tick); ticks > 0; ticks -= 30) {
+    await bench.advance(Math.min(ticks, 30));
+  }
+  if (bench.failure) throw new Error(bench.failure);
+  bench.draw();
+}
+const place = (ball) => bench.view.on_screen(ball.position);
+const besides = ([x, y], dx, dy) => [x + dx, y + dy];
+"""
+
+_RESULT = re.compile(r'<pre id="result"[^>]*>(.*?)</pre>', re.DOTALL)
+
+
+def with_script(page: str, body: str) -> str:
+    """The text of a page of a bench with the body of an async function, which has `HELPERS`."""
+    script = (
+        f'<script type="module">{HELPERS}\n'
+        "const shown = document.createElement('pre');\nshown.id = 'result';\n"
+        "shown.style.display = 'none';\n"
+        "async function main() {\n"
+        "  while (!window.bench?.isReady) await sleep(20);\n"
+        "  bench.isRunning = false;\n  await sleep(100);\n"
+        f"{body}\n}}\n"
+        "main().catch((error) => ({ failed: String(error.stack) })).then((found) => {\n"
+        "  shown.textContent = JSON.stringify(found);\n  document.body.append(shown);\n});\n"
+        "</script>"
+    )
+    before, mark, after = page.rpartition("</body>")
+    return before + script + mark + after
+
+
+def in_page(page: str, body: str, file: Path, width: int = 1000, height: int = 700):
+    """What a script returns in a page that is opened from file://.
+
+    Args:
+        page: The text of the page.
+        body: As of `with_script`.
+        file: Where the page with the script is written.
+        width, height: The size of the window, in pixels.
+    """
+    file.write_text(with_script(page, body), encoding="utf-8")
+    return opened(file.as_uri(), file.parent / "profile", width, height)
+
+
+def opened(address: str, profile: Path, width: int = 1000, height: int = 700):
+    """What the script of a page returns that Chromium opens, in virtual time."""
+    more = f"--window-size={width},{height}", f"--user-data-dir={profile}", BUDGET
+    command = [CHROMIUM, *OPTIONS, *more, "--dump-dom", address]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    found = _RESULT.search(done.stdout)
+    assert found, f"the page has no result: {done.stderr[-2000:]}"
+    result = json.loads(unescape(found[1]))
+    assert not (isinstance(result, dict) and "failed" in result), result
+    return result
 
 
 def shown(page: Path, script: str = "", fragment: str = "", size: str = "900,700") -> str:
@@ -38,11 +123,8 @@ def shown(page: Path, script: str = "", fragment: str = "", size: str = "900,700
     copy = page.with_name(f"told-{page.name}")
     copy.write_text(f"{head}{told}{end}{tail}", "utf-8")
     with tempfile.TemporaryDirectory() as user:
-        command = [str(BROWSER), *_WORDS.split(), f"--user-data-dir={user}"]
-        command += [f"--window-size={size}", "--virtual-time-budget=8000", "--dump-dom"]
-        address = copy.as_uri() + fragment
-        done = subprocess.run(
-            [*command, address], capture_output=True, text=True, timeout=120, check=True
-        )
+        command = [CHROMIUM, *OPTIONS, f"--user-data-dir={user}", f"--window-size={size}"]
+        command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri() + fragment]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     (found,) = re.findall(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
     return found

@@ -59,6 +59,7 @@ class TrackingLaw:
             tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
         exogenous_degrees: The number of derivatives of each entry of w that the law needs.
+        coordinates_function: (state, reference, integral, parameters) -> the error coordinates.
         integral: The integrated outputs; then `function` takes "integral" before the parameters,
             and returns "integral_rate" as well.
         control_takes_force: Whether the measured force enters the control in the same instant.
@@ -91,7 +92,7 @@ class TrackingLaw:
         self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
-        self._error_coordinates = self._trace_error_coordinates()
+        self.coordinates_function = self._trace_error_coordinates()
         self.function = self._trace()
 
     def __repr__(self) -> str:
@@ -299,7 +300,7 @@ class TrackingLaw:
         `control`.
         """
         values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
-        return self._error_coordinates(state, reference, sigma, values)[0]
+        return self.coordinates_function(state, reference, sigma, values)[0]
 
     def predicted_error(
         self,

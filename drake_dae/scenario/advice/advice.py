@@ -18,12 +18,12 @@ from drake_dae.scenario.advice.sensed import (
 )
 from drake_dae.scenario.advice.springs import NOISE, loop_note, rounded, velocity_noise, with_loop
 from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import opening_contact
 
 _SOFTER = 5.0
 """A free robot's poles of positions are so many times as fast as those of the distance."""

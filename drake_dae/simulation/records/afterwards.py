@@ -64,7 +64,9 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     plant = loop.plant
     times, values = logged.time, {name: logged[name] for name in logged.signals}
     known = {**values, "parameters": _parameters_along(loop, plant, context, times)}
-    if loop.plant_exogenous is not None:
+    if "exogenous" in values:  # Logged, since it does not follow from the time.
+        known["parameters"][:, plant.exogenous_places] = values["exogenous"]
+    elif loop.plant_exogenous is not None:
         values["exogenous"] = loop.plant_exogenous.along(times)
     if loop.generator is not None and "reference" not in values:
         values["reference"] = loop.generator.along(times)

@@ -225,6 +225,11 @@ class ReferenceGenerator(DifferentiableSystem):
         """Name of an output port beside `reference` -> names and units, for a record."""
         return {}
 
+    @property
+    def follows_time(self) -> bool:
+        """Whether R follows from the time alone."""
+        return not (self.num_input_ports() or self.num_continuous_states())
+
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s, shape (sum (mu_i + 1),)."""
         return self.function(time).copy()

@@ -13,6 +13,8 @@ from pydrake.systems.analysis import Simulator
 from drake_dae import (
     AdaptiveController,
     AdaptiveLaw,
+    CommandedReferences,
+    CommandLimits,
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
@@ -62,6 +64,12 @@ def measured_law(integral, gain=0.5):
 def references():
     height, force = SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)
     return ReferenceGenerator([height, force], law("two_link").degrees)
+
+
+def commanded():
+    of = law("two_link")
+    own, signals = references().references, of.system.output_signals
+    return CommandedReferences(own, of.degrees, signals, CommandLimits(), 0.4)
 
 
 def narrow():
@@ -143,6 +151,7 @@ BLOCKS = {
         actuated("two_link", "flexible").model, PointMaterial(0.01, friction=0.3)
     ),
     "ReferenceGenerator": references,
+    "CommandedReferences": commanded,
     "TrackingController": lambda: TrackingController(law("two_link")),
     "TrackingController that knows its references": lambda: TrackingController(
         law("two_link"), references=references()

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydrake.systems.framework import Context, Diagram
 
-from drake_dae.compiler.compile import compile_part
+from drake_dae.compiler.compile import compile_diagram, compile_part
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
@@ -117,18 +117,24 @@ def plant_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
     return _part(compiled, _known_signals(loop, plant))
 
 
-def loop_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
+def loop_part(loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()) -> Part:
     """A loop as a whole, which has no inputs. Its outputs are those of the record.
 
     Args:
         loop, context: As of `controller_part`; a diagram may have any number of plants.
+        further: Names of output ports of a loop's diagram that are outputs as well.
 
     Raises:
         ModelError: It changes as no function of the time does: why.
     """
-    program = program_of(loop)
-    _check_time(program.compiled, "the loop")
-    return _part(program.compiled, {name: tuple(each) for name, each in program.signals.items()})
+    if further and not isinstance(loop, Diagram):
+        compiled = compile_diagram(loop.diagram, [*loop.signals, *further])
+        signals: Mapping[str, Sequence[Signal]] = loop.signals
+    else:
+        program = program_of(loop)
+        compiled, signals = program.compiled, program.signals
+    _check_time(compiled, "the loop")
+    return _part(compiled, {name: tuple(each) for name, each in signals.items()})
 
 
 def _part(

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import casadi as ca
 import numpy as np
+from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -143,15 +144,22 @@ def parameter_signals(compiled: CompiledDiagram) -> list[Signal]:
     first = compiled.inputs[0][1].start if compiled.inputs else compiled.sizes["parameters"]
     found = [Signal("")] * first
     for system, part in compiled.parameters:
-        dae, law = getattr(system, "dae", None), getattr(system, "law", None)
-        own, count = [] if dae is None else parameter_names(dae, law), part.stop - part.start
-        if len(own) != count:
-            own = [Signal(f"parameter[{i}]") for i in range(count)]
-        found[part] = [Signal(f"{system.get_name()}.{s.name}", s.unit) for s in own]
+        found[part] = parameters_of_block(system, part.stop - part.start)
     for system, name, part in compiled.fixed:
         count = part.stop - part.start
         found[part] = [Signal(f"{system.get_name()}.{name}[{i}]") for i in range(count)]
     return distinct(found)
+
+
+def parameters_of_block(system: System, count: int) -> list[Signal]:
+    """Names and units of the numeric parameters of a block, with the block's name before them."""
+    dae, law = getattr(system, "dae", None), getattr(system, "law", None)
+    own = list(getattr(system, "commands", ()))
+    if dae is not None:
+        own = parameter_names(dae, law)
+    if len(own) != count:
+        own = [Signal(f"parameter[{i}]") for i in range(count)]
+    return [Signal(f"{system.get_name()}.{s.name}", s.unit) for s in own]
 
 
 def distinct(signals: Sequence[Signal]) -> list[Signal]:

@@ -1,11 +1,13 @@
 """A controller, its plant and their loop as WebAssembly, for a page in a browser."""
 
 import json
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
 from typing import Any
 
+import casadi as ca
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
@@ -23,7 +25,8 @@ from drake_dae.running.export.steps.parts import (
     parts_of_loop,
 )
 from drake_dae.running.export.steps.words import file_of, identifiers, prefix_of
-from drake_dae.running.export.text import comment, written
+from drake_dae.running.export.text import comment, generated, written
+from drake_dae.trace.compiled import without_branches
 from drake_dae.trace.compiler import compile_webassembly
 
 TEMPLATES = Path(__file__).parent / "js"
@@ -56,7 +59,6 @@ def export_wasm(
         MachineCodeError: There is no zig, as of `pip install 'drake_dae[compiler]'`, or it fails.
         OSError: A file cannot be written.
     """
-    prefix, file = prefix_of(name), file_of(name)
     parts, left_out = parts_of_loop(loop, context, (LOOP, PLANT, CONTROLLER))
     found = [
         write_controller(part, context, name, folder)
@@ -64,6 +66,32 @@ def export_wasm(
         else write_integrated(part, kind, context, name, folder, config)
         for kind, part in parts.items()
     ]
+    files = write_module(found, name, folder)
+    sources = [path for each in found for path in each.files]
+    return Export([*files, *sources], left_out)
+
+
+def write_module(
+    found: Sequence[Written],
+    name: str,
+    folder: str | Path,
+    further: Mapping[str, ca.Function] | None = None,
+) -> list[Path]:
+    """Compiles parts that are written as C to name.wasm, and writes name.mjs.
+
+    Args:
+        found: The parts.
+        name, folder: As of `export_wasm`.
+        further: Name -> a function of all outputs and all parameters of the first part, which the
+            module shows beside it; read by `part.view(name, 0, size)`.
+
+    Returns:
+        name.wasm, name.mjs, and the C source of what the module shows.
+
+    Raises:
+        MachineCodeError, OSError: As of `export_wasm`.
+    """
+    prefix, file = prefix_of(name), file_of(name)
     words = {
         "title": comment(name),
         "name": file,
@@ -71,9 +99,22 @@ def export_wasm(
         "prefix": prefix,
         "guard": prefix.upper(),
     }
+    sources = [each.files[1] for each in found]
+    shown = ""
+    for key, function in (further or {}).items():
+        symbol = f"{prefix}_{key}"
+        own = {"symbol": symbol, "key": key, "kind": found[0].kind, "prefix": prefix}
+        own |= {
+            "size": str(function.numel_out(0)),
+            "given": str(function.sz_arg()),
+            "results": str(function.sz_res()),
+            "generated": without_branches(generated({f"{symbol}_traced": function})),
+        }
+        sources += written(TEMPLATES, folder, {"further.c": f"{file}_{key}.c"}, own)
+        shown += Template((TEMPLATES / "shown.c").read_text(encoding="utf-8")).substitute(own)
     glue = words | {
         "includes": "".join(f'#include "{each.files[0].name}"\n' for each in found),
-        "parts": "".join(_glue(each, words) for each in found),
+        "parts": "".join(_glue(each, words) for each in found) + shown,
     }
     (source,) = written(TEMPLATES, folder, {"exports.c": f"{file}_exports.c"}, glue)
     described = {each.kind: _described(each) for each in found}
@@ -87,9 +128,8 @@ def export_wasm(
     (module,) = written(TEMPLATES, folder, {"module.mjs": f"{file}.mjs"}, words)
     target = module.with_suffix(".wasm")
     target.unlink(missing_ok=True)
-    compile_webassembly([source, *(each.files[1] for each in found)], target)
-    sources = [path for each in found for path in each.files]
-    return Export([target, module, source, *sources], left_out)
+    compile_webassembly([source, *sources], target)
+    return [target, module, source]
 
 
 def _glue(each: Written, words: dict[str, str]) -> str:

@@ -1,0 +1,48 @@
+/* The loop runs in this page, as WebAssembly. */
+async function makeEngine() {
+  const { create } = await load(Uint8Array.from(atob(wasm), (letter) => letter.charCodeAt(0)));
+  const loop = create("loop");
+  let tick = 0, log = [];
+
+  function sample() {
+    const { controlled_output: z, reference } = loop.outputs;
+    const shown = Array.from(loop.view("shown", 0, sizes.scene + sizes.coordinates));
+    return {
+      time: loop.time,
+      z: Array.from(z),
+      r: data.outputs.map(({ lowest }) => reference[lowest]),
+      scene: shown.slice(0, sizes.scene),
+      coordinates: shown.slice(sizes.scene),
+    };
+  }
+  return {
+    async start() {
+      loop.reset();
+      [tick, log] = [0, []];
+      loop.show();
+      return sample();
+    },
+    set(input, value) {
+      loop.view("parameters", data.places[input], 1)[0] = value;
+      log.push([tick, data.inputs[input].name, value]);
+    },
+    /* Samples after each of some ticks. */
+    async advance(ticks) {
+      const found = [];
+      for (let i = 0; i < ticks; i++) {
+        loop.advance(data.start + (tick + 1) * data.tick);
+        tick++;
+        found.push(sample());
+      }
+      return found;
+    },
+    async save() {
+      const text = JSON.stringify({ title: data.title, tick: data.tick, end: tick, commands: log });
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+      link.download = "commands.json";
+      link.click();
+      return "commands.json";
+    },
+  };
+}

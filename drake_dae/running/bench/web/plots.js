@@ -1,0 +1,86 @@
+/* Curves over the last seconds on a canvas. */
+const SECONDS = 8;
+const COLORS = ["#1a5fb4", "#c01c28", "#8833bb", "#9c6a00", "#0a7d6c", "#555"];
+
+class Plot {
+  constructor(canvas) {
+    this.canvas = canvas;
+  }
+  /* curves: [{ value: sample -> number, color, dashed }]. */
+  draw(samples, curves, unit, legend) {
+    const { canvas } = this;
+    const ratio = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    }
+    const pen = canvas.getContext("2d");
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    if (samples.length < 2) return;
+    const columns = curves.map(({ value }) => samples.map(value));
+    let [low, high] = [Infinity, -Infinity];
+    for (const value of columns.flat()) {
+      if (value === null || !Number.isFinite(value)) continue;
+      [low, high] = [Math.min(low, value), Math.max(high, value)];
+    }
+    if (low > high) return;
+    const least = Math.max(1e-12, 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
+    if (high - low < least) [low, high] = [low - least, high + least];
+    const [left, right, top, bottom] = [58, width - 8, 30, height - 18];
+    const last = samples.at(-1).time, first = Math.max(samples[0].time, last - SECONDS);
+    const span = Math.max(last - first, 1e-3);
+    const x = (time) => left + ((right - left) * (time - first)) / span;
+    const y = (value) => bottom - ((bottom - top) * (value - low)) / (high - low);
+    pen.font = "11px sans-serif";
+    pen.fillStyle = "#667";
+    pen.strokeStyle = "#e2e2e8";
+    pen.lineWidth = 1;
+    pen.textAlign = "right";
+    for (const part of [0, 0.5, 1]) {
+      const value = low + part * (high - low);
+      pen.beginPath();
+      pen.moveTo(left, y(value));
+      pen.lineTo(right, y(value));
+      pen.stroke();
+      pen.fillText(short(value), left - 4, y(value) + 4);
+    }
+    pen.textAlign = "center";
+    for (let t = Math.ceil(first); t <= last; t++) pen.fillText(`${t} s`, x(t), height - 5);
+    pen.textAlign = "left";
+    let place = 6;
+    for (const [text, color, dashed] of [...legend, [unit && `[${unit}]`, "#667"]]) {
+      pen.fillStyle = color;
+      pen.fillText(text, place, 14);
+      if (dashed !== undefined) {
+        pen.strokeStyle = color;
+        pen.setLineDash(dashed ? [5, 4] : []);
+        pen.lineWidth = 2;
+        pen.beginPath();
+        pen.moveTo(place, 20);
+        pen.lineTo(place + pen.measureText(text).width, 20);
+        pen.stroke();
+      }
+      place += pen.measureText(text).width + 12;
+    }
+    curves.forEach(({ color, dashed }, i) => {
+      pen.strokeStyle = color;
+      pen.setLineDash(dashed ? [6, 5] : []);
+      pen.lineWidth = dashed ? 2.2 : 1.6;
+      pen.beginPath();
+      samples.forEach(({ time }, k) => {
+        if (time >= first && columns[i][k] !== null) pen.lineTo(x(time), y(columns[i][k]));
+      });
+      pen.stroke();
+    });
+    pen.setLineDash([]);
+  }
+}
+
+/* A number with three digits. */
+function short(value) {
+  const size = Math.abs(value);
+  if (size && (size < 1e-3 || size >= 1e4)) return value.toExponential(1);
+  return String(Number(value.toPrecision(3)));
+}

@@ -1,0 +1,125 @@
+"""A scenario whose references, surfaces and links a person moves while it runs."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked
+from drake_dae.dae.references import ConstantReference
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.robots.constraints.points import PointOnSurface
+from drake_dae.robots.known_forces import KnownWrench
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_scenario
+from drake_dae.systems.control.command_filter import CommandLimits
+
+PUSH = "push."
+"""Begins the names of the wrenches that push links."""
+
+
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """A loop that a person changes while it runs.
+
+    Attributes:
+        scenario: The scenario, completed, with what was added to it.
+        loop: Its loop.
+        context: The context of its diagram at the start.
+        left_out: What cannot be changed in it, a sentence for each.
+    """
+
+    scenario: Scenario
+    loop: ClosedLoop
+    context: Context
+    left_out: tuple[str, ...]
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> Commanded:
+    """The loop of a scenario with `CommandedReferences`, surfaces that move, and links to push.
+
+    What nobody commands is as in the scenario: surfaces stand still, wrenches and friction are
+    zero. Signals for which a task waits are inputs of the diagram, to be given by hand. Where a
+    part does not fit the scenario, it is left out.
+
+    Args:
+        scenario: What `load_scenario` returns.
+        limits: How fast references follow; `CommandLimits()` if None.
+
+    Raises:
+        ScenarioError: The scenario itself does not fit; the message names its key.
+    """
+    limits = limits or CommandLimits()
+    parts = dict(_PARTS)
+    left_out = dict[str, str]()
+    while True:
+        try:
+            found = scenario
+            for add in parts.values():
+                found = add(found)
+            completed, loop = build_completed(found, commands=limits)
+            # At rest, where the scenario itself starts at rest.
+            begun = replace(completed.scenario, exogenous=scenario.exogenous)
+            context = start_scenario(begun, loop)
+            return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
+        except DrakeDaeError as error:
+            if not parts:
+                raise
+            name = next(iter(parts))
+            del parts[name]
+            left_out[name] = f"{name}: {error}"
+
+
+def _with_moving_surfaces(scenario: Scenario) -> Scenario:
+    """Surfaces whose positions are exogenous signals that stand still."""
+    if scenario.task is not None or scenario.observer is not None or scenario.is_advised:
+        return scenario
+    moving = dict[str, Any]()
+    for constraint in scenario.constraints:
+        if isinstance(constraint, PointOnSurface) and scenario.plant.material is None:
+            position = constraint.parameters[0]
+            if position.name not in scenario.exogenous:
+                moving[position.name] = [ConstantReference(x) for x in position.value.tolist()]
+    return replace(scenario, exogenous={**scenario.exogenous, **moving})
+
+
+def _with_friction(scenario: Scenario) -> Scenario:
+    """Surfaces with the parameters of friction, which is zero."""
+    if scenario.actuation or scenario.task is not None or scenario.plant.material is not None:
+        return scenario
+    constraints = [
+        replace(each, friction=0.0)
+        if isinstance(each, PointOnSurface) and each.friction is None
+        else each
+        for each in scenario.constraints
+    ]
+    return replace(scenario, constraints=constraints)
+
+
+def _with_pushes(scenario: Scenario) -> Scenario:
+    """Links with wrenches that are zero."""
+    if scenario.plant.material is not None:
+        return scenario
+    plant = robot_links(scenario.robot, SceneGraph())[0].plant
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    pushes = [
+        KnownWrench(body.scoped_name().get_full(), name=PUSH + body.scoped_name().get_full())
+        for body in bodies
+        if plant.GetVisualGeometriesForBody(body) and not plant.IsAnchored(body)
+    ]
+    return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
+
+
+_PARTS: Mapping[str, Callable[[Scenario], Scenario]] = {
+    "friction of the plant": _with_friction,
+    "surfaces that are dragged": _with_moving_surfaces,
+    "links that are pushed": _with_pushes,
+}
+"""What is added, in the order in which it is left out again."""

@@ -1,0 +1,100 @@
+"""Scenarios whose references, surfaces and links are commanded while they run."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import SimulatorConfig
+from runs import run, scenario
+
+from drake_dae import build_commanded, build_scenario
+from drake_dae.running.bench.controls import Inputs
+from drake_dae.scenario.shipped import shipped_scenarios
+
+FIXED = SimulatorConfig(
+    integration_scheme="runge_kutta5", use_error_control=False, max_step_size=0.002
+)
+
+
+def jumped(built, duration, **changes):
+    """A record of a run with jumps of inputs, given by parts of their names, at its start."""
+    inputs, context = Inputs.of(built.loop), built.context.Clone()
+    found = {
+        number: value
+        for part, value in changes.items()
+        for number, name in enumerate(inputs.names)
+        if name.endswith(part.replace("__", "."))
+    }
+    assert len(found) >= len(changes)
+    inputs.set(context, found)
+    return run(built.loop, context, duration, FIXED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two_link_wall",
+        pytest.param("two_link_flexible", marks=pytest.mark.thorough),
+        pytest.param("seven_joint_moving_plate", marks=pytest.mark.thorough),
+    ],
+)
+def test_without_commands_it_is_the_scenario(name):
+    plain = run(*build_scenario(scenario(name)), 0.5, FIXED)
+    built = build_commanded(scenario(name))
+    assert not built.left_out
+    same = run(built.loop, built.context, 0.5, FIXED)
+    for signal in ("controlled_output", "constraint_force", "reference"):
+        # Round-off of other expressions, through fixed steps.
+        size = np.abs(plain[signal]).max()
+        np.testing.assert_allclose(same[signal], plain[signal], atol=1e-8 * size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("two_link_wall", marks=pytest.mark.thorough),
+        "two_link_flexible",
+        pytest.param("two_link_motors", marks=pytest.mark.thorough),
+        pytest.param("two_link_hydraulics", marks=pytest.mark.thorough),
+    ],
+)
+def test_errors_stay_as_predicted_whatever_is_commanded(name):
+    """The wall moves by as many lags for the plant as for the law, which needs more derivatives."""
+    built = build_commanded(scenario(name, "start.errors={tool.z: 0.01}"))
+    path = {
+        "reference__path__speed": 0.4,
+        "reference__tool__z": 0.05,
+        "reference__wall__force": 12.0,
+    }
+    found = jumped(built, 1.5, **path, **{"exogenous.wall.position[0]": -0.06})
+    error, wanted = found["tracking_error"], built.loop.predicted_error(found)
+    size = np.abs(found["desired_output"]).max(axis=0)
+    assert np.abs((error - wanted) / size).max() <= 1e-6
+    # All of it was followed.
+    moved = found["exogenous"][-1, 0] - found["exogenous"][0, 0]
+    assert moved == pytest.approx(-0.06, abs=1e-4)
+    assert np.abs(found["constraint_residual"]).max() <= 1e-6
+
+
+@pytest.mark.slow
+def test_a_push_that_the_law_does_not_know_moves_the_tool():
+    built = build_commanded(scenario("two_link_wall"))
+    inputs = Inputs.of(built.loop)
+    name = "two_link_arm.push.two_link_arm::link2.force"
+    place = next(k for k, each in enumerate(inputs.names) if each.startswith(name))
+    context = built.context.Clone()
+    inputs.set(context, {place + 2: 15.0})  # Upwards
+    pushed = run(built.loop, context, 0.5, FIXED)
+    plain = run(built.loop, built.context.Clone(), 0.5, FIXED)
+    assert pushed["controlled_output"][-1, 0] > plain["controlled_output"][-1, 0] + 0.01
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_every_shipped_scenario_is_commanded(name):
+    built = build_commanded(scenario(name))
+    names = Inputs.of(built.loop).names
+    is_contact = not built.loop.plant.is_ideal
+    assert built.loop.generator is None or "reference.path.speed" in names
+    assert is_contact or any(".push." in each for each in names)
+    assert not built.left_out
