@@ -95,6 +95,7 @@ class Fit:
         sizes: Their sizes, shape (p,).
         lowest: Their lower bounds, -inf for none, shape (p,).
         strict: Which must stay above these, shape (p,).
+        noise: A guess of the deviation of each column of each record, shape (c,).
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class Fit:
         sizes: FloatArray,
         lowest: FloatArray,
         strict: np.ndarray,
+        noise: Sequence[FloatArray] | None = None,
     ) -> None:
         self._pieces = [each.fine_enough(start) for each in pieces]
         self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
@@ -111,30 +113,40 @@ class Fit:
         self._states = [each.first_states.copy() for each in pieces]
         self._spread = [_spread(each) for each in pieces]
         self._floor = FIRST_NOISE
-        self._noise = [FIRST_NOISE * spread for spread in self._spread]
+        guess = [FIRST_NOISE * spread for spread in self._spread] if noise is None else noise
+        self._noise = [each.copy() for each in guess]
         self._parts = np.eye(start.size), np.zeros((start.size, 0))
         self._before, self._least_left = (self._values, list(self._states)), np.inf
 
-    def run(self) -> Fitted:
+    def run(self, couplings: Sequence[float] = COUPLINGS) -> Fitted:
         """Fits.
 
         Derivatives are computed anew only where steps with old ones do not become shorter, and at
         the end: they take most of the time.
+
+        Args:
+            couplings: How tightly pieces are joined, one after the other.
 
         Raises:
             ModelError: The computed motion leaves the recorded one, or the steps do not come to an
                 end.
         """
         known: list[Slopes] | None = None
-        for coupling in COUPLINGS:
+        for coupling in couplings:
+            is_last = coupling == COUPLINGS[-1]
             # Loose pieces follow noise, so that what is left says nothing of it.
-            self._floor = SMALLEST if coupling == COUPLINGS[-1] else FIRST_NOISE
+            self._floor = SMALLEST if is_last else FIRST_NOISE
             before, self._least_left = np.inf, np.inf
             for _ in range(MOST):
                 slopes, chains = self._shortened(coupling, known)
+                step, length = self._step(chains)
+                if known is not None and length > max(SHORTER * before, CLOSE):
+                    known = None
+                    slopes, chains = self._chained(coupling, None)
+                    step, length = self._step(chains)
                 self._least_left = min(self._least_left, self._left(slopes))
-                length, is_new = self._step(slopes, chains), known is None
-                is_last = coupling == COUPLINGS[-1]
+                self._move(step, slopes, chains)
+                is_new, self._last = known is None, length
                 known = slopes if length < SHORTER * before else None
                 before = length
                 if length < CLOSE:
@@ -148,7 +160,8 @@ class Fit:
                         "the record does not fit this robot, or the values to begin with are far "
                         "off; free fewer parameters first"
                     )
-        return self._fitted(slopes, chains)
+        # Errors are those after the last step.
+        return self._fitted(*self._chained(couplings[-1], slopes))
 
     def known(self, noise: Sequence[FloatArray]) -> Fitted:
         """The information about the unknowns at the values and states to begin with.
@@ -218,22 +231,23 @@ class Fit:
         moves = np.concatenate([slopes.of_ends[:-1], defects[..., None]], axis=2)
         return Chain.of(own, moves, coupling * _known(own, scale), WEAK * scale)
 
-    def _step(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> float:
-        """Makes a step; returns its length in deviations of the unknowns."""
+    def _step(self, chains: Sequence[Chain]) -> tuple[FloatArray, float]:
+        """A step of the unknowns, and its length in their deviations."""
         scaled, rest = self._split(chains)
-        p = self._values.size
-        step = self._sizes * self._over_sizes(scaled, rest)
+        step = self._over_sizes(scaled, rest)
+        length = float(np.linalg.norm(scaled @ step))
+        return self._sizes * step, length / max(1.0, np.sqrt(step.size))
+
+    def _move(self, step: FloatArray, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> None:
+        """Makes a step."""
         self._before = self._values, list(self._states)
         for index, chain in enumerate(chains):
             states, _ = chain.states(step)
             self._states[index] = self._states[index] + states
-            changes = np.concatenate([states, np.broadcast_to(step, (len(states), p))], 1)
-            after = slopes[index].errors + np.einsum(
-                "jkci,ji->jkc", slopes[index].of_errors, changes
-            )
-            self._set_noise(index, after)
+            both = np.concatenate([states, np.broadcast_to(step, (len(states), step.size))], 1)
+            of_errors = slopes[index].of_errors
+            self._set_noise(index, slopes[index].errors + np.einsum("jkci,ji->jkc", of_errors, both))
         self._values = np.maximum(self._values + step, self._lowest)
-        return float(np.linalg.norm(scaled @ (step / self._sizes))) / max(1.0, np.sqrt(p))
 
     def _over_sizes(self, scaled: FloatArray, rest: FloatArray) -> FloatArray:
         """The step of the unknowns over their sizes, along what is determined and above bounds.

@@ -1,6 +1,7 @@
 """Parameters of a plant from records of it."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -11,7 +12,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.identification.driven import Driven
-from drake_dae.studies.identification.fit import SMALLEST, Fit, Fitted
+from drake_dae.studies.identification.fit import COUPLINGS, SMALLEST, Fit, Fitted
 from drake_dae.studies.identification.identified import (
     WHITE,
     Identified,
@@ -82,11 +83,20 @@ def identify(
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
     given = sizes, lowest, np.array([unknown.strict for unknown in unknowns.all])
-    near = start
-    if any(each.data.times.size > LONG for each in pieces):
-        near = Fit([each.first(BRIEF) for each in pieces], start, *given).run().values
-    fitted = Fit(pieces, near, *given).run()
+    fitted = _fitted(pieces, start, given)
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
+
+
+def _fitted(
+    pieces: Sequence[Pieces], start: FloatArray, given: tuple[FloatArray, FloatArray, np.ndarray]
+) -> Fitted:
+    """The fit, of long records from a first estimate by their first rows."""
+    if all(each.data.times.size <= LONG for each in pieces):
+        return Fit(pieces, start, *given).run()
+    first = Fit([each.first(BRIEF) for each in pieces], start, *given).run(COUPLINGS[:-1])
+    with suppress(ModelError):  # From nearby, pieces need not be loose at first.
+        return Fit(pieces, first.values, *given, first.noise).run(COUPLINGS[-1:])
+    return Fit(pieces, first.values, *given).run()
 
 
 def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) -> Pieces:
