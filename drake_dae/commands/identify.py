@@ -17,7 +17,7 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.studies.variations import parse_ranges
 
 if TYPE_CHECKING:
-    from drake_dae.studies.identification.excitation import Excitation
+    from drake_dae.studies.excitation.excitation import Excitation
     from drake_dae.studies.identification.identified import Identified
 
 
@@ -49,7 +49,7 @@ def _identify(options: argparse.Namespace) -> int:
 def _excite(options: argparse.Namespace) -> int:
     """Finds a motion and a force; returns the exit code, after a signal that of this."""
     # It loads SciPy's optimizers.
-    from drake_dae.studies.identification.excite import excite
+    from drake_dae.studies.excitation.excite import excite
 
     scenario = load_scenario(find_scenario(options.scenario), options.settings)
     found = excite(

@@ -69,8 +69,11 @@ class Fitted:
         determined: Directions of the unknowns over their sizes that the data determine, in
             columns, shape (p, q).
         undetermined: Those that the data do not determine, shape (p, p - q).
-        errors: Measured minus computed columns of each record, shape (k, c).
+        errors: Measured minus computed columns of each record, shape (k, c); nan where none is
+            used.
         noise: The deviation of each column of each record, shape (c,).
+        last_step: The length of the last step: no unknown moved by more of its deviations.
+        left_out: How many steps between rows are not used, of how many.
     """
 
     values: FloatArray
@@ -79,6 +82,8 @@ class Fitted:
     undetermined: FloatArray
     errors: Sequence[FloatArray]
     noise: Sequence[FloatArray]
+    last_step: float
+    left_out: tuple[int, int]
 
 
 class Fit:
@@ -110,13 +115,14 @@ class Fit:
         self._pieces = [each.fine_enough(start) for each in pieces]
         self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
         self._strict = strict
-        self._states = [each.first_states.copy() for each in pieces]
-        self._spread = [_spread(each) for each in pieces]
+        self._states = [each.first_states.copy() for each in self._pieces]
+        self._spread = [each.spread for each in self._pieces]
         self._floor = FIRST_NOISE
         guess = [FIRST_NOISE * spread for spread in self._spread] if noise is None else noise
         self._noise = [each.copy() for each in guess]
         self._parts = np.eye(start.size), np.zeros((start.size, 0))
         self._before, self._least_left = (self._values, list(self._states)), np.inf
+        self._last = 0.0
 
     def run(self, couplings: Sequence[float] = COUPLINGS) -> Fitted:
         """Fits.
@@ -144,9 +150,11 @@ class Fit:
                     known = None
                     slopes, chains = self._chained(coupling, None)
                     step, length = self._step(chains)
-                self._least_left = min(self._least_left, self._left(slopes))
-                self._move(step, slopes, chains)
-                is_new, self._last = known is None, length
+                expected = self._move(step, slopes, chains)
+                left = self._left([each.errors for each in slopes])
+                # Tighter pieces leave more, as it is expected.
+                self._least_left = max(min(self._least_left, left), self._left(expected))
+                is_new, self._last = known is None, length * max(1.0, np.sqrt(step.size))
                 known = slopes if length < SHORTER * before else None
                 before = length
                 if length < CLOSE:
@@ -188,7 +196,7 @@ class Fit:
         for _ in range(HALVED):
             with suppress(ModelError):
                 found = self._chained(coupling, known)
-                if self._left(found[0]) <= WORSE * self._least_left:
+                if self._left([each.errors for each in found[0]]) <= WORSE * self._least_left:
                     return found
             values, states = self._before
             self._values = (values + self._values) / 2.0
@@ -196,10 +204,10 @@ class Fit:
             self._states = [(one + other) / 2.0 for one, other in pairs]
         return self._chained(coupling, known)
 
-    def _left(self, slopes: Sequence[Slopes]) -> float:
+    def _left(self, errors: Sequence[FloatArray]) -> float:
         """The size of all errors, relative to how much their columns vary."""
-        pairs = zip(slopes, self._spread, strict=True)
-        return max(float(np.sqrt(np.nanmean(np.square(s.errors / spread)))) for s, spread in pairs)
+        pairs = zip(errors, self._spread, strict=True)
+        return max(float(np.sqrt(np.nanmean(np.square(e / spread)))) for e, spread in pairs)
 
     def _chained(
         self, coupling: float, known: Sequence[Slopes] | None
@@ -229,7 +237,10 @@ class Fit:
         own = np.concatenate([found.reshape(count, -1, width), exact / EXACT], axis=1)
         defects = slopes.ends[:-1] - self._states[index][1:]
         moves = np.concatenate([slopes.of_ends[:-1], defects[..., None]], axis=2)
-        return Chain.of(own, moves, coupling * _known(own, scale), WEAK * scale)
+        # Across an event of a contact nothing is known of the next state.
+        is_joined = self._pieces[index].is_joined[:, None]
+        loose = np.where(is_joined, coupling * _known(own, scale), WEAK * scale)
+        return Chain.of(own, np.where(is_joined[..., None], moves, 0.0), loose, WEAK * scale)
 
     def _step(self, chains: Sequence[Chain]) -> tuple[FloatArray, float]:
         """A step of the unknowns, and its length in their deviations."""
@@ -238,16 +249,20 @@ class Fit:
         length = float(np.linalg.norm(scaled @ step))
         return self._sizes * step, length / max(1.0, np.sqrt(step.size))
 
-    def _move(self, step: FloatArray, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> None:
-        """Makes a step."""
-        self._before = self._values, list(self._states)
+    def _move(
+        self, step: FloatArray, slopes: Sequence[Slopes], chains: Sequence[Chain]
+    ) -> list[FloatArray]:
+        """Makes a step; returns the errors that are expected after it."""
+        self._before, expected = (self._values, list(self._states)), []
         for index, chain in enumerate(chains):
             states, _ = chain.states(step)
             self._states[index] = self._states[index] + states
             both = np.concatenate([states, np.broadcast_to(step, (len(states), step.size))], 1)
-            of_errors = slopes[index].of_errors
-            self._set_noise(index, slopes[index].errors + np.einsum("jkci,ji->jkc", of_errors, both))
+            own = slopes[index]
+            expected.append(own.errors + np.einsum("jkci,ji->jkc", own.of_errors, both))
+            self._set_noise(index, expected[-1])
         self._values = np.maximum(self._values + step, self._lowest)
+        return expected
 
     def _over_sizes(self, scaled: FloatArray, rest: FloatArray) -> FloatArray:
         """The step of the unknowns over their sizes, along what is determined and above bounds.
@@ -299,22 +314,20 @@ class Fit:
             both /= self._noise[index][:, None]
             flat = both.reshape(len(both), -1, p + 1)
             information.append(np.matmul(flat[..., :p].transpose(0, 2, 1), flat))
-            rows = self._pieces[index].data.times.size
-            errors.append(found.errors.reshape(-1, found.errors.shape[2])[:rows])
-        return Fitted(self._values, np.concatenate(information), *self._parts, errors, self._noise)
-
-
-def _spread(pieces: Pieces) -> FloatArray:
-    """How much the columns of each group vary; their size if they do not, or 1 if that is zero."""
-    values, groups = pieces.values, [channel.group for channel in pieces.data.channels]
-    found = np.ones(len(groups))
-    for group in set(groups):
-        own = [i for i, each in enumerate(groups) if each == group]
-        columns = values[:, :, own].reshape(-1, len(own))
-        varies = float(np.max(np.nanstd(columns, axis=0)))
-        size = float(np.sqrt(np.nanmean(np.square(columns))))
-        found[own] = max(varies, 1e-3 * size) or 1.0
-    return found
+            pieces = self._pieces[index]
+            left = np.full(pieces.data.values.shape, np.nan)
+            left[pieces.rows[:, :-1][pieces.is_own]] = found.errors[pieces.is_own]
+            errors.append(left)
+        cuts = [pieces.data.cut for pieces in self._pieces]
+        return Fitted(
+            self._values,
+            np.concatenate(information),
+            *self._parts,
+            errors,
+            self._noise,
+            self._last,
+            (sum(int(cut.sum()) for cut in cuts), sum(cut.size for cut in cuts)),
+        )
 
 
 def _known(own: FloatArray, scale: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
+from drake_dae.studies.identification.channels import SAME, Channel
 from drake_dae.studies.identification.driven import Driven
 from drake_dae.studies.identification.fit import COUPLINGS, SMALLEST, Fit, Fitted
 from drake_dae.studies.identification.identified import (
@@ -21,7 +22,7 @@ from drake_dae.studies.identification.identified import (
     resampled,
     undetermined_names,
 )
-from drake_dae.studies.identification.measured import SAME, Channel, measured, measured_ports
+from drake_dae.studies.identification.measured import measured, measured_ports
 from drake_dae.studies.identification.pieces import Pieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
@@ -55,8 +56,9 @@ def identify(
     constraint forces, of its sensor if it has one. Velocities are not: they are estimated.
 
     Args:
-        loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`; contacts
-            stay closed, or are compliant.
+        loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`. Steps in
+            which an ideal contact opens, closes or is struck are left out, and pieces on both sides
+            are not joined; "mode" of the records says when contacts are closed.
         context: A context of its diagram; parameters begin with its values, and all others have
             them.
         records: The records, by name or in a list: of this plant under any law, with the signals
@@ -109,6 +111,11 @@ def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) ->
     biases, delays = unknowns.of_sensors(data.channels)
     if (delays >= 0).any():
         _check_even(data.times, title)
+        if data.cut.any():
+            raise ModelError(
+                f"contacts of {title} open or close, or phases of its task end, and a delay is not "
+                "found across these; leave the delay out, or take a record between two of them"
+            )
     return Pieces(driven, data, biases, unknowns.num_sensed, delays=delays)
 
 
@@ -156,8 +163,18 @@ def _identified(
     bootstrap[np.isnan(np.diagonal(covariance))] = np.nan
     undetermined = undetermined_names(fitted.undetermined, names)
     noise = _noise(loop, pieces, fitted)
-    given = fitted.values, start, covariance, bootstrap, undetermined, noise, fitted.errors
-    return Identified(unknowns.all, *given)
+    return Identified(
+        unknowns.all,
+        fitted.values,
+        start,
+        covariance,
+        bootstrap,
+        undetermined,
+        noise,
+        fitted.errors,
+        fitted.last_step,
+        fitted.left_out,
+    )
 
 
 def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[str, Noise]:
