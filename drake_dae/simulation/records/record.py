@@ -288,7 +288,7 @@ class Record:
                 about = json.loads(str(file["about"])) if "about" in file.files else {}
                 return cls(file["time"], signals, events_of_arrays(file), about)
         except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
-            text = getattr(error, "strerror", None) or error
+            text = getattr(error, "strerror", None) or f"{error}; it may be cut off or damaged"
             raise ModelError(f"{path} is not a record of a run: {text}") from None
 
 

@@ -165,8 +165,8 @@ class Fit:
                 if is_last and length > NEAR:
                     raise ModelError(
                         f"the steps toward the best values have not come to an end after {MOST}: "
-                        "the record does not fit this robot, or the values to begin with are far "
-                        "off; free fewer parameters first"
+                        "the record does not fit this robot (look for a wrong unit or sign), or "
+                        "the values to begin with are far off; free fewer parameters first"
                     )
         # Errors are those after the last step.
         return self._fitted(*self._chained(couplings[-1], slopes))
@@ -219,8 +219,8 @@ class Fit:
             if not found.is_finite:
                 raise ModelError(
                     "the motion that is computed with these parameters leaves the recorded one: "
-                    "the record is that of another robot or run, or the values to begin with are "
-                    "far off"
+                    "a unit or a sign is wrong (rad, m, s, N m, N), the record is that of another "
+                    "robot or run, or the values to begin with are far off"
                 )
             slopes.append(found)
             chains.append(self._chain(index, found, coupling))

@@ -31,6 +31,10 @@ LARGER = 1.5
 ALIKE = 1.25
 """What is left is called other than the stated noise where it differs by more than this factor."""
 
+LARGE = 0.3
+"""If so large a part of how much a measurement varies is left, and not white, the record does not
+fit."""
+
 CONVERGED = 0.1
 """A last step below this, in deviations, is small beside the intervals."""
 
@@ -50,6 +54,7 @@ class Noise:
         correlation: The largest correlation of an error with the next one, by its absolute value.
         is_white: Whether that is what white noise has.
         is_least: Whether there is no noise, and what is left is that of computing.
+        share: The deviation relative to how much the columns vary.
     """
 
     unit: str
@@ -58,6 +63,7 @@ class Noise:
     correlation: float
     is_white: bool
     is_least: bool = False
+    share: float = 0.0
 
 
 @checked(ModelError)
@@ -159,7 +165,13 @@ class Identified:
 
     def remarks(self) -> list[str]:
         """What is to be known about the values."""
-        found = list[str]()
+        found = [
+            f"What is left of {name} is {noise.share:.2g} times as large as how much it varies: "
+            "the record does not fit this robot. Look for a wrong sign, a wrong unit, a column of "
+            "another joint, or something that the plant lacks."
+            for name, noise in self.noise.items()
+            if noise.share > LARGE and not noise.is_white
+        ]
         if self.undetermined:
             names = listed((" with ".join(each) for each in self.undetermined), 20)[1:-1]
             found.append(

@@ -181,17 +181,13 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
     """What is left of each group of measured columns, over all records."""
     groups = dict[tuple[str, str], list[FloatArray]]()
     one_of = dict[tuple[str, str], Channel]()
-    least = dict[tuple[str, str], float]()
+    spreads = dict[tuple[str, str], float]()
     for each, errors in zip(pieces, fitted.errors, strict=True):
-        measured_columns = each.data.values.T
-        for channel, column, values in zip(
-            each.data.channels, errors.T, measured_columns, strict=True
-        ):
+        for channel, column, spread in zip(each.data.channels, errors.T, each.spread, strict=True):
             own = column[np.isfinite(column)]
             groups.setdefault(channel.group, []).append(own)
             one_of[channel.group] = channel
-            spread = float(np.nanstd(values))
-            least[channel.group] = max(SMALLEST * spread, least.get(channel.group, 0.0))
+            spreads[channel.group] = max(float(spread), spreads.get(channel.group, 0.0))
     found, signals = {}, [signal for signal, _ in groups]
     for (signal, unit), columns in groups.items():
         correlations = [_correlation(column) for column in columns]
@@ -200,8 +196,9 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
         stated = stated_noise(loop, one_of[signal, unit])
-        is_white, is_least = bool(abs(largest) < limit), deviation < ROUNDED * least[signal, unit]
-        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
+        share = deviation / spreads[signal, unit]
+        is_white, is_least = bool(abs(largest) < limit), share < ROUNDED * SMALLEST
+        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least, share)
     return found
 
 

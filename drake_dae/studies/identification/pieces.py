@@ -276,7 +276,7 @@ class Pieces:
             if not is_rough.any() or (found.parts >= ENOUGH and is_rough.mean() <= FEW):
                 return found.without(is_rough)
             found, ends = finer, after
-            if found.parts >= ENOUGH and not np.isfinite(ends).any():
+            if found.parts >= ENOUGH and np.isfinite(ends).all(axis=1).mean() < 0.5:
                 break  # It is not the steps.
         return found
 

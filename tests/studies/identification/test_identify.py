@@ -240,6 +240,14 @@ def test_what_is_left_is_compared_with_the_noise_that_is_stated():
     assert float(found[1]) == pytest.approx(2.24, rel=0.1)
 
 
+@pytest.mark.parametrize("name", ["control", "constraint_force"])
+def test_a_wrong_sign_is_told(name):
+    loop, context, record = run_of((), *WALL)
+    other = changed(record, name, lambda s: Recorded(-s.values, s.signals))
+    remark = identify(loop, context, [other], ["link2.mass"]).remarks()[0]
+    assert re.search("does not fit this robot. Look for a wrong sign", remark)
+
+
 def test_biases_of_sensors_are_found():
     loop, context, record = run_of((), *WALL)
     signals = dict(record.signals)
