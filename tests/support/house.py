@@ -73,7 +73,12 @@ LONG = {
 }
 
 # Distributions whose modules bear another name.
-IMPORT_NAMES = {"cupy-cuda12x": "cupy", "drake": "pydrake", "pyyaml": "yaml"}
+IMPORT_NAMES = {
+    "cupy-cuda12x": "cupy",
+    "drake": "pydrake",
+    "mcap-ros2-support": "mcap_ros2",
+    "pyyaml": "yaml",
+}
 
 
 def declared_modules() -> set[str]:
