@@ -131,11 +131,11 @@ from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
 from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
-from .studies.identification.excitation import Excitation as Excitation
-from .studies.identification.excite import excite as excite
+from .studies.excitation.excitation import Excitation as Excitation
+from .studies.excitation.excite import excite as excite
+from .studies.excitation.promised import Promised as Promised
 from .studies.identification.identified import Identified as Identified
 from .studies.identification.identify import identify as identify
-from .studies.identification.promised import Promised as Promised
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations

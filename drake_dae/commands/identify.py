@@ -17,7 +17,7 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.studies.variations import parse_ranges
 
 if TYPE_CHECKING:
-    from drake_dae.studies.identification.excitation import Excitation
+    from drake_dae.studies.excitation.excitation import Excitation
     from drake_dae.studies.identification.identified import Identified
 
 
@@ -49,7 +49,7 @@ def _identify(options: argparse.Namespace) -> int:
 def _excite(options: argparse.Namespace) -> int:
     """Finds a motion and a force; returns the exit code, after a signal that of this."""
     # It loads SciPy's optimizers.
-    from drake_dae.studies.identification.excite import excite
+    from drake_dae.studies.excitation.excite import excite
 
     scenario = load_scenario(find_scenario(options.scenario), options.settings)
     found = excite(
@@ -104,11 +104,13 @@ def _noise(texts: list[str]) -> dict[str, float]:
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:
-    """The record of a run, or a log in CSV."""
+    """The record of a run, or a log in CSV or MCAP."""
     if path.suffix == ".csv":
         return Record.from_csv(path, columns)
+    if path.suffix == ".mcap":
+        return Record.from_mcap(path, columns)
     if columns is not None:
-        raise ModelError(f"--columns names those of a .csv, and '{path}' is none")
+        raise ModelError(f"--columns names those of a .csv or .mcap, and '{path}' is none")
     return load_run(path)
 
 

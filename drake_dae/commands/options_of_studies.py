@@ -90,14 +90,15 @@ def add_identify(commands: Any) -> None:
         help="find masses, friction, stiffness, places and biases from records",
         description="Finds parameters of the plant of a scenario from records of it, with 95 % "
         "intervals, what the records do not determine, and what is left of each measurement. The "
-        "plant alone is driven by the recorded controls; contacts stay closed or are compliant.",
+        "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
+        "closes or is struck are left out.",
     )
     found.add_argument(
         "records",
         nargs="+",
         type=path_option,
         metavar="RECORD",
-        help="a run's folder, .npz, or a .csv",
+        help="a run's folder, .npz, .csv or .mcap",
     )
     found.add_argument(
         "--free",
@@ -122,7 +123,8 @@ def add_identify(commands: Any) -> None:
         "--columns",
         type=path_option,
         metavar="FILE",
-        help='of a .csv: a YAML file with lines "column: control.joint1_motor"',
+        help='of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
+        '"/topic.field: control.joint1_motor"',
     )
     found.add_argument(
         "--out", type=path_option, metavar="FILE", help="a scenario with these values"

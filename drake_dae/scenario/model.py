@@ -100,6 +100,8 @@ def completed_model(
             scenario.control_weights or None,
             scenario.compiled,
         )
+    with at("parameters"):
+        model.dae = model.dae.with_values(scenario.parameters)
     with at("bounds"):
         model.dae = model.dae.with_bounds(scenario.bounds)
     return robot.completed, model

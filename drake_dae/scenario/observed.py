@@ -33,6 +33,7 @@ def law_robot(
             "task": scenario.task is not None,
             "compliances": scenario.compliances is not None,
             "control_weights": bool(scenario.control_weights),
+            "parameters": bool(scenario.parameters),
         }
         for key, is_given in refused.items():
             if is_given:

@@ -94,6 +94,9 @@ class Scenario:
             parameter "free_control" is zero unless it is in `exogenous`.
         actuation: Stages from the joints toward the motor; none for rigid joints.
         force_feedback: Whether the law uses its model's force or a measured one.
+        parameters: Parameter name -> its value for law and plant, in place of that of the robot's
+            file, a constraint or a stage; one number for all entries, or a list. `drake-dae
+            identify` writes it.
         plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
             number for all entries, or a list. To tilt a surface give it `rpy`.
         plant_payloads: Additional masses on the plant, unknown to the law's model.
@@ -158,6 +161,7 @@ class Scenario:
     control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
     force_feedback: Force = field(default_factory=parts.ModelForce)
+    parameters: dict[str, float | list[float]] = field(default_factory=dict)
     plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
     plant_payloads: list[Payload] = field(default_factory=list)
     plant_disturbances: list[DisturbanceForce] = field(default_factory=list)

@@ -20,6 +20,8 @@ _KINKS = {
 }
 """Operations of CasADi that are not smooth."""
 
+_LARGE = 2.0**200
+
 
 def length_of(vector: ca.SX) -> ca.SX:
     """The length of a column, with derivatives of all orders wherever it is not zero.
@@ -31,6 +33,14 @@ def length_of(vector: ca.SX) -> ca.SX:
     if len(entries) == 1:
         return ca.norm_2(ca.vertcat(0.6 * entries[0], 0.8 * entries[0]))
     return ca.norm_2(vector)
+
+
+def as_constant(expression: ca.SX) -> ca.SX:
+    """The same numbers, to 2^-200, whose derivatives are zero.
+
+    CasADi takes floor(x) for a constant, and so large a multiple of a number is a whole one.
+    """
+    return ca.floor(expression * _LARGE) / _LARGE
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,7 @@ LONG = {
 IMPORT_NAMES = {
     "cupy-cuda12x": "cupy",
     "drake": "pydrake",
+    "mcap-ros2-support": "mcap_ros2",
     "pycollada": "collada",
     "pyyaml": "yaml",
     "rerun-sdk": "rerun",

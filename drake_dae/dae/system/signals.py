@@ -185,7 +185,25 @@ def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parame
     Raises:
         ModelError: The bounds are not valid, or the value is outside of them.
     """
-    made = replace(parameter, bounds=bounds)
+    return _same_symbols(parameter, replace(parameter, bounds=bounds))
+
+
+def valued(parameter: Parameter, value: ArrayLike) -> Parameter:
+    """The same parameter, with the same symbols, with another default; a number for all entries.
+
+    Raises:
+        ModelError: The value does not fit, or is out of the parameter's range.
+    """
+    given = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
+    if given.shape not in ((1,), parameter.value.shape):
+        raise ModelError(
+            f"parameter '{parameter.name}' has {parameter.value.size} entries, got {value!r}"
+        )
+    full = np.broadcast_to(given, parameter.value.shape).copy()
+    return _same_symbols(parameter, replace(parameter, value=full))
+
+
+def _same_symbols(parameter: Parameter, made: Parameter) -> Parameter:
     # Expressions already contain the symbols of the derivatives.
     object.__setattr__(made, "derivatives", parameter.derivatives)
     return made

@@ -19,7 +19,7 @@ from drake_dae.dae.system.exogenous import Exogenous
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.scale import natural_scale, spread_about
 from drake_dae.dae.system.sharing import Sharing
-from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving
+from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving, valued
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -294,6 +294,25 @@ class DaeSystem:
             self,
             parameters=tuple(
                 bounded(p, bounds[p.name]) if p.name in bounds else p for p in self.parameters
+            ),
+        )
+
+    @checked(ModelError)
+    def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
+        """The same system with other defaults of some parameters.
+
+        Args:
+            values: Name -> its default, a number for all entries or one for each.
+
+        Raises:
+            ModelError: No parameter has that name, or a value does not fit.
+        """
+        for name in values:
+            self.parameter_slice(name)
+        return replace(
+            self,
+            parameters=tuple(
+                valued(p, values[p.name]) if p.name in values else p for p in self.parameters
             ),
         )
 

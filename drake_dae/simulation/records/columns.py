@@ -89,16 +89,16 @@ def _columns(
     """Place, name and unit of the columns that are read."""
     if len(head) == 1 and ";" in head[0]:
         raise ModelError(f"{path} separates its columns by ';'; separate them by ','")
-    parsed = [(i, *_parsed(text)) for i, text in enumerate(head)]
+    parsed = [(i, *name_and_unit(text)) for i, text in enumerate(head)]
     if columns is not None:
         known = {name: (i, unit) for i, name, unit in parsed}
-        missing = [name for name in columns if _parsed(name)[0] not in known]
+        missing = [name for name in columns if name_and_unit(name)[0] not in known]
         if missing:
             raise ModelError(f"{path} has no column {listed(missing)}; it has {listed(known, 30)}")
         chosen = []
         for given, meant in columns.items():
-            place, unit = known[_parsed(given)[0]]
-            name, said = _parsed(meant)
+            place, unit = known[name_and_unit(given)[0]]
+            name, said = name_and_unit(meant)
             chosen.append((place, name, said or unit))
         parsed = chosen
     names = [name for _, name, _ in parsed]
@@ -115,8 +115,8 @@ def _columns(
     return parsed
 
 
-def _parsed(text: str) -> tuple[str, str]:
-    """Name and unit."""
+def name_and_unit(text: str) -> tuple[str, str]:
+    """Name and unit of a column."""
     match = _LABEL.fullmatch(text)
     return (match[1], match[2] or "") if match else (text, "")
 

@@ -2,12 +2,9 @@
 
 import html
 import json
-import platform
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TypeVar
 
@@ -22,6 +19,8 @@ from drake_dae.errors import ModelError
 from drake_dae.files import open_file
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
+from drake_dae.simulation.records.mcap_log import read_mcap, write_mcap
+from drake_dae.simulation.records.versions import versions
 from drake_dae.systems.plants.contact_events import ContactEvent
 
 
@@ -129,12 +128,7 @@ class Record:
         if time is None:
             return self
         first = int(np.searchsorted(self.time, time, side="right"))
-        signals = {
-            name: recorded_values(each.values[first:], each.signals)
-            for name, each in self.signals.items()
-        }
-        events = tuple(event for event in self.events if event.time > time)
-        return type(self)(self.time[first:], signals, events, self.about)
+        return self._rows(slice(first, None), [one for one in self.events if one.time > time])
 
     def while_finite(self) -> Self:
         """The record up to the first time at which some signal is not finite."""
@@ -143,13 +137,15 @@ class Record:
         if not broken.any():
             return self
         count = int(np.argmax(broken))
+        last = self.time[count - 1] if count else -np.inf
+        return self._rows(slice(count), [one for one in self.events if one.time <= last])
+
+    def _rows(self, rows: slice, events: Sequence[ContactEvent]) -> Self:
         signals = {
-            name: recorded_values(each.values[:count], each.signals)
+            name: recorded_values(each.values[rows], each.signals)
             for name, each in self.signals.items()
         }
-        last = self.time[count - 1] if count else -np.inf
-        events = tuple(event for event in self.events if event.time <= last)
-        return type(self)(self.time[:count], signals, events, self.about)
+        return type(self)(self.time[rows], signals, tuple(events), self.about)
 
     def event_rows(self) -> list[dict[str, Any]]:
         """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
@@ -233,6 +229,25 @@ class Record:
         time, signals = read_csv(path, columns)
         return cls(time, {name: Recorded(*given) for name, given in signals.items()})
 
+    def to_mcap(self, path: str | Path) -> None:
+        """Writes the record as MCAP, which Foxglove shows: a channel of JSON for each signal.
+
+        Raises:
+            ModelError: mcap is not installed, or a time is negative.
+        """
+        signals = {n: (r.values, r.signals) for n, r in self.signals.items()}
+        write_mcap(path, self.time, signals, {"versions": versions(), **self.about})
+
+    @classmethod
+    def from_mcap(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
+        """Reads a file of `to_mcap`, or a robot's log in JSON or ROS 2's CDR; see `read_mcap`.
+
+        Raises:
+            ModelError: mcap is not installed, or the file cannot be read or lacks a column.
+        """
+        time, signals = read_mcap(path, columns)
+        return cls(time, {name: Recorded(*given) for name, given in signals.items()})
+
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
 
@@ -292,7 +307,7 @@ class Record:
                 about = json.loads(str(file["about"])) if "about" in file.files else {}
                 return cls(file["time"], signals, events_of_arrays(file), about)
         except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
-            text = getattr(error, "strerror", None) or error
+            text = getattr(error, "strerror", None) or f"{error}; it may be cut off or damaged"
             raise ModelError(f"{path} is not a record of a run: {text}") from None
 
 
@@ -310,15 +325,6 @@ def _needed(module: str, asked: str) -> Any:
         return import_module(module)
     except ImportError:
         raise ModelError(f"{asked} needs {module}: pip install 'drake_dae[data]'") from None
-
-
-def versions() -> dict[str, str]:
-    """The versions of the library, its dependencies and Python, and the machine."""
-    found = {"python": platform.python_version(), "machine": platform.platform()}
-    for name in ("drake_dae", "drake", "casadi", "numpy"):
-        with suppress(PackageNotFoundError):  # Drake may be built from its source.
-            found[name] = version(name)
-    return found
 
 
 R = TypeVar("R", bound=Record)

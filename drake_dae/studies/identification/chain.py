@@ -17,7 +17,7 @@ class Chain:
     (p,). They minimize the sum of squares of
 
         a_j dz_j + b_j dtheta + c_j               for each state, and
-        (f_j dz_j + g_j dtheta + d_j - dz_(j+1)) / s    between one and the next.
+        (f_j dz_j + g_j dtheta + d_j - dz_(j+1)) / s_j  between one and the next.
 
     States are eliminated one after the other by orthogonal transformations, as in a square root
     information filter. This remains accurate for unstable motions, and for states without any
@@ -45,7 +45,7 @@ class Chain:
         Args:
             own: [a_j, b_j, c_j], shape (J + 1, k, n + p + 1).
             moves: [f_j, g_j, d_j], shape (J, n, n + p + 1).
-            loose: s, shape (n,).
+            loose: s, shape (J, n).
             weak: The deviation of each entry of the first state without a measurement, shape (n,).
         """
         n, width = len(weak), own.shape[2]
@@ -64,9 +64,9 @@ class Chain:
                 break
             both = np.zeros((len(now) + n, 2 * n + p + 1))
             both[: len(now), :n], both[: len(now), 2 * n :] = now[:, :n], now[:, n:]
-            both[len(now) :, :n] = moves[j, :, :n] / loose[:, None]
-            both[len(now) :, n : 2 * n] = -np.diag(1.0 / loose)
-            both[len(now) :, 2 * n :] = moves[j, :, n:] / loose[:, None]
+            both[len(now) :, :n] = moves[j, :, :n] / loose[j][:, None]
+            both[len(now) :, n : 2 * n] = -np.diag(1.0 / loose[j])
+            both[len(now) :, 2 * n :] = moves[j, :, n:] / loose[j][:, None]
             found = triangle(both)
             rows[j] = found[:n]
             known = found[n:, n:]

@@ -42,7 +42,9 @@ class Driven:
     """The plant of a loop as functions of its state, its control and some of its parameters.
 
     A continuous plant takes steps of the classical Runge-Kutta method of fourth order, a discrete
-    one its own. The state of a discrete plant is all that it holds.
+    one its own. The state of a discrete plant is all that it holds. A plant whose contacts open
+    takes for each of them 1 or 0 as a further entry of its control: whether it is closed, which
+    stays as it is while the plant moves.
 
     Attributes:
         loop: The loop.
@@ -58,19 +60,14 @@ class Driven:
 
     def __post_init__(self) -> None:
         compiled, plant = self._compiled, self.loop.plant
-        if compiled.guards or compiled.watched:
-            raise ModelError(
-                f"{plant.dae.name}: contacts of a {type(plant).__name__} open and close, and a "
-                "record with impacts is not identified; take a plant whose contacts stay closed, "
-                "or a compliant one (plant: !CompliantContact)"
-            )
         if compiled.has_stepped:
             raise ModelError(
                 f"{plant.dae.name} is stepped by Drake's own contact, which has no derivatives; "
                 "take point contact as !CompliantContact"
             )
         own = sum(part.stop - part.start for system, part in compiled.held if system is plant)
-        if own != compiled.sizes["held"] or (own and compiled.sizes["state"]):
+        is_known = bool(plant.contacts) or not (own and compiled.sizes["state"])
+        if own != compiled.sizes["held"] or not is_known or compiled.watched:
             raise ModelError(f"{plant.dae.name}: a plant that samples cannot be identified")
 
     @cached_property
@@ -155,7 +152,8 @@ class Driven:
     @cached_property
     def _symbols(self) -> list[ca.SX]:
         sizes = self._compiled.sizes
-        control = self.loop.plant.GetInputPort("control").size()
+        plant = self.loop.plant
+        control = plant.GetInputPort("control").size() + len(plant.contacts)
         given = {"time": 1, "state": self.num_states, "unknown": len(self.places)}
         given |= {"control": control, "base": sizes["parameters"]}
         return [ca.SX.sym(name, size) for name, size in given.items()]
@@ -168,12 +166,13 @@ class Driven:
             values[self._unknown] = unknown
         for system, name, part in compiled.fixed:
             if name == "control" and system is self.loop.plant:
-                values[part] = control
+                values[part] = control[: part.stop - part.start]
         return self._given(time, state[: self.felt.start], values)
 
     def _given(self, time: ca.SX, state: ca.SX, values: ca.SX) -> list[ca.SX]:
-        nothing = ca.SX(0, 1)
-        return [time, *((nothing, state) if self.period else (state, nothing)), values]
+        control = self._symbols[3]
+        mode = control[control.numel() - len(self.loop.plant.contacts) :]
+        return [time, *((ca.SX(0, 1), state) if self.period else (state, mode)), values]
 
     def _force(self, given: Sequence[ca.SX]) -> ca.SX:
         """What a force sensor feels: the multipliers."""
@@ -257,7 +256,7 @@ class Driven:
             time: The times.
             moved: The states.
             unknown: The unknown parameters, shape (p,).
-            control: The controls, shape (j, q).
+            control: The controls, and then which contacts are closed, shape (j, q).
         """
         return self._called(self._shows, time, moved, unknown, control)
 

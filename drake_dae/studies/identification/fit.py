@@ -69,8 +69,11 @@ class Fitted:
         determined: Directions of the unknowns over their sizes that the data determine, in
             columns, shape (p, q).
         undetermined: Those that the data do not determine, shape (p, p - q).
-        errors: Measured minus computed columns of each record, shape (k, c).
+        errors: Measured minus computed columns of each record, shape (k, c); nan where none is
+            used.
         noise: The deviation of each column of each record, shape (c,).
+        last_step: The length of the last step: no unknown moved by more of its deviations.
+        left_out: How many steps between rows are not used, of how many.
     """
 
     values: FloatArray
@@ -79,6 +82,8 @@ class Fitted:
     undetermined: FloatArray
     errors: Sequence[FloatArray]
     noise: Sequence[FloatArray]
+    last_step: float
+    left_out: tuple[int, int]
 
 
 class Fit:
@@ -95,6 +100,7 @@ class Fit:
         sizes: Their sizes, shape (p,).
         lowest: Their lower bounds, -inf for none, shape (p,).
         strict: Which must stay above these, shape (p,).
+        noise: A guess of the deviation of each column of each record, shape (c,).
     """
 
     def __init__(
@@ -104,37 +110,51 @@ class Fit:
         sizes: FloatArray,
         lowest: FloatArray,
         strict: np.ndarray,
+        noise: Sequence[FloatArray] | None = None,
     ) -> None:
         self._pieces = [each.fine_enough(start) for each in pieces]
         self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
         self._strict = strict
-        self._states = [each.first_states.copy() for each in pieces]
-        self._spread = [_spread(each) for each in pieces]
+        self._states = [each.first_states.copy() for each in self._pieces]
+        self._spread = [each.spread for each in self._pieces]
         self._floor = FIRST_NOISE
-        self._noise = [FIRST_NOISE * spread for spread in self._spread]
+        guess = [FIRST_NOISE * spread for spread in self._spread] if noise is None else noise
+        self._noise = [each.copy() for each in guess]
         self._parts = np.eye(start.size), np.zeros((start.size, 0))
         self._before, self._least_left = (self._values, list(self._states)), np.inf
+        self._last = 0.0
 
-    def run(self) -> Fitted:
+    def run(self, couplings: Sequence[float] = COUPLINGS) -> Fitted:
         """Fits.
 
         Derivatives are computed anew only where steps with old ones do not become shorter, and at
         the end: they take most of the time.
+
+        Args:
+            couplings: How tightly pieces are joined, one after the other.
 
         Raises:
             ModelError: The computed motion leaves the recorded one, or the steps do not come to an
                 end.
         """
         known: list[Slopes] | None = None
-        for coupling in COUPLINGS:
+        for coupling in couplings:
+            is_last = coupling == COUPLINGS[-1]
             # Loose pieces follow noise, so that what is left says nothing of it.
-            self._floor = SMALLEST if coupling == COUPLINGS[-1] else FIRST_NOISE
+            self._floor = SMALLEST if is_last else FIRST_NOISE
             before, self._least_left = np.inf, np.inf
             for _ in range(MOST):
                 slopes, chains = self._shortened(coupling, known)
-                self._least_left = min(self._least_left, self._left(slopes))
-                length, is_new = self._step(slopes, chains), known is None
-                is_last = coupling == COUPLINGS[-1]
+                step, length = self._step(chains)
+                if known is not None and length > max(SHORTER * before, CLOSE):
+                    known = None
+                    slopes, chains = self._chained(coupling, None)
+                    step, length = self._step(chains)
+                expected = self._move(step, slopes, chains)
+                left = self._left([each.errors for each in slopes])
+                # Tighter pieces leave more, as it is expected.
+                self._least_left = max(min(self._least_left, left), self._left(expected))
+                is_new, self._last = known is None, length * max(1.0, np.sqrt(step.size))
                 known = slopes if length < SHORTER * before else None
                 before = length
                 if length < CLOSE:
@@ -145,10 +165,11 @@ class Fit:
                 if is_last and length > NEAR:
                     raise ModelError(
                         f"the steps toward the best values have not come to an end after {MOST}: "
-                        "the record does not fit this robot, or the values to begin with are far "
-                        "off; free fewer parameters first"
+                        "the record does not fit this robot (look for a wrong unit or sign), or "
+                        "the values to begin with are far off; free fewer parameters first"
                     )
-        return self._fitted(slopes, chains)
+        # Errors are those after the last step.
+        return self._fitted(*self._chained(couplings[-1], slopes))
 
     def known(self, noise: Sequence[FloatArray]) -> Fitted:
         """The information about the unknowns at the values and states to begin with.
@@ -175,7 +196,7 @@ class Fit:
         for _ in range(HALVED):
             with suppress(ModelError):
                 found = self._chained(coupling, known)
-                if self._left(found[0]) <= WORSE * self._least_left:
+                if self._left([each.errors for each in found[0]]) <= WORSE * self._least_left:
                     return found
             values, states = self._before
             self._values = (values + self._values) / 2.0
@@ -183,10 +204,10 @@ class Fit:
             self._states = [(one + other) / 2.0 for one, other in pairs]
         return self._chained(coupling, known)
 
-    def _left(self, slopes: Sequence[Slopes]) -> float:
+    def _left(self, errors: Sequence[FloatArray]) -> float:
         """The size of all errors, relative to how much their columns vary."""
-        pairs = zip(slopes, self._spread, strict=True)
-        return max(float(np.sqrt(np.nanmean(np.square(s.errors / spread)))) for s, spread in pairs)
+        pairs = zip(errors, self._spread, strict=True)
+        return max(float(np.sqrt(np.nanmean(np.square(e / spread)))) for e, spread in pairs)
 
     def _chained(
         self, coupling: float, known: Sequence[Slopes] | None
@@ -198,8 +219,8 @@ class Fit:
             if not found.is_finite:
                 raise ModelError(
                     "the motion that is computed with these parameters leaves the recorded one: "
-                    "the record is that of another robot or run, or the values to begin with are "
-                    "far off"
+                    "a unit or a sign is wrong (rad, m, s, N m, N), the record is that of another "
+                    "robot or run, or the values to begin with are far off"
                 )
             slopes.append(found)
             chains.append(self._chain(index, found, coupling))
@@ -216,24 +237,32 @@ class Fit:
         own = np.concatenate([found.reshape(count, -1, width), exact / EXACT], axis=1)
         defects = slopes.ends[:-1] - self._states[index][1:]
         moves = np.concatenate([slopes.of_ends[:-1], defects[..., None]], axis=2)
-        return Chain.of(own, moves, coupling * _known(own, scale), WEAK * scale)
+        # Across an event of a contact nothing is known of the next state.
+        is_joined = self._pieces[index].is_joined[:, None]
+        loose = np.where(is_joined, coupling * _known(own, scale), WEAK * scale)
+        return Chain.of(own, np.where(is_joined[..., None], moves, 0.0), loose, WEAK * scale)
 
-    def _step(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> float:
-        """Makes a step; returns its length in deviations of the unknowns."""
+    def _step(self, chains: Sequence[Chain]) -> tuple[FloatArray, float]:
+        """A step of the unknowns, and its length in their deviations."""
         scaled, rest = self._split(chains)
-        p = self._values.size
-        step = self._sizes * self._over_sizes(scaled, rest)
-        self._before = self._values, list(self._states)
+        step = self._over_sizes(scaled, rest)
+        length = float(np.linalg.norm(scaled @ step))
+        return self._sizes * step, length / max(1.0, np.sqrt(step.size))
+
+    def _move(
+        self, step: FloatArray, slopes: Sequence[Slopes], chains: Sequence[Chain]
+    ) -> list[FloatArray]:
+        """Makes a step; returns the errors that are expected after it."""
+        self._before, expected = (self._values, list(self._states)), []
         for index, chain in enumerate(chains):
             states, _ = chain.states(step)
             self._states[index] = self._states[index] + states
-            changes = np.concatenate([states, np.broadcast_to(step, (len(states), p))], 1)
-            after = slopes[index].errors + np.einsum(
-                "jkci,ji->jkc", slopes[index].of_errors, changes
-            )
-            self._set_noise(index, after)
+            both = np.concatenate([states, np.broadcast_to(step, (len(states), step.size))], 1)
+            own = slopes[index]
+            expected.append(own.errors + np.einsum("jkci,ji->jkc", own.of_errors, both))
+            self._set_noise(index, expected[-1])
         self._values = np.maximum(self._values + step, self._lowest)
-        return float(np.linalg.norm(scaled @ (step / self._sizes))) / max(1.0, np.sqrt(p))
+        return expected
 
     def _over_sizes(self, scaled: FloatArray, rest: FloatArray) -> FloatArray:
         """The step of the unknowns over their sizes, along what is determined and above bounds.
@@ -285,22 +314,20 @@ class Fit:
             both /= self._noise[index][:, None]
             flat = both.reshape(len(both), -1, p + 1)
             information.append(np.matmul(flat[..., :p].transpose(0, 2, 1), flat))
-            rows = self._pieces[index].data.times.size
-            errors.append(found.errors.reshape(-1, found.errors.shape[2])[:rows])
-        return Fitted(self._values, np.concatenate(information), *self._parts, errors, self._noise)
-
-
-def _spread(pieces: Pieces) -> FloatArray:
-    """How much the columns of each group vary; their size if they do not, or 1 if that is zero."""
-    values, groups = pieces.values, [channel.group for channel in pieces.data.channels]
-    found = np.ones(len(groups))
-    for group in set(groups):
-        own = [i for i, each in enumerate(groups) if each == group]
-        columns = values[:, :, own].reshape(-1, len(own))
-        varies = float(np.max(np.nanstd(columns, axis=0)))
-        size = float(np.sqrt(np.nanmean(np.square(columns))))
-        found[own] = max(varies, 1e-3 * size) or 1.0
-    return found
+            pieces = self._pieces[index]
+            left = np.full(pieces.data.values.shape, np.nan)
+            left[pieces.rows[:, :-1][pieces.is_own]] = found.errors[pieces.is_own]
+            errors.append(left)
+        cuts = [pieces.data.cut for pieces in self._pieces]
+        return Fitted(
+            self._values,
+            np.concatenate(information),
+            *self._parts,
+            errors,
+            self._noise,
+            self._last,
+            (sum(int(cut.sum()) for cut in cuts), sum(cut.size for cut in cuts)),
+        )
 
 
 def _known(own: FloatArray, scale: FloatArray) -> FloatArray:

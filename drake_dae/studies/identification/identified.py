@@ -31,6 +31,13 @@ LARGER = 1.5
 ALIKE = 1.25
 """What is left is called other than the stated noise where it differs by more than this factor."""
 
+LARGE = 0.3
+"""If so large a part of how much a measurement varies is left, and not white, the record does not
+fit."""
+
+CONVERGED = 0.1
+"""A last step below this, in deviations, is small beside the intervals."""
+
 STRONG = 0.95
 """Correlations of two unknowns above this are printed."""
 
@@ -47,6 +54,7 @@ class Noise:
         correlation: The largest correlation of an error with the next one, by its absolute value.
         is_white: Whether that is what white noise has.
         is_least: Whether there is no noise, and what is left is that of computing.
+        share: The deviation relative to how much the columns vary.
     """
 
     unit: str
@@ -55,6 +63,7 @@ class Noise:
     correlation: float
     is_white: bool
     is_least: bool = False
+    share: float = 0.0
 
 
 @checked(ModelError)
@@ -75,7 +84,13 @@ class Identified:
         bootstrap: The deviations by the bootstrap, shape (p,).
         undetermined: The parameters of each combination that the data do not determine.
         noise: Name of a measured signal, with its unit if it has several -> what is left of it.
-        errors: For each record the measured minus the computed columns, shape (k, c).
+        errors: For each record the measured minus the computed columns, shape (k, c); nan where
+            none is used.
+        last_step: How far it has converged: in the last step no parameter moved by more of its
+            deviations.
+        left_out: How many steps between rows are not used, of how many: those in which a contact
+            opens, closes or is struck, a control that is not held jumps as a phase of a task ends,
+            or friction at rest needs far shorter steps than the rest of the record.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -86,6 +101,8 @@ class Identified:
     undetermined: tuple[tuple[str, ...], ...]
     noise: Mapping[str, Noise]
     errors: Sequence[FloatArray] = field(repr=False)
+    last_step: float = 0.0
+    left_out: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         p = len(self.unknowns)
@@ -148,12 +165,32 @@ class Identified:
 
     def remarks(self) -> list[str]:
         """What is to be known about the values."""
-        found = list[str]()
+        found = [
+            f"What is left of {name} is {noise.share:.2g} times as large as how much it varies: "
+            "the record does not fit this robot. Look for a wrong sign, a wrong unit, a column of "
+            "another joint, or something that the plant lacks."
+            for name, noise in self.noise.items()
+            if noise.share > LARGE and not noise.is_white
+        ]
         if self.undetermined:
             names = listed((" with ".join(each) for each in self.undetermined), 20)[1:-1]
             found.append(
                 f"Not determined by the records, and left as before: {names}. A motion or a force "
                 "that depends on them is needed, or fewer free parameters."
+            )
+        found.append(
+            f"Converged: the last step moved no parameter by more than {self.last_step:.2g} of its "
+            "deviation."
+            if self.last_step <= CONVERGED
+            else f"Not quite converged: the last step was up to {self.last_step:.2g} deviations; "
+            "intervals are wrong by as much."
+        )
+        count, total = self.left_out
+        if count:
+            found.append(
+                f"Left out are {count} of {total} steps between rows, in which a contact opens, "
+                "closes or is struck, a phase of a task ends, or friction at rest needs far "
+                "shorter steps."
             )
         at_bound = [
             unknown.name
@@ -213,6 +250,8 @@ class Identified:
                 for unknown, value, interval, spread in rows
             },
             "undetermined": [list(names) for names in self.undetermined],
+            "last_step_in_deviations": self.last_step,
+            "steps_left_out": self.left_out[0],
             "noise": {name: vars(noise) for name, noise in self.noise.items()},
         }
 

@@ -1,6 +1,7 @@
 """Parameters of a plant from records of it."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -10,8 +11,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
+from drake_dae.studies.identification.channels import SAME, Channel
 from drake_dae.studies.identification.driven import Driven
-from drake_dae.studies.identification.fit import SMALLEST, Fit, Fitted
+from drake_dae.studies.identification.fit import COUPLINGS, SMALLEST, Fit, Fitted
 from drake_dae.studies.identification.identified import (
     WHITE,
     Identified,
@@ -20,7 +22,7 @@ from drake_dae.studies.identification.identified import (
     resampled,
     undetermined_names,
 )
-from drake_dae.studies.identification.measured import SAME, Channel, measured, measured_ports
+from drake_dae.studies.identification.measured import measured, measured_ports
 from drake_dae.studies.identification.pieces import Pieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
@@ -54,8 +56,9 @@ def identify(
     constraint forces, of its sensor if it has one. Velocities are not: they are estimated.
 
     Args:
-        loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`; contacts
-            stay closed, or are compliant.
+        loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`. Steps in
+            which an ideal contact opens, closes or is struck are left out, and pieces on both sides
+            are not joined; "mode" of the records says when contacts are closed.
         context: A context of its diagram; parameters begin with its values, and all others have
             them.
         records: The records, by name or in a list: of this plant under any law, with the signals
@@ -82,11 +85,20 @@ def identify(
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
     given = sizes, lowest, np.array([unknown.strict for unknown in unknowns.all])
-    near = start
-    if any(each.data.times.size > LONG for each in pieces):
-        near = Fit([each.first(BRIEF) for each in pieces], start, *given).run().values
-    fitted = Fit(pieces, near, *given).run()
+    fitted = _fitted(pieces, start, given)
     return _identified(loop, unknowns, start, sizes, pieces, fitted)
+
+
+def _fitted(
+    pieces: Sequence[Pieces], start: FloatArray, given: tuple[FloatArray, FloatArray, np.ndarray]
+) -> Fitted:
+    """The fit, of long records from a first estimate by their first rows."""
+    if all(each.data.times.size <= LONG for each in pieces):
+        return Fit(pieces, start, *given).run()
+    first = Fit([each.first(BRIEF) for each in pieces], start, *given).run(COUPLINGS[:-1])
+    with suppress(ModelError):  # From nearby, pieces need not be loose at first.
+        return Fit(pieces, first.values, *given, first.noise).run(COUPLINGS[-1:])
+    return Fit(pieces, first.values, *given).run()
 
 
 def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) -> Pieces:
@@ -99,6 +111,11 @@ def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) ->
     biases, delays = unknowns.of_sensors(data.channels)
     if (delays >= 0).any():
         _check_even(data.times, title)
+        if data.cut.any():
+            raise ModelError(
+                f"contacts of {title} open or close, or phases of its task end, and a delay is not "
+                "found across these; leave the delay out, or take a record between two of them"
+            )
     return Pieces(driven, data, biases, unknowns.num_sensed, delays=delays)
 
 
@@ -146,25 +163,31 @@ def _identified(
     bootstrap[np.isnan(np.diagonal(covariance))] = np.nan
     undetermined = undetermined_names(fitted.undetermined, names)
     noise = _noise(loop, pieces, fitted)
-    given = fitted.values, start, covariance, bootstrap, undetermined, noise, fitted.errors
-    return Identified(unknowns.all, *given)
+    return Identified(
+        unknowns.all,
+        fitted.values,
+        start,
+        covariance,
+        bootstrap,
+        undetermined,
+        noise,
+        fitted.errors,
+        fitted.last_step,
+        fitted.left_out,
+    )
 
 
 def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[str, Noise]:
     """What is left of each group of measured columns, over all records."""
     groups = dict[tuple[str, str], list[FloatArray]]()
     one_of = dict[tuple[str, str], Channel]()
-    least = dict[tuple[str, str], float]()
+    spreads = dict[tuple[str, str], float]()
     for each, errors in zip(pieces, fitted.errors, strict=True):
-        measured_columns = each.data.values.T
-        for channel, column, values in zip(
-            each.data.channels, errors.T, measured_columns, strict=True
-        ):
+        for channel, column, spread in zip(each.data.channels, errors.T, each.spread, strict=True):
             own = column[np.isfinite(column)]
             groups.setdefault(channel.group, []).append(own)
             one_of[channel.group] = channel
-            spread = float(np.nanstd(values))
-            least[channel.group] = max(SMALLEST * spread, least.get(channel.group, 0.0))
+            spreads[channel.group] = max(float(spread), spreads.get(channel.group, 0.0))
     found, signals = {}, [signal for signal, _ in groups]
     for (signal, unit), columns in groups.items():
         correlations = [_correlation(column) for column in columns]
@@ -173,8 +196,9 @@ def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[s
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
         stated = stated_noise(loop, one_of[signal, unit])
-        is_white, is_least = bool(abs(largest) < limit), deviation < ROUNDED * least[signal, unit]
-        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least)
+        share = deviation / spreads[signal, unit]
+        is_white, is_least = bool(abs(largest) < limit), share < ROUNDED * SMALLEST
+        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least, share)
     return found
 
 

@@ -8,50 +8,22 @@ import numpy as np
 from pydrake.systems.framework import OutputPort, System
 
 from drake_dae.arrays import FloatArray, listed
-from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
+from drake_dae.studies.identification.channels import (
+    SAME,
+    Channel,
+    channels_of,
+    columns_of,
+    is_position,
+)
 from drake_dae.studies.identification.driven import Driven
+from drake_dae.studies.identification.openings import cuts, modes
 from drake_dae.systems.blocks.traced import Traced
-
-SAME = 1e-3
-"""Times that differ by less than this part of a period are one."""
-
-LARGEST = 1e9
-"""A larger number in a record is that of a run that has diverged."""
 
 FEWEST = 20
 """A record needs at least so many rows."""
-
-
-@dataclass(frozen=True, eq=False)
-class Channel:
-    """A measured column, and what the plant has for it.
-
-    Attributes:
-        signal: The name of the signal in the record.
-        entry: Name and unit of the column.
-        port: The name of the output that it measures.
-        place: Its place in that output.
-        bias: What the sensor adds, where it is not unknown.
-    """
-
-    signal: str
-    entry: Signal
-    port: str
-    place: int
-    bias: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """Its name in reports."""
-        return f"{self.signal}.{self.entry.name}"
-
-    @property
-    def group(self) -> tuple[str, str]:
-        """Columns of one group have the same noise."""
-        return self.signal, self.entry.unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +32,14 @@ class Measured:
 
     Attributes:
         times: The times in s, shape (k,).
-        acting: u at the times, or just after them where the force is sampled then, shape (k, q).
+        acting: u at the times, or just after them where the force is sampled then, and for each
+            contact that opens 1 where it is closed, else 0, shape (k, q).
         controls: The same or, of a held control, that of the step from a row to the next one.
         states: A first guess of the states, shape (k, n).
         values: The measured columns, shape (k, c); nan where there is no measurement.
         channels: What they measure.
+        cut: Between which rows a contact opens, closes or is struck, or a control jumps, shape
+            (k - 1,).
     """
 
     times: FloatArray
@@ -73,6 +48,7 @@ class Measured:
     states: FloatArray
     values: FloatArray
     channels: Sequence[Channel]
+    cut: np.ndarray
 
     def first(self, count: int) -> Self:
         """The first rows alone."""
@@ -83,6 +59,7 @@ class Measured:
             controls=self.controls[:count],
             states=self.states[:count],
             values=self.values[:count],
+            cut=self.cut[: count - 1],
         )
 
 
@@ -118,7 +95,7 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
             "motion, or rows at fixed steps or samples"
         )
     _check_steps(record, plant.time_step, title)
-    columns = _columns(record, "control", plant.dae.control_signals, title)
+    columns = columns_of(record, "control", plant.dae.control_signals, title)
     missing = [s.name for s in plant.dae.control_signals if s.name not in columns]
     if missing:
         raise ModelError(
@@ -130,7 +107,7 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
     if driven.hold is not None:  # A row of a continuous plant has what led to it.
         is_after = _acts_before(driven.hold, record.time, driven.period) | (not driven.period)
         controls = np.where(is_after[:, None], after, acting)
-    channels, values = _channels(record, loop, title)
+    channels, values = channels_of(record, loop, title)
     if not channels:
         raise ModelError(
             f"{title} has neither positions (signal 'state' or of the encoders) nor forces "
@@ -139,7 +116,16 @@ def measured(record: Record, driven: Driven, title: str) -> Measured:
     if driven.hold is not None and any(each.signal == "measured_force" for each in channels):
         acting = controls  # A sensor samples what the control makes that has just been set.
     states = _first_states(record, driven, channels, values, title)
-    found = Measured(record.time, acting, controls, states, np.column_stack(values), channels)
+    mode = modes(record, plant, title)
+    acting, controls = np.hstack([acting, mode]), np.hstack([controls, mode])
+    cut = cuts(record, mode, driven.hold is not None)
+    if cut.all():
+        raise ModelError(
+            f"{title} has a contact that opens, closes or is struck between all of its rows; "
+            "record more rows"
+        )
+    given = np.column_stack(values), channels, cut
+    found = Measured(record.time, acting, controls, states, *given)
     # The last row has the control and the sample of its instant, others those before it.
     steps = float(np.diff(record.time)[-1]) / driven.period if driven.period else 1.0
     is_last = abs(steps - round(steps)) > SAME or (driven.hold is not None and not driven.period)
@@ -176,123 +162,6 @@ def _acts_before(hold: System, times: FloatArray, period: float) -> np.ndarray:
     return found
 
 
-def _columns(
-    record: Record, name: str, expected: Sequence[Signal], title: str
-) -> dict[str, FloatArray]:
-    """The columns of a signal by the plant's names.
-
-    Raises:
-        ModelError: The record has other names or units, or values that are not finite.
-    """
-    if name not in record.signals:
-        return {}
-    units = {signal.name: signal.unit for signal in expected}
-    found, recorded = {}, record.signals[name]
-    for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
-        if signal.name not in units:
-            raise ModelError(
-                f"{title} has '{name}.{signal.name}', and that of this robot has {listed(units)}: "
-                "it is the record of another robot, or a column is misnamed"
-            )
-        if signal.unit and signal.unit != units[signal.name]:
-            raise ModelError(
-                f"{title} has '{name}.{signal.name}' in {signal.unit}; it must be in "
-                f"{units[signal.name] or '1'}"
-            )
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values)))
-            raise ModelError(
-                f"{title}: '{name}.{signal.name}' is not a number at {record.time[row]:g} s; leave "
-                "out the rows from there on"
-            )
-        if np.abs(values).max(initial=0.0) > LARGEST:
-            row = int(np.argmax(np.abs(values) > LARGEST))
-            raise ModelError(
-                f"{title}: '{name}.{signal.name}' is {values[row]:.2g} at {record.time[row]:g} s: "
-                "the run has failed there; leave out the rows shortly before and from there on"
-            )
-        found[signal.name] = values
-    return found
-
-
-def is_position(signal: Signal) -> bool:
-    """Whether a state is measured: all but those that are per second, such as velocities."""
-    return "/s" not in signal.unit
-
-
-def _channels(
-    record: Record, loop: ClosedLoop, title: str
-) -> tuple[list[Channel], list[FloatArray]]:
-    plant, channels, values = loop.plant, list[Channel](), list[FloatArray]()
-    # Positions, as encoders show them or as they are.
-    name, biases = "state", np.zeros(plant.dae.num_states)
-    if loop.encoders is not None:
-        name = "measured_state" if "measured_state" in loop.signals else "estimated_state"
-        given = np.asarray(loop.encoders.sensor.encoders.position_bias, dtype=float)
-        count = plant.robot("an encoder").links.q.numel()
-        biases[:count] = given
-    if name not in record.signals:
-        name, biases = "state", 0.0 * biases
-    columns = _columns(record, name, plant.dae.state_signals, title)
-    period = loop.encoders.sensor.period if loop.encoders is not None and name != "state" else 0.0
-    for place, signal in enumerate(plant.dae.state_signals):
-        if signal.name in columns and is_position(signal):
-            channels.append(Channel(name, signal, "state", place, float(biases[place])))
-            # Between samples a record repeats the last one.
-            column = columns[signal.name]
-            values.append(_at_samples(record.time, column, period) if period else column)
-    # Forces.
-    sensor = loop.sensor
-    is_sensed = sensor is not None and "measured_force" in record.signals
-    name = "measured_force" if is_sensed else "constraint_force"
-    signals = plant.dae.constraint_input_signals if is_sensed else plant.dae.force_signals
-    columns = _columns(record, name, signals, title)
-    for place, signal in enumerate(signals):
-        if signal.name not in columns:
-            continue
-        column, port, bias = columns[signal.name], "constraint_force", 0.0
-        if is_sensed and sensor is not None:
-            bias, port = float(sensor.bias[place]), "felt_force" if sensor.time_constant else port
-            if sensor.sample_period:
-                # A discrete plant has stepped when the sensor samples, a lag has not.
-                later = int(plant.time_step > 0.0 and not sensor.time_constant)
-                column = _sampled(record.time, column, sensor.sample_period, later)
-            elif loop.noise is not None:
-                # It is drawn anew after each time constant, and rows between have the same one.
-                drawn = np.ceil(record.time / sensor.time_constant - SAME)
-                column = np.where(np.diff(drawn, append=np.inf) > 0.0, column, np.nan)
-        channels.append(Channel(name, signal, port, place, bias))
-        values.append(column)
-    return channels, values
-
-
-def _at_samples(times: FloatArray, column: FloatArray, period: float) -> FloatArray:
-    """A column at the samples, and nan between them."""
-    is_sample = np.abs(times - period * np.round(times / period)) < SAME * period
-    return np.where(is_sample, column, np.nan)
-
-
-def _sampled(times: FloatArray, column: FloatArray, period: float, later: int) -> FloatArray:
-    """What a sensor that samples has measured, at the rows of these samples; nan elsewhere.
-
-    A row has the last sample before it.
-
-    Args:
-        times: The times of the rows in s.
-        column: What the rows have.
-        period: The time between samples in s.
-        later: How many rows after the time of a sample its force is found.
-    """
-    found = np.full_like(column, np.nan)
-    taken = (np.ceil((times - SAME * period) / period) - 1.0) * period
-    rows = np.searchsorted(times, taken - SAME * period)
-    is_there = np.abs(times[np.minimum(rows, times.size - 1)] - taken) < SAME * period
-    good = is_there & (rows + later < times.size)
-    # Of the rows with one sample the first one: the last row of a record may have the next.
-    found[rows[good][::-1] + later] = column[good][::-1]
-    return found
-
-
 def _first_states(
     record: Record,
     driven: Driven,
@@ -306,7 +175,7 @@ def _first_states(
     signals, first = plant.dae.state_signals, driven.state_of_plant.start
     known = dict[str, FloatArray]()
     for name in ("estimated_state", "measured_state", "state"):
-        known |= _columns(record, name, signals, title)
+        known |= columns_of(record, name, signals, title)
     for channel, column in zip(channels, values, strict=True):
         if channel.port == "state" and "state" not in record.signals:
             known[channel.entry.name] = _filled(record.time, column) - channel.bias

@@ -53,8 +53,9 @@ def identify_scenario(
         free: As of `identify`.
 
     Returns:
-        The result, and the scenario whose plant and sensors have the values that were found, except
-        for those that are not determined, delays, and biases of sensors that it does not have.
+        The result, and the scenario whose law, plant and sensors have the values that were found
+        (for the law of a cascade its plant alone), except for those that are not determined,
+        delays, and biases of sensors that it does not have.
 
     Raises:
         ModelError: As of `identify`.
@@ -83,7 +84,9 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
     ):
         if np.isfinite(deviation):
             values.setdefault(unknown.parameter, {})[unknown.entry] = float(value)
-    numbers = dict(scenario.plant_parameters)
+    # A cascade does not know `parameters`.
+    key = "plant_parameters" if scenario.is_cascade else "parameters"
+    numbers = dict(getattr(scenario, key))
     # No sensor of a scenario has a delay, and there may be none.
     left_out = {FORCE_DELAY, POSITION_DELAY}
     left_out |= set() if scenario.force_feedback.is_measured else {FORCE_BIAS}
@@ -107,7 +110,7 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
             changes[name] = value
         else:
             numbers[name] = value
-    return _changed(replace(scenario, plant_parameters=numbers), changes)
+    return _changed(scenario, {**changes, key: numbers})
 
 
 def _changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:

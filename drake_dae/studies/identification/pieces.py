@@ -1,5 +1,6 @@
 """A record cut into short pieces, each from a state of its own: multiple shooting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from drake_dae.arrays import FloatArray
 from drake_dae.studies.identification.driven import Driven, Moved
 from drake_dae.studies.identification.measured import Measured
+from drake_dae.studies.identification.openings import parts
 
 DURATION, ROWS = 0.01, 10
 """A piece lasts so long in s, and has at least so many rows: in stiff contact a longer one loses
@@ -18,12 +20,12 @@ the contact where states and parameters are wrong."""
 ACCURATE = 1e-7
 """Steps are halved until the end of a piece changes by less than this, relative to the state."""
 
-SOME = 8
-"""Steps are compared in so many pieces."""
-
 MOST_PARTS, ENOUGH = 64, 8
 """A step between two rows is divided into at most so many, and what is not finite with the latter
 is not with more."""
+
+FEW = 0.1
+"""If no larger share of the pieces needs more than `ENOUGH`, these are left out."""
 
 
 class Slopes(NamedTuple):
@@ -72,20 +74,38 @@ class Pieces:
         return max(ROWS, round(DURATION / float(np.median(np.diff(self.data.times)))))
 
     @cached_property
+    def _parts(self) -> Sequence[tuple[int, int]]:
+        """First and last rows of what lies between events of contacts."""
+        return parts(self.data.cut)
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        """First row of each piece, and the last one of its part, shape (j, 2)."""
+        k = self.length
+        return np.array(
+            [(i, last) for first, last in self._parts for i in range(first, last + 1, k)]
+        )
+
+    @cached_property
     def rows(self) -> np.ndarray:
         """The rows of each piece and the first one of the next, shape (j, k + 1).
 
-        Behind the last row it is repeated.
+        Behind the last row of a part it is repeated.
         """
-        count, k = self.data.times.size, self.length
-        firsts = np.arange(0, count, k)
-        return np.minimum(firsts[:, None] + np.arange(k + 1), count - 1)
+        firsts, lasts = self._ends.T
+        return np.minimum(firsts[:, None] + np.arange(self.length + 1), lasts[:, None])
 
     @cached_property
-    def _is_own(self) -> np.ndarray:
-        """Which entries of `rows` are rows of that piece alone."""
-        k, count = self.length, self.data.times.size
-        return np.arange(0, count, k)[:, None] + np.arange(k) < count
+    def is_own(self) -> np.ndarray:
+        """Which of `rows` but the last are rows of that piece, shape (j, k)."""
+        firsts, lasts = self._ends.T
+        return firsts[:, None] + np.arange(self.length) <= lasts[:, None]
+
+    @cached_property
+    def is_joined(self) -> np.ndarray:
+        """Which pieces end where the next one begins, shape (j - 1,)."""
+        firsts, lasts = self._ends.T
+        return (lasts[:-1] == lasts[1:]) & (np.diff(firsts) == self.length)
 
     @cached_property
     def first_states(self) -> FloatArray:
@@ -96,7 +116,23 @@ class Pieces:
     def values(self) -> FloatArray:
         """The measured columns less known biases, shape (j, k, c); nan behind the last row."""
         found: FloatArray = self._measured[self.rows[:, :-1]]
-        found[~self._is_own] = np.nan
+        found[~self.is_own] = np.nan
+        return found
+
+    @cached_property
+    def spread(self) -> FloatArray:
+        """How much the columns of each group vary, shape (c,).
+
+        Their size if they do not vary, and 1 if that is zero.
+        """
+        groups = [channel.group for channel in self.data.channels]
+        found = np.ones(len(groups))
+        for group in set(groups):
+            own = [i for i, each in enumerate(groups) if each == group]
+            columns = self.values[:, :, own].reshape(-1, len(own))
+            varies = float(np.max(np.nanstd(columns, axis=0)))
+            size = float(np.sqrt(np.nanmean(np.square(columns))))
+            found[own] = max(varies, 1e-3 * size) or 1.0
         return found
 
     @cached_property
@@ -128,13 +164,15 @@ class Pieces:
         stages = 2 * self.parts + 1
         if self.driven.hold is not None:
             return [stages * [controls[rows[:, k]]] for k in range(self.length)]
-        smooth = CubicSpline(times, controls)
-        shares = np.linspace(0.0, 1.0, stages)
         begins, ends = times[rows[:, :-1]], times[rows[:, 1:]]
-        return [
-            [smooth(begins[:, k] + share * (ends[:, k] - begins[:, k])) for share in shares]
-            for k in range(self.length)
-        ]
+        shares = np.linspace(0.0, 1.0, stages)[:, None, None]
+        moments = np.moveaxis(begins + shares * (ends - begins), 2, 0)  # (k, stages, j)
+        found = np.zeros((*moments.shape, controls.shape[1]))
+        for first, last in self._parts:
+            own = self._ends[:, 1] == last
+            smooth = CubicSpline(times[first : last + 1], controls[first : last + 1])
+            found[:, :, own] = smooth(moments[:, :, own])
+        return [list(each) for each in found]
 
     def slopes(
         self, states: FloatArray, unknown: FloatArray, known: Slopes | None = None
@@ -186,7 +224,7 @@ class Pieces:
         found, (rows, _) = self.values.copy(), self._shifts(sensed)
         for column in np.flatnonzero(rows):
             places = self.rows[:, :-1] + rows[column]
-            is_there = (places >= 0) & (places < self.data.times.size) & self._is_own
+            is_there = (places >= 0) & (places < self.data.times.size) & self.is_own
             raw = self._measured[np.clip(places, 0, self.data.times.size - 1), column]
             found[:, :, column] = np.where(is_there, raw, np.nan)
         return found
@@ -222,31 +260,42 @@ class Pieces:
         return replace(self, data=self.data.first(count))
 
     def fine_enough(self, unknown: FloatArray) -> "Pieces":
-        """The same with steps so short that the ends of pieces are accurate."""
+        """The same with steps so short that the ends of pieces are accurate.
+
+        A few pieces that need far shorter steps than the others, as in contact with friction at
+        rest, are left out.
+        """
         if self.driven.period:
             return self
-        few = np.unique(np.linspace(0, len(self.rows) - 1, SOME).astype(int))
-        found, ends = self, self._some_ends(few, unknown)
+        sizes = np.maximum(self.driven.scale, np.abs(self.first_states).max(axis=0))
+        found, ends = self, self._found_ends(unknown)
         while found.parts < MOST_PARTS:
             finer = replace(self, parts=2 * found.parts)
-            after = finer._some_ends(few, unknown)
-            sizes = np.maximum(self.driven.scale, np.abs(after).max(axis=0))
-            change = np.abs(after - ends) / sizes
-            if np.isfinite(change).all() and change.max() < ACCURATE:
-                return found
+            after = finer._found_ends(unknown)
+            is_rough = ~((np.abs(after - ends) / sizes).max(axis=1) < ACCURATE)
+            if not is_rough.any() or (found.parts >= ENOUGH and is_rough.mean() <= FEW):
+                return found.without(is_rough)
             found, ends = finer, after
-            if found.parts >= ENOUGH and not np.isfinite(ends).all():
+            if found.parts >= ENOUGH and np.isfinite(ends).all(axis=1).mean() < 0.5:
                 break  # It is not the steps.
         return found
 
-    def _some_ends(self, pieces: np.ndarray, unknown: FloatArray) -> FloatArray:
-        """The ends of some pieces."""
+    def without(self, pieces: np.ndarray) -> "Pieces":
+        """The same without some pieces."""
+        if not pieces.any():
+            return self
+        cut = self.data.cut.copy()
+        for first, after in self.rows[pieces][:, [0, -1]]:
+            cut[max(first - 1, 0) : after] = True
+        return replace(self, data=replace(self.data, cut=cut))
+
+    def _found_ends(self, unknown: FloatArray) -> FloatArray:
+        """The ends of pieces from their guessed states."""
         of_plant = unknown[: unknown.size - self.num_sensed]
-        times = self.data.times[self.rows][pieces]
-        moved = Moved(self.first_states[pieces])
-        for k, controls in enumerate(self._controls):
-            own = [each[pieces] for each in controls]
-            moved = self.driven.step(times[:, k], times[:, k + 1], moved, of_plant, own)
+        times, moved = self.data.times[self.rows], Moved(self.first_states)
+        with np.errstate(all="ignore"):
+            for k, controls in enumerate(self._controls):
+                moved = self.driven.step(times[:, k], times[:, k + 1], moved, of_plant, controls)
         return moved.values
 
 

@@ -11,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.studies.identification.measured import Channel
+from drake_dae.studies.identification.channels import Channel
 
 FORCE_BIAS, POSITION_BIAS = "force.bias", "position.bias"
 """What sensors add to forces and to positions."""

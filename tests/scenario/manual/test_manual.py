@@ -21,7 +21,8 @@ PURE = {
     ("Observer", "largest_friction"),
     ("Scenario", "control_weights"),
     ("Scenario", "compliances"),
-    ("Scenario", "plant_parameters"),  # Each has its own.
+    ("Scenario", "parameters"),  # Each has its own.
+    ("Scenario", "plant_parameters"),  # Likewise.
     ("!ImplicitSurface", "parameters"),  # Likewise.
     ("!Plane", "normal"),
     ("!Sphere", "axis"),

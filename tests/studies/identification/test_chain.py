@@ -13,7 +13,8 @@ def random_chain(seed, growth=1.0):
     own = random.normal(size=(LAST + 1, 7, STATES + COMMON + 1))
     moves = random.normal(size=(LAST, STATES, STATES + COMMON + 1))
     moves[:, :, :STATES] *= growth
-    return own, moves, np.array([0.1, 1.0, 0.3]), np.array([1.0, 10.0, 2.0])
+    loose = np.array([0.1, 1.0, 0.3]) * random.uniform(0.5, 2.0, (LAST, 1))
+    return own, moves, loose, np.array([1.0, 10.0, 2.0])
 
 
 def dense(own, moves, loose, weak):
@@ -30,7 +31,7 @@ def dense(own, moves, loose, weak):
         row[:, j * STATES : (j + 1) * STATES] = block[:, :STATES]
         row[:, (j + 1) * STATES : (j + 2) * STATES] = -np.eye(STATES)
         row[:, -COMMON - 1 :] = block[:, STATES:]
-        rows.append(row / loose[:, None])
+        rows.append(row / loose[j][:, None])
     first = np.zeros((STATES, total + 1))
     first[:, :STATES] = np.diag(1.0 / weak)
     every = np.vstack([*rows, first])

@@ -49,7 +49,8 @@ def test_the_command_finds_what_the_plant_has_and_writes_its_scenario(run, tmp_p
     printed = capsys.readouterr().out
     assert str(out) in printed
     scenario = load_scenario(out)
-    assert scenario.plant_parameters["link2.mass"] == pytest.approx(6.6, rel=1e-6)
+    assert scenario.parameters["link2.mass"] == pytest.approx(6.6, rel=1e-6)
+    assert not scenario.plant_parameters
     # The law's mass is where the search began.
     (row,) = [line.split() for line in printed.splitlines() if line.startswith("link2.mass")]
     assert row[-2:] == ["6", "kg"]
@@ -60,7 +61,18 @@ def test_a_bias_of_a_sensor_that_the_scenario_does_not_have_is_told_alone(run, t
     free = ["--free", "link2.mass,force.bias,position.bias[0]", "--out", str(out)]
     assert main(["identify", str(run), *free]) == 0
     assert "force.bias" in capsys.readouterr().out
-    assert set(load_scenario(out).plant_parameters) == {"link2.mass"}
+    assert set(load_scenario(out).parameters) == {"link2.mass"}
+
+
+def test_a_law_that_knows_what_was_found_follows_its_prediction(run, tmp_path):
+    """The force of the law's own model is without error, that of the other one 2 N off."""
+    largest = [np.abs(Record.load(run / "record.npz")["tracking_error"][-1, 1])]
+    again = ["simulate", "two_link_wall", "--out", str(tmp_path), *BARE, "--rollout"]
+    assert main([*again, "--set=parameters={link2.mass: 6.6}"]) == 0
+    largest.append(np.abs(Record.load(tmp_path / "record.npz")["tracking_error"][-1, 1]))
+    assert largest[0] > 1.0
+    assert largest[1] < 1e-9
+    assert main([*again, "--set=parameters={link2.mass: [1, 2]}"]) == 1
 
 
 def test_a_log_with_names_of_its_own_is_enough(run, log, capsys):

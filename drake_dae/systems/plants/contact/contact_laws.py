@@ -7,6 +7,7 @@ import casadi as ca
 
 from drake_dae.systems.plants.contact.point_contact import PointContact
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+from drake_dae.trace.smoothness import as_constant
 
 ITERATIONS = 10
 """The number of Newton steps for the velocities of contacts. Of random problems far beyond those
@@ -97,7 +98,9 @@ def contact_step(
     "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
     solves for v_c to round-off, by a primal-dual Newton's method: with p = v_t / |v_t|_s as
     unknowns of their own it also converges where the sliding direction turns (Chan, Golub and Mulet
-    1999).
+    1999). Its last step alone has derivatives, with the velocity before it and the matrix taken for
+    constants: those of first order are then the ones of the solution, by the theorem of the
+    implicit function, with a third of the operations that those of all steps take.
 
     Args:
         contacts: The contacts.
@@ -129,10 +132,12 @@ def contact_step(
 
     velocity = before
     shares = ca.vertcat(*(law.share(before[p]) for p, law in laws))
-    for _ in range(ITERATIONS):
+    for left in reversed(range(ITERATIONS)):
         slope = ca.diagcat(*(law.slope(velocity[p], shares[p]) for p, law in laws))
-        matrix = Factorization(ca.SX.eye(3 * count) - ca.mtimes(delassus, slope))
-        change = -matrix.solve(residual(velocity))
+        matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
+        if not left:
+            velocity, matrix = as_constant(velocity), as_constant(matrix)
+        change = -Factorization(matrix).solve(residual(velocity))
         moved = [law.next_share(velocity[p], shares[p], change[p]) for p, law in laws]
         velocity, shares = velocity + change, ca.vertcat(*moved)
     slack = SOLVED * ca.fmax(ca.norm_2(wanted), AT_REST) - ca.norm_2(residual(velocity))

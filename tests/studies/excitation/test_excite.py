@@ -17,7 +17,7 @@ from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.identification.promised import Trials
+from drake_dae.studies.excitation.promised import Trials
 
 MASS, SIGMA, FASTEST, DURATION, STEP = 2.5, 1e-4, 1.0, 2.0, 0.01
 

@@ -11,7 +11,7 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.studies.identification.promised import Criterion, Promised
+from drake_dae.studies.excitation.promised import Criterion, Promised
 
 _MEANING: Mapping[Criterion, str] = {
     "D": "D, the geometric mean of relative deviations along the axes of their ellipsoid",

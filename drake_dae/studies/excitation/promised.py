@@ -19,6 +19,7 @@ from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits, shortfalls
+from drake_dae.studies.identification.channels import Channel
 from drake_dae.studies.identification.driven import Driven
 from drake_dae.studies.identification.fit import Fit
 from drake_dae.studies.identification.identified import (
@@ -27,7 +28,7 @@ from drake_dae.studies.identification.identified import (
     undetermined_names,
 )
 from drake_dae.studies.identification.identify import pieces_of, stated_noise
-from drake_dae.studies.identification.measured import Channel, measured_ports
+from drake_dae.studies.identification.measured import measured_ports
 from drake_dae.studies.identification.unknowns import Unknown, Unknowns
 from drake_dae.studies.runs import Runner
 from drake_dae.studies.structures import study_data

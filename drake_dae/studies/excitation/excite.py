@@ -17,8 +17,8 @@ from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
-from drake_dae.studies.identification.excitation import Excitation
-from drake_dae.studies.identification.promised import Criterion, Trial, Trials
+from drake_dae.studies.excitation.excitation import Excitation
+from drake_dae.studies.excitation.promised import Criterion, Trial, Trials
 
 SPREAD = 0.4
 """This part of the runs is spread over the ranges; the others go on from the best of them."""

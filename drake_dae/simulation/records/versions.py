@@ -1,0 +1,14 @@
+"""The versions of what made a record."""
+
+import platform
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+
+
+def versions() -> dict[str, str]:
+    """The versions of the library, its dependencies and Python, and the machine."""
+    found = {"python": platform.python_version(), "machine": platform.platform()}
+    for name in ("drake_dae", "drake", "casadi", "numpy"):
+        with suppress(PackageNotFoundError):  # Drake may be built from its source.
+            found[name] = version(name)
+    return found

@@ -1,0 +1,1 @@
+"""Motions and forces that determine parameters best."""

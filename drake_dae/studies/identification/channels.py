@@ -1,0 +1,165 @@
+"""The measured columns of a record, and what a plant has for them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, listed
+from drake_dae.dae.system.signals import Signal
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.simulation.records.record import Record
+
+SAME = 1e-3
+"""Times that differ by less than this part of a period are one."""
+
+LARGEST = 1e9
+"""A larger number in a record is that of a run that has diverged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """A measured column, and what the plant has for it.
+
+    Attributes:
+        signal: The name of the signal in the record.
+        entry: Name and unit of the column.
+        port: The name of the output that it measures.
+        place: Its place in that output.
+        bias: What the sensor adds, where it is not unknown.
+    """
+
+    signal: str
+    entry: Signal
+    port: str
+    place: int
+    bias: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Its name in reports."""
+        return f"{self.signal}.{self.entry.name}"
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """Columns of one group have the same noise."""
+        return self.signal, self.entry.unit
+
+
+def columns_of(
+    record: Record, name: str, expected: Sequence[Signal], title: str
+) -> dict[str, FloatArray]:
+    """The columns of a signal by the plant's names.
+
+    Raises:
+        ModelError: The record has other names or units, or values that are not finite.
+    """
+    if name not in record.signals:
+        return {}
+    units = {signal.name: signal.unit for signal in expected}
+    found, recorded = {}, record.signals[name]
+    for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
+        if signal.name not in units:
+            raise ModelError(
+                f"{title} has '{name}.{signal.name}', and that of this robot has {listed(units)}: "
+                "it is the record of another robot, or a column is misnamed"
+            )
+        if signal.unit and signal.unit != units[signal.name]:
+            raise ModelError(
+                f"{title} has '{name}.{signal.name}' in {signal.unit}; it must be in "
+                f"{units[signal.name] or '1'}"
+            )
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values)))
+            raise ModelError(
+                f"{title}: '{name}.{signal.name}' is not a number at {record.time[row]:g} s; leave "
+                "out the rows from there on"
+            )
+        if np.abs(values).max(initial=0.0) > LARGEST:
+            row = int(np.argmax(np.abs(values) > LARGEST))
+            raise ModelError(
+                f"{title}: '{name}.{signal.name}' is {values[row]:.2g} at {record.time[row]:g} s: "
+                "the run has failed there; leave out the rows shortly before and from there on"
+            )
+        found[signal.name] = values
+    return found
+
+
+def is_position(signal: Signal) -> bool:
+    """Whether a state is measured: all but those that are per second, such as velocities."""
+    return "/s" not in signal.unit
+
+
+def channels_of(
+    record: Record, loop: ClosedLoop, title: str
+) -> tuple[list[Channel], list[FloatArray]]:
+    """The measured columns, and their values: nan where there is no measurement."""
+    plant, channels, values = loop.plant, list[Channel](), list[FloatArray]()
+    # Positions, as encoders show them or as they are.
+    name, biases = "state", np.zeros(plant.dae.num_states)
+    if loop.encoders is not None:
+        name = "measured_state" if "measured_state" in loop.signals else "estimated_state"
+        given = np.asarray(loop.encoders.sensor.encoders.position_bias, dtype=float)
+        count = plant.robot("an encoder").links.q.numel()
+        biases[:count] = given
+    if name not in record.signals:
+        name, biases = "state", 0.0 * biases
+    columns = columns_of(record, name, plant.dae.state_signals, title)
+    period = loop.encoders.sensor.period if loop.encoders is not None and name != "state" else 0.0
+    for place, signal in enumerate(plant.dae.state_signals):
+        if signal.name in columns and is_position(signal):
+            channels.append(Channel(name, signal, "state", place, float(biases[place])))
+            # Between samples a record repeats the last one.
+            column = columns[signal.name]
+            values.append(_at_samples(record.time, column, period) if period else column)
+    # Forces.
+    sensor = loop.sensor
+    is_sensed = sensor is not None and "measured_force" in record.signals
+    name = "measured_force" if is_sensed else "constraint_force"
+    signals = plant.dae.constraint_input_signals if is_sensed else plant.dae.force_signals
+    columns = columns_of(record, name, signals, title)
+    for place, signal in enumerate(signals):
+        if signal.name not in columns:
+            continue
+        column, port, bias = columns[signal.name], "constraint_force", 0.0
+        if is_sensed and sensor is not None:
+            bias, port = float(sensor.bias[place]), "felt_force" if sensor.time_constant else port
+            if sensor.sample_period:
+                # A discrete plant has stepped when the sensor samples, a lag has not.
+                later = int(plant.time_step > 0.0 and not sensor.time_constant)
+                column = _sampled(record.time, column, sensor.sample_period, later)
+            elif loop.noise is not None:
+                # It is drawn anew after each time constant, and rows between have the same one.
+                drawn = np.ceil(record.time / sensor.time_constant - SAME)
+                column = np.where(np.diff(drawn, append=np.inf) > 0.0, column, np.nan)
+        channels.append(Channel(name, signal, port, place, bias))
+        values.append(column)
+    return channels, values
+
+
+def _at_samples(times: FloatArray, column: FloatArray, period: float) -> FloatArray:
+    """A column at the samples, and nan between them."""
+    is_sample = np.abs(times - period * np.round(times / period)) < SAME * period
+    return np.where(is_sample, column, np.nan)
+
+
+def _sampled(times: FloatArray, column: FloatArray, period: float, later: int) -> FloatArray:
+    """What a sensor that samples has measured, at the rows of these samples; nan elsewhere.
+
+    A row has the last sample before it.
+
+    Args:
+        times: The times of the rows in s.
+        column: What the rows have.
+        period: The time between samples in s.
+        later: How many rows after the time of a sample its force is found.
+    """
+    found = np.full_like(column, np.nan)
+    taken = (np.ceil((times - SAME * period) / period) - 1.0) * period
+    rows = np.searchsorted(times, taken - SAME * period)
+    is_there = np.abs(times[np.minimum(rows, times.size - 1)] - taken) < SAME * period
+    good = is_there & (rows + later < times.size)
+    # Of the rows with one sample the first one: the last row of a record may have the next.
+    found[rows[good][::-1] + later] = column[good][::-1]
+    return found
