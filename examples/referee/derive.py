@@ -41,7 +41,7 @@ from referee.vectors import (
     turned,
 )
 
-mp.dps = 60
+mp.dps = 55
 ZERO = mpf(0)
 
 
@@ -309,9 +309,9 @@ class State:
 
 
 def state(mechanism: Mechanism, q: Sequence | None = None, rates: Sequence | None = None) -> State:
-    """All that is asked at a state: q as given or near it, and the rates of the free joints."""
+    """All that is asked at closed positions with rates of the free joints; those stated if None."""
     size, free = mechanism.size, list(mechanism.free)
-    q = closed(mechanism, exact(mechanism.q) if q is None else q)
+    q = closed(mechanism, exact(mechanism.q)) if q is None else list(q)
     if rates is None:
         rates = [mpf(repr(mechanism.v.get(i, 0.0))) for i in free]
     impact = mechanism.restitution is not None

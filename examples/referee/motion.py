@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 from mpmath import mpf
 
-from referee.derive import State, state
+from referee.derive import State, closed, state
 from referee.description import Mechanism
 
 COLUMNS = 14
@@ -19,25 +19,20 @@ Rate = Callable[[Sequence], list]
 
 
 def after(mechanism: Mechanism, duration: object, columns: int = COLUMNS) -> State:
-    """The state after a while."""
-    placed = list(mechanism.free if mechanism.placed is None else mechanism.placed)
-    free = list(mechanism.free)
-    last = state(mechanism)
+    """The state after a while.
 
-    def at(y: Sequence) -> State:
-        nonlocal last
-        q = list(last.q)
-        for i, value in zip(placed, y, strict=False):
-            q[i] = value
-        last = state(mechanism, q, y[len(placed) :])
-        return last
+    The positions of the joints that are not free follow from their rates T v_free; they stay closed
+    to the accuracy of the integrator, and to round-off in the end.
+    """
+    size, first = mechanism.size, state(mechanism)
 
     def rate(y: Sequence) -> list:
-        found = at(y)
-        return [found.v[i] for i in placed] + [found.acceleration[i] for i in free]
+        found = state(mechanism, y[:size], y[size:])
+        return found.v + [found.acceleration[i] for i in mechanism.free]
 
-    start = [last.q[i] for i in placed] + [last.v[i] for i in free]
-    return at(integrated(rate, start, mpf(repr(duration)), columns))
+    start = first.q + [first.v[i] for i in mechanism.free]
+    y = integrated(rate, start, mpf(repr(duration)), columns)
+    return state(mechanism, closed(mechanism, y[:size]), y[size:])
 
 
 def integrated(rate: Rate, start: Sequence, duration: object, columns: int) -> list:

@@ -26,7 +26,7 @@ PENDULUM = Mechanism(
     v={2: 2.5},
     free=(2,),
     gravity=DOWN,
-    duration=2.0,
+    duration=1.0,
 )
 
 TWO_RODS = Mechanism(
@@ -40,7 +40,7 @@ TWO_RODS = Mechanism(
     v={2: 1.5, 5: -2.0},
     free=(2, 5),
     gravity=DOWN,
-    duration=1.0,
+    duration=0.5,
 )
 
 FOUR_BAR = Mechanism(
@@ -56,7 +56,7 @@ FOUR_BAR = Mechanism(
     free=(0,),
     gravity=DOWN,
     torques={0: 0.5},
-    duration=1.0,
+    duration=0.5,
 )
 
 SLIDER_CRANK = Mechanism(
@@ -72,7 +72,7 @@ SLIDER_CRANK = Mechanism(
     free=(0,),
     gravity=DOWN,
     torques={0: 2.0, 2: -35.0},
-    duration=1.0,
+    duration=0.5,
 )
 
 PARALLEL_BARS = Mechanism(
@@ -92,7 +92,7 @@ PARALLEL_BARS = Mechanism(
     free=(0,),
     gravity=DOWN,
     split=LEAST,
-    duration=1.0,
+    duration=0.5,
 )
 
 # Andrews' squeezer: the numbers of the Test Set for IVP Solvers; without gravity.
