@@ -22,9 +22,7 @@ def main() -> None:
     states, motions = {}, {}
     for name in names:
         mechanism = MECHANISMS[name]
-        states[name] = {
-            engine.NAME: compare_state(engine, mechanism, start) for engine in engines
-        }
+        states[name] = {engine.NAME: compare_state(engine, mechanism, start) for engine in engines}
         if mechanism.duration:
             motions[name] = compare_motion(engines[0], mechanism, start, end)
         print(name, *(f"{key} {cell}" for key, cell in states[name].items()), sep="  ", flush=True)

@@ -8,8 +8,9 @@ from types import ModuleType
 
 import numpy as np
 
-from referee.derive import balance, frames
+from referee.derive import balance
 from referee.description import Mechanism, force_names
+from referee.kinematics import frames
 from referee.mechanisms import MECHANISMS
 from referee.reference import Lines
 from referee.vectors import exact

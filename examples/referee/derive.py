@@ -24,117 +24,10 @@ from dataclasses import dataclass
 
 from mpmath import mp, mpf
 
-from referee.description import Closure, Mechanism, force_names
-from referee.vectors import (
-    IDENTITY,
-    add,
-    apply,
-    cross,
-    dot,
-    exact,
-    matmul,
-    rank_and_pivots,
-    scaled,
-    solve,
-    sub,
-    transposed,
-    turned,
-)
-
-mp.dps = 55
-ZERO = mpf(0)
-
-
-@dataclass
-class Frame:
-    """A body in motion: pose, velocities, and accelerations for v' = 0, in the world."""
-
-    rotation: list
-    position: list
-    spin: list
-    velocity: list
-    spin_rate: list
-    acceleration: list
-    joints: list  # (number, kind, axis in the world, a point on it) from the world outward
-
-    def point(self, place: Sequence) -> "Point":
-        """A point that is fixed in the body."""
-        lever = apply(self.rotation, place)
-        whirl = cross(self.spin, lever)
-        return Point(
-            add(self.position, lever),
-            add(self.velocity, whirl),
-            add(self.acceleration, cross(self.spin_rate, lever), cross(self.spin, whirl)),
-        )
-
-    def columns(self, point: Sequence, size: int) -> tuple[list, list]:
-        """W and C: what each joint's unit rate gives the body and a point of it."""
-        turns, shifts = [[ZERO] * 3] * size, [[ZERO] * 3] * size
-        for number, kind, axis, origin in self.joints:
-            if kind == "turn":
-                turns[number] = axis
-                shifts[number] = cross(axis, sub(point, origin))
-            else:
-                shifts[number] = axis
-        return turns, shifts
-
-
-@dataclass
-class Point:
-    """A point's place, velocity, and acceleration for v' = 0."""
-
-    place: list
-    velocity: list
-    acceleration: list
-
-
-@dataclass
-class Row:
-    """One equation: its gap, its rate J v, the rest of the rate's derivative, and its force."""
-
-    gap: object
-    gradient: list
-    bias: object
-    force: list
-
-
-def frames(mechanism: Mechanism, q: Sequence, v: Sequence) -> dict[str, Frame]:
-    """All bodies in motion."""
-    zero = [ZERO] * 3
-    found = {"world": Frame(IDENTITY, zero, zero, zero, zero, zero, [])}
-    number = 0
-    for body in mechanism.bodies:
-        parent = found[body.parent]
-        start = parent.point(exact(body.at))
-        rotation, place = parent.rotation, start.place
-        spin, velocity = parent.spin, start.velocity
-        spin_rate, acceleration = parent.spin_rate, start.acceleration
-        joints = list(parent.joints)
-        for kind, direction in body.joints:
-            own = exact(direction)
-            axis = apply(rotation, own)
-            joints.append((number, kind, axis, place))
-            if kind == "turn":
-                # The body's own origin is on the axis.
-                spin_rate = add(spin_rate, scaled(v[number], cross(spin, axis)))
-                spin = add(spin, scaled(v[number], axis))
-                rotation = matmul(rotation, turned(own, q[number]))
-            else:
-                lever = scaled(q[number], axis)
-                whirl, along = cross(spin, lever), scaled(v[number], axis)
-                acceleration = add(
-                    acceleration,
-                    cross(spin_rate, lever),
-                    cross(spin, whirl),
-                    scaled(mpf(2), cross(spin, along)),
-                )
-                velocity = add(velocity, whirl, along)
-                place = add(place, lever)
-            number += 1
-        found[body.name] = Frame(
-            rotation, place, spin, velocity, spin_rate, acceleration, joints
-        )
-    return found
+from referee.closures import Row, reported, rows_of
+from referee.description import Mechanism, force_names
+from referee.kinematics import ZERO, Frame, frames
+from referee.vectors import add, cross, dot, exact, rank_and_pivots, scaled, solve, sub, transposed
 
 
 def balance(mechanism: Mechanism, bodies: dict[str, Frame]) -> tuple[list, list]:
@@ -179,99 +72,6 @@ def balance(mechanism: Mechanism, bodies: dict[str, Frame]) -> tuple[list, list]
             for i in range(size):
                 rest[i] += sign * pull * dot(C[i], apart)
     return M, rest
-
-
-def rows_of(
-    mechanism: Mechanism, closure: Closure, bodies: dict[str, Frame], q: Sequence
-) -> list[Row]:
-    """The equations of a closure."""
-    size = mechanism.size
-    if closure.kind == "gear":
-        follower = mechanism.first_joint(closure.body_b)
-        leader = mechanism.first_joint(closure.body_a)
-        ratio, gradient = mpf(repr(closure.size)), [ZERO] * size
-        gradient[follower], gradient[leader] = mpf(1), -ratio
-        return [Row(q[follower] - ratio * q[leader], gradient, ZERO, gradient)]
-    frame_a, frame_b = bodies[closure.body_a], bodies[closure.body_b]
-    a, b = frame_a.point(exact(closure.point_a)), frame_b.point(exact(closure.point_b))
-    W_a, C_a = frame_a.columns(a.place, size)
-    W_b, C_b = frame_b.columns(b.place, size)
-    apart, moving = sub(b.place, a.place), sub(b.velocity, a.velocity)
-    bending = sub(b.acceleration, a.acceleration)
-
-    def shift(u: list, turning: list, gap: object = None) -> Row:
-        gradient = [dot(u, sub(C_b[i], C_a[i])) for i in range(size)]
-        bias = dot(u, bending) + dot(turning, moving)
-        return Row(dot(u, apart) if gap is None else gap, gradient, bias, gradient)
-
-    def turn(u: list, turning: list, gap: object) -> Row:
-        gradient = [dot(u, sub(W_b[i], W_a[i])) for i in range(size)]
-        bias = dot(u, sub(frame_b.spin_rate, frame_a.spin_rate))
-        bias += dot(turning, sub(frame_b.spin, frame_a.spin))
-        return Row(gap, gradient, bias, gradient)
-
-    still = [ZERO] * 3
-    if closure.kind == "point":
-        return [shift(IDENTITY["xyz".index(axis)], still) for axis in closure.axes]
-    if closure.kind == "distance":
-        length = mp.sqrt(dot(apart, apart))
-        away = scaled(1 / length, apart)
-        across = scaled(1 / length, sub(moving, scaled(dot(away, moving), away)))
-        return [shift(away, across, length - mpf(repr(closure.size)))]
-    if closure.kind in ("weld", "hinge"):
-        axes_a, axes_b = transposed(frame_a.rotation), transposed(frame_b.rotation)
-        if closure.kind == "weld":
-            off = add(*(cross(axes_a[k], axes_b[k]) for k in range(3)))
-            turns = [turn(u, still, dot(u, off) / 2) for u in IDENTITY]
-        else:
-            turns, axis = [], exact(closure.direction)
-            own, other = apply(frame_a.rotation, axis), apply(frame_b.rotation, axis)
-            off = cross(own, other)
-            for u in axes_a:
-                if dot(u, own) ** 2 < mpf("0.5"):
-                    turns.append(turn(u, cross(frame_a.spin, u), dot(u, off)))
-        return turns + [shift(u, still) for u in IDENTITY]
-    normal = exact(closure.direction)
-    if closure.kind == "plane":
-        row = shift(normal, still)
-        friction = mpf(repr(closure.friction))
-        along = sub(moving, scaled(dot(normal, moving), normal))
-        if friction and any(along):  # It matters in motion alone.
-            pull = scaled(-friction / mp.sqrt(dot(along, along)), along)
-            row.force = [dot(add(normal, pull), C_b[i]) for i in range(size)]
-        return [row]
-    # A ball: the material point that touches, at -radius normal from the center, is at rest.
-    radius = mpf(repr(closure.size))
-    lever = scaled(-radius, normal)
-    found = []
-    for k, u in enumerate(IDENTITY):
-        gradient = [dot(u, add(C_b[i], cross(W_b[i], lever))) for i in range(size)]
-        bias = dot(u, add(b.acceleration, cross(frame_b.spin_rate, lever)))
-        gap = dot(normal, apart) - radius if abs(normal[k]) == 1 else None
-        found.append(Row(gap, gradient, bias, gradient))
-    return found
-
-
-def reported(
-    closure: Closure, bodies: dict[str, Frame], values: Sequence
-) -> list:
-    """The force of a closure in the components of `force_names`, from those of its rows."""
-    if closure.kind == "hinge":
-        axes = transposed(bodies[closure.body_a].rotation)
-        own = apply(bodies[closure.body_a].rotation, exact(closure.direction))
-        held = [u for u in axes if dot(u, own) ** 2 < mpf("0.5")]
-        moment = add(*(scaled(values[k], u) for k, u in enumerate(held)))
-        return [*moment, *values[2:]]
-    if closure.kind == "plane":
-        normal, friction = exact(closure.direction), mpf(repr(closure.friction))
-        force = scaled(values[0], normal)
-        if friction:
-            moving = bodies[closure.body_b].point(exact(closure.point_b)).velocity
-            along = sub(moving, scaled(dot(normal, moving), normal))
-            pull = -friction * values[0] / mp.sqrt(dot(along, along))
-            force = add(force, scaled(pull, along))
-        return force
-    return list(values)
 
 
 def closed(mechanism: Mechanism, q: Sequence) -> list:
@@ -392,6 +192,4 @@ def least(rows: list[Row], bound: list[int], chosen: list[int], force: Sequence)
     G = [[row.gradient[i] for row in rows] for i in bound]
     product = [[sum((x * y for x, y in zip(a, b, strict=True)), ZERO) for b in G] for a in G]
     y = solve(product, total)
-    return [
-        sum((y[i] * G[i][k] for i in range(len(bound))), ZERO) for k in range(len(rows))
-    ]
+    return [sum((y[i] * G[i][k] for i in range(len(bound))), ZERO) for k in range(len(rows))]

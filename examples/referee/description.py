@@ -87,7 +87,7 @@ class Spring:
     length: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mechanism:
     """A mechanism in a stated state.
 

@@ -75,4 +75,3 @@ def midpoint(rate: Rate, y: Sequence, first: Sequence, step: object, count: int)
         before, now = now, [a + 2 * h * b for a, b in zip(before, rate(now), strict=True)]
     end = rate(now)
     return [(a + b + h * c) / 2 for a, b, c in zip(before, now, end, strict=True)]
-

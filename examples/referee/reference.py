@@ -65,7 +65,7 @@ def main(names: Iterable[str] = ()) -> None:
         if not mechanism.duration or (names and mechanism.name not in names):
             continue
         found = after(mechanism, mechanism.duration)
-        other = after(mechanism, mechanism.duration, COLUMNS - 3)
+        other = after(mechanism, mechanism.duration, COLUMNS + 3)
         apart = max(
             abs(a - b) / max(1, abs(a))
             for a, b in zip(

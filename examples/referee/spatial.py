@@ -1,6 +1,6 @@
 """Mechanisms in space; gravity points along -z, unless stated."""
 
-from referee.description import FREE, X, Y, Z, Body, Closure, Mechanism
+from referee.description import FREE, Body, Closure, Mechanism, X, Y, Z
 
 LEAST = "least sum of squares of all forces and moments, N^2 + (N m)^2, moments about the point"
 
@@ -102,8 +102,9 @@ SIDES = ((1.0, 0.0), (-0.6, 0.8), (-0.6, -0.8))
 def delta_arm(i: int) -> Body:
     """An upper arm, which turns about the horizontal across its side."""
     x, y = SIDES[i]
-    return Body(f"arm{i}", (("turn", (-y, x, 0.0)),), "world", (round(0.2 * x, 4), round(0.2 * y, 4), 0.0), 0.5,
-                (round(0.15 * x, 4), round(0.15 * y, 4), 0.0), (0.004, 0.004, 0.004))  # fmt: skip
+    shoulder, center = ((round(r * x, 4), round(r * y, 4), 0.0) for r in (0.2, 0.15))
+    joint = (("turn", (-y, x, 0.0)),)
+    return Body(f"arm{i}", joint, "world", shoulder, 0.5, center, (0.004, 0.004, 0.004))
 
 
 def delta_rods(i: int) -> tuple[Closure, Closure]:

@@ -1,8 +1,8 @@
 """Drake's discrete MultibodyPlant: SAP with its constraints and contacts.
 
 A step solves J v+ = -phi / h with the Jacobian of its start, so the part J' v of the acceleration
-enters after some steps. Forces of constraints are found from the change of momentum in a step, since
-they are on no port; contact forces are on a port. `SETTINGS` are the best of those that were tried.
+enters after some steps. Forces of constraints are found from the change of momentum in a step: they
+are on no port. Contact forces are on a port. The settings are the best of those that were tried.
 """
 
 from typing import NamedTuple
@@ -113,9 +113,7 @@ def add(
         add_contact(plant, closure, rotations)
 
 
-def add_contact(
-    plant: MultibodyPlant, closure: Closure, rotations: dict[str, np.ndarray]
-) -> None:
+def add_contact(plant: MultibodyPlant, closure: Closure, rotations: dict[str, np.ndarray]) -> None:
     """A half space, and a ball on the body that touches it at the point."""
     normal, ball = np.array(closure.direction), closure.kind == "ball"
     radius = closure.size if ball else RADIUS
@@ -128,9 +126,7 @@ def add_contact(
         friction=CoulombFriction(mu, mu),
         properties=properties,
     )
-    ground = RigidTransform(
-        RotationMatrix.MakeFromOneVector(normal, 2), np.array(closure.point_a)
-    )
+    ground = RigidTransform(RotationMatrix.MakeFromOneVector(normal, 2), np.array(closure.point_a))
     if not plant.GetCollisionGeometriesForBody(plant.world_body()):
         plant.RegisterCollisionGeometry(
             plant.world_body(), ground, HalfSpace(), "ground", properties
@@ -253,7 +249,9 @@ def contacts(
             place = place - closure.size * np.array(closure.direction)
         if not infos:
             raise NotImplementedError("the contact opened")
-        near = min(infos, key=lambda info, place=place: np.linalg.norm(info.contact_point() - place))
+        near = min(
+            infos, key=lambda info, place=place: np.linalg.norm(info.contact_point() - place)
+        )
         # On B of the pair.
         sign = 1.0 if near.bodyB_index() == body.index() else -1.0
         found[closure.name] = sign * near.contact_force()

@@ -8,8 +8,8 @@ import exudyn.itemInterface as item
 import numpy as np
 from exudyn.utilities import RigidBodyInertia
 
-from referee.derive import frames
 from referee.description import PLANAR, Body, Closure, Mechanism
+from referee.kinematics import frames
 from referee.vectors import exact
 
 NAME = "Exudyn"

@@ -125,7 +125,7 @@ def contact_geoms(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[st
     if not touching:
         return geoms
     model, data = solved(mechanism, q, v, {})
-    for i, closure in enumerate(touching):
+    for closure in touching:
         normal = np.array(closure.direction)
         rotation = data.xmat[model.body(closure.body_b).id].reshape(3, 3)
         ball = closure.kind == "ball"

@@ -1,5 +1,7 @@
 """drake_dae: ideal constraints, with the multipliers on an output port."""
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -15,6 +17,7 @@ STILL = 1e-12
 """The speed of regularized friction in m/s; at 1 m/s it takes 1e-24 off Coulomb's."""
 
 
+@cache
 def model_of(mechanism: Mechanism) -> dd.RobotModel:
     """The mechanism as a RobotModel."""
     plant = MultibodyPlant(0.0)
@@ -89,9 +92,7 @@ def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.nd
     return {"q": state[: len(q)], "v": state[len(q) :], **read(mechanism, plant, context)}
 
 
-def context_of(
-    plant: dd.RobotPlant, mechanism: Mechanism, q: np.ndarray, v: np.ndarray
-) -> object:
+def context_of(plant: dd.RobotPlant, mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> object:
     """The state, and the torques."""
     context = plant.CreateDefaultContext()
     plant.set_state(context, np.concatenate([q, v]))
