@@ -22,10 +22,13 @@ def main() -> None:
     states, motions = {}, {}
     for name in names:
         mechanism = MECHANISMS[name]
-        states[name] = {engine.NAME: compare_state(engine, mechanism, start) for engine in engines}
-        if mechanism.duration:
-            motions[name] = compare_motion(engines[0], mechanism, start, end)
+        states[name] = {e.NAME: compare_state(e, mechanism, start) for e in engines}
         print(name, *(f"{key} {cell}" for key, cell in states[name].items()), sep="  ", flush=True)
+        if mechanism.duration:
+            title = f"{name}, {mechanism.duration:g} s"
+            motions[title] = {e.NAME: compare_motion(e, mechanism, start, end) for e in engines}
+            cells = (f"{key} {cell}" for key, cell in motions[title].items())
+            print("  after", *cells, sep="  ", flush=True)
     text = page(engines, states, motions, missing)
     print("\n" + text)
     if not (given.mechanisms or given.ours):

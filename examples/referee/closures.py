@@ -12,12 +12,14 @@ from referee.vectors import IDENTITY, add, apply, cross, dot, exact, scaled, sub
 
 @dataclass
 class Row:
-    """One equation: its gap, its rate J v, the rest of the rate's derivative, and its force."""
+    """One equation: its gap, J of its rate J v - drive, the derivative but J v', and its force."""
 
+    closure: Closure
     gap: object
     gradient: list
     bias: object
     force: list
+    drive: object = ZERO
 
 
 def rows_of(
@@ -30,7 +32,7 @@ def rows_of(
         leader = mechanism.first_joint(closure.body_a)
         ratio, gradient = mpf(repr(closure.size)), [ZERO] * size
         gradient[follower], gradient[leader] = mpf(1), -ratio
-        return [Row(q[follower] - ratio * q[leader], gradient, ZERO, gradient)]
+        return [Row(closure, q[follower] - ratio * q[leader], gradient, ZERO, gradient)]
     frame_a, frame_b = bodies[closure.body_a], bodies[closure.body_b]
     a, b = frame_a.point(exact(closure.point_a)), frame_b.point(exact(closure.point_b))
     W_a, C_a = frame_a.columns(a.place, size)
@@ -41,13 +43,13 @@ def rows_of(
     def shift(u: list, turning: list, gap: object = None) -> Row:
         gradient = [dot(u, sub(C_b[i], C_a[i])) for i in range(size)]
         bias = dot(u, bending) + dot(turning, moving)
-        return Row(dot(u, apart) if gap is None else gap, gradient, bias, gradient)
+        return Row(closure, dot(u, apart) if gap is None else gap, gradient, bias, gradient)
 
     def turn(u: list, turning: list, gap: object) -> Row:
         gradient = [dot(u, sub(W_b[i], W_a[i])) for i in range(size)]
         bias = dot(u, sub(frame_b.spin_rate, frame_a.spin_rate))
         bias += dot(turning, sub(frame_b.spin, frame_a.spin))
-        return Row(gap, gradient, bias, gradient)
+        return Row(closure, gap, gradient, bias, gradient)
 
     still = [ZERO] * 3
     if closure.kind == "point":
@@ -73,6 +75,8 @@ def rows_of(
     normal = exact(closure.direction)
     if closure.kind == "plane":
         row = shift(normal, still)
+        row.drive, moving_up = exact(closure.road)
+        row.bias -= moving_up
         friction = mpf(repr(closure.friction))
         along = sub(moving, scaled(dot(normal, moving), normal))
         if friction and any(along):  # It matters in motion alone.
@@ -87,7 +91,7 @@ def rows_of(
         gradient = [dot(u, add(C_b[i], cross(W_b[i], lever))) for i in range(size)]
         bias = dot(u, add(b.acceleration, cross(frame_b.spin_rate, lever)))
         gap = dot(normal, apart) - radius if abs(normal[k]) == 1 else None
-        found.append(Row(gap, gradient, bias, gradient))
+        found.append(Row(closure, gap, gradient, bias, gradient))
     return found
 
 

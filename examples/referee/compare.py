@@ -11,7 +11,6 @@ import numpy as np
 from referee.derive import balance
 from referee.description import Mechanism, force_names
 from referee.kinematics import frames
-from referee.mechanisms import MECHANISMS
 from referee.reference import Lines
 from referee.vectors import exact
 
@@ -95,46 +94,58 @@ def compare_state(engine: ModuleType, mechanism: Mechanism, lines: Lines) -> Cel
 
 
 def compare_motion(engine: ModuleType, mechanism: Mechanism, start: Lines, end: Lines) -> Cell:
-    """The least digits of an engine's positions, rates and forces after the motion."""
-    found = engine.after(mechanism, *state_of(mechanism, start))
+    """The digits of an engine's forces after the motion; the least of those of q and v, if any."""
+    if not hasattr(engine, "after"):
+        return Cell(None, "it has no integrator of constrained motion")
+    try:
+        found = engine.after(mechanism, *state_of(mechanism, start))
+    except NotImplementedError as error:
+        return Cell(None, str(error))
     q, v = state_of(mechanism, end)
-    parts = (
-        (found.pop("q"), q),
-        (found.pop("v"), v),
-        (stacked(mechanism, found), wanted_forces(mechanism, end)),
-    )
+    parts = [(stacked(mechanism, found), wanted_forces(mechanism, end))]
+    parts += [(found[key], value) for key, value in (("q", q), ("v", v)) if key in found]
     return Cell(min(correct_digits(*part) for part in parts))
+
+
+def table(
+    title: str, engines: Sequence[ModuleType], cells: dict[str, dict[str, Cell]]
+) -> list[str]:
+    """One table of digits, and why there is a '-', as lines of Markdown."""
+    heads = [engine.NAME for engine in engines]
+    lines = [
+        "| " + " | ".join([title, *heads]) + " |",
+        "|" + "---|" * (len(heads) + 1),
+    ]
+    for name, row in cells.items():
+        lines.append("| " + " | ".join([name, *(str(row[head]) for head in heads)]) + " |")
+    lines += ["", "Why there is a '-':\n"]
+    for head in heads:
+        reasons: dict[str, list[str]] = {}
+        for name, row in cells.items():
+            if row[head].reason:
+                reasons.setdefault(row[head].reason, []).append(name)
+        lines += [f"- {head}, {', '.join(who)}: {why}." for why, who in reasons.items()]
+    return [*lines, ""]
 
 
 def page(
     engines: Sequence[ModuleType],
     states: dict[str, dict[str, Cell]],
-    motions: dict[str, Cell],
+    motions: dict[str, dict[str, Cell]],
     missing: Sequence[str],
 ) -> str:
-    """The table, what each engine solves, and why it cannot tell, in Markdown."""
-    heads = [engine.NAME for engine in engines]
+    """The tables, and what each engine solves, in Markdown."""
     lines = [
-        "# Constraint forces of twenty mechanisms: correct digits\n",
+        "# Constraint forces of mechanisms: correct digits\n",
         "Made by `make referee`. Each number is -log10 of the largest error of all constraint",
-        "forces of the mechanism, in the size of the largest one, at the stated state; the last",
-        "column is the least of positions, rates and forces of drake_dae after the motion.\n",
-        "| " + " | ".join(["mechanism", *heads, "after a motion"]) + " |",
-        "|" + "---|" * (len(heads) + 2),
+        "forces of the mechanism, in the size of the largest one, rounded down; doubles hold 15 or",
+        "16. What each engine solves, at the best settings found:\n",
+        *(f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines),
+        *(f"- {sentence}" for sentence in missing),
+        "\n## At the stated state\n",
+        *table("mechanism", engines, states),
+        "## After the motion\n",
+        "The digits of forces; for drake_dae the least of forces, positions and rates.\n",
+        *table("mechanism, s", engines, motions),
     ]
-    for name, cells in states.items():
-        row = [name, *(str(cells[head]) for head in heads)]
-        duration = MECHANISMS[name].duration
-        row.append(f"{motions[name]} after {duration:g} s" if name in motions else "")
-        lines.append("| " + " | ".join(row) + " |")
-    lines += ["", "What each engine solves, at the best settings found:\n"]
-    lines += [f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines]
-    lines += [f"- {sentence}" for sentence in missing]
-    lines += ["", "Why there is a '-':\n"]
-    for head in heads:
-        reasons: dict[str, list[str]] = {}
-        for name, cells in states.items():
-            if cells[head].reason:
-                reasons.setdefault(cells[head].reason, []).append(name)
-        lines += [f"- {head}, {', '.join(who)}: {why}." for why, who in reasons.items()]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)

@@ -74,6 +74,11 @@ def balance(mechanism: Mechanism, bodies: dict[str, Frame]) -> tuple[list, list]
     return M, rest
 
 
+def all_rows(mechanism: Mechanism, bodies: dict[str, Frame], q: Sequence) -> list[Row]:
+    """The equations of all closures."""
+    return [row for closure in mechanism.closures for row in rows_of(mechanism, closure, bodies, q)]
+
+
 def closed(mechanism: Mechanism, q: Sequence) -> list:
     """Positions at which all closures hold, by Newton's method; those that are placed stay."""
     q, size = list(q), mechanism.size
@@ -82,10 +87,7 @@ def closed(mechanism: Mechanism, q: Sequence) -> list:
     still = [ZERO] * size
     for _ in range(60):
         bodies = frames(mechanism, q, still)
-        rows = [
-            row for closure in mechanism.closures for row in rows_of(mechanism, closure, bodies, q)
-        ]
-        rows = [row for row in rows if row.gap is not None]
+        rows = [row for row in all_rows(mechanism, bodies, q) if row.gap is not None]
         if not solved or max(abs(row.gap) for row in rows) < mpf(10) ** (8 - mp.dps):
             return q
         matrix = [[row.gradient[i] for i in solved] for row in rows]
@@ -108,88 +110,112 @@ class State:
     forces: dict[str, object]
 
 
-def state(mechanism: Mechanism, q: Sequence | None = None, rates: Sequence | None = None) -> State:
-    """All that is asked at closed positions with rates of the free joints; those stated if None."""
-    size, free = mechanism.size, list(mechanism.free)
-    q = closed(mechanism, exact(mechanism.q)) if q is None else list(q)
-    if rates is None:
-        rates = [mpf(repr(mechanism.v.get(i, 0.0))) for i in free]
-    impact = mechanism.restitution is not None
-    still = [ZERO] * size
-    at_rest = frames(mechanism, q, still)
-    rows = [
-        row for closure in mechanism.closures for row in rows_of(mechanism, closure, at_rest, q)
-    ]
-    bound = [i for i in range(size) if i not in free]
-    matrix = [[row.gradient[i] for i in bound] for row in rows]
-    rank, chosen = rank_and_pivots(matrix)
-    if rank < len(bound):
-        raise ValueError(f"{mechanism.name}: the free joints do not determine the others")
-    square = [matrix[k] for k in chosen]
+class Reduction:
+    """How the free joints determine the others where J x + rest = 0.
 
-    def bound_by(vector: Sequence, rest: Sequence) -> list:
+    Attributes:
+        free, bound: The joints that are free, and the others.
+        rows: All equations.
+        chosen: The numbers of as many independent ones as there are bound joints.
+        T: For each free joint all rates for its unit rate.
+    """
+
+    def __init__(self, mechanism: Mechanism, rows: list[Row]) -> None:
+        self.free, self.rows, size = list(mechanism.free), rows, mechanism.size
+        self.bound = [i for i in range(size) if i not in self.free]
+        matrix = [[row.gradient[i] for i in self.bound] for row in rows]
+        rank, self.chosen = rank_and_pivots(matrix)
+        if rank < len(self.bound):
+            raise ValueError(f"{mechanism.name}: the free joints do not determine the others")
+        self._square = [matrix[k] for k in self.chosen]
+        nothing = [ZERO] * len(rows)
+        units = [[mpf(int(i == j)) for i in range(size)] for j in self.free]
+        self.T = [self.completed(unit, nothing) for unit in units]
+
+    def completed(self, vector: Sequence, rest: Sequence) -> list:
         """The vector with its bound parts so that J vector + rest = 0."""
-        right = [
-            -rest[k] - sum((rows[k].gradient[i] * vector[i] for i in free), ZERO) for k in chosen
-        ]
+        right = []
+        for k in self.chosen:
+            gradient = self.rows[k].gradient
+            right.append(-rest[k] - sum((gradient[i] * vector[i] for i in self.free), ZERO))
         whole = list(vector)
-        for i, value in zip(bound, solve(square, right), strict=True):
+        for i, value in zip(self.bound, solve(self._square, right), strict=True):
             whole[i] = value
         return whole
 
-    nothing = [ZERO] * len(rows)
-    T = [bound_by([mpf(int(i == j)) for i in range(size)], nothing) for j in free]
-    if impact:
-        before = exact(mechanism.approach)
-        rate = [sum((g * x for g, x in zip(row.gradient, before, strict=True)), ZERO)
-                for row in rows]  # fmt: skip
-        rest = [mpf(repr(mechanism.restitution)) * value for value in rate]
-        v, bodies = before, frames(mechanism, q, before)
-    else:
-        v = [ZERO] * size
-        for column, value in zip(T, rates, strict=True):
-            v = [x + value * c for x, c in zip(v, column, strict=True)]
+    def combined(self, start: Sequence, fewest: Sequence) -> list:
+        """start + T fewest."""
+        whole = list(start)
+        for column, value in zip(self.T, fewest, strict=True):
+            whole = [x + value * c for x, c in zip(whole, column, strict=True)]
+        return whole
+
+
+def state(mechanism: Mechanism, q: Sequence | None = None, rates: Sequence | None = None) -> State:
+    """All that is asked at closed positions with rates of the free joints; those stated if None."""
+    q = closed(mechanism, exact(mechanism.q)) if q is None else list(q)
+    still = [ZERO] * mechanism.size
+    rows = all_rows(mechanism, frames(mechanism, q, still), q)
+    reduction = Reduction(mechanism, rows)
+    if mechanism.restitution is not None:
+        v = exact(mechanism.approach)
         bodies = frames(mechanism, q, v)
-        rows = [
-            row for closure in mechanism.closures for row in rows_of(mechanism, closure, bodies, q)
-        ]
+        restored = mpf(repr(mechanism.restitution))
+        rest = [restored * total(row.gradient, v) for row in rows]
+        M, _ = balance(mechanism, bodies)
+        h = [-total(line, v) for line in M]
+    else:
+        if rates is None:
+            rates = [mpf(repr(mechanism.v.get(i, 0.0))) for i in mechanism.free]
+        v = reduction.combined(reduction.completed(still, [-row.drive for row in rows]), rates)
+        bodies = frames(mechanism, q, v)
+        rows = all_rows(mechanism, bodies, q)
         rest = [row.bias for row in rows]
-    gamma = bound_by(still, rest)
-    M, h = balance(mechanism, bodies)
-    if impact:
-        h = [-sum((m * x for m, x in zip(line, v, strict=True)), ZERO) for line in M]
+        M, h = balance(mechanism, bodies)
+    gamma = reduction.completed(still, rest)
     # M T a - G f = -h - M gamma, with the forces of the chosen rows alone.
-    MT = [[sum((line[i] * column[i] for i in range(size)), ZERO) for line in M] for column in T]
+    MT = [[total(line, column) for line in M] for column in reduction.T]
     lines, right = [], []
-    for i in range(size):
-        lines.append([column[i] for column in MT] + [-rows[k].force[i] for k in chosen])
-        right.append(-h[i] - sum((M[i][j] * gamma[j] for j in range(size)), ZERO))
+    for i in range(mechanism.size):
+        lines.append([column[i] for column in MT] + [-rows[k].force[i] for k in reduction.chosen])
+        right.append(-h[i] - total(M[i], gamma))
     found = solve(lines, right)
-    fewest, force = found[: len(free)], found[len(free) :]
-    acceleration = list(gamma)
-    for column, value in zip(T, fewest, strict=True):
-        acceleration = [x + value * c for x, c in zip(acceleration, column, strict=True)]
-    values = [ZERO] * len(rows)
-    for k, value in zip(chosen, force, strict=True):
-        values[k] = value
-    if rank < len(rows):
-        values = least(rows, bound, chosen, force)
+    count = len(mechanism.free)
+    values = shared(reduction, rows, found[count:])
+    return State(
+        q, v, reduction.combined(gamma, found[:count]), named(mechanism, bodies, rows, values)
+    )
+
+
+def named(
+    mechanism: Mechanism, bodies: dict[str, Frame], rows: list[Row], values: Sequence
+) -> dict[str, object]:
+    """The forces of all closures by their names."""
     forces, start = {}, 0
     for closure in mechanism.closures:
-        count = len(rows_of(mechanism, closure, bodies, q))
+        count = sum(row.closure is closure for row in rows)
         own = reported(closure, bodies, values[start : start + count])
         forces.update(zip(force_names(closure), own, strict=True))
         start += count
-    return State(q, v, acceleration, forces)
+    return forces
 
 
-def least(rows: list[Row], bound: list[int], chosen: list[int], force: Sequence) -> list:
-    """The forces of all rows with the same sum and the least sum of squares: f = G^T y."""
-    total = [
-        sum((rows[k].gradient[i] * f for k, f in zip(chosen, force, strict=True)), ZERO)
-        for i in bound
-    ]
-    G = [[row.gradient[i] for row in rows] for i in bound]
-    product = [[sum((x * y for x, y in zip(a, b, strict=True)), ZERO) for b in G] for a in G]
-    y = solve(product, total)
-    return [sum((y[i] * G[i][k] for i in range(len(bound))), ZERO) for k in range(len(rows))]
+def shared(reduction: Reduction, rows: list[Row], force: Sequence) -> list:
+    """The forces of all rows: f = G^T y, with the sum that those of the chosen rows have.
+
+    It has the least sum of squares of all f with the same G f.
+    """
+    values = [ZERO] * len(rows)
+    for k, value in zip(reduction.chosen, force, strict=True):
+        values[k] = value
+    if len(reduction.chosen) == len(rows):
+        return values
+    G = [[row.gradient[i] for row in rows] for i in reduction.bound]
+    product = [[total(a, b) for b in G] for a in G]
+    y = solve(product, [total(line, values) for line in G])
+    return [total(y, column) for column in zip(*G, strict=True)]
+
+
+def total(a: Sequence, b: Sequence) -> object:
+    """The scalar product; most entries are zero."""
+    return sum((x * y for x, y in zip(a, b, strict=True) if x and y), ZERO)

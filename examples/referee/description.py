@@ -52,7 +52,8 @@ class Closure:
     - "distance": the points have the distance `size`; the force in the rod, N, positive if it
       pushes.
     - "plane": point B is in the plane through A with the normal `direction`, fixed in the world,
-      with Coulomb's `friction` while it slides; the force with its friction, N.
+      with Coulomb's `friction` while it slides; the force with its friction, N. The plane may move
+      along its normal, with `road`: its velocity, m/s, and acceleration, m/s^2, at the stated time.
     - "ball": a ball of the radius `size` with the center B rolls on that plane; the force, N.
     - "gear": the position of `body_b` is `size` times that of `body_a` (one joint each); the moment
       on body B, N m, which gives `size` times the opposite on A.
@@ -68,6 +69,7 @@ class Closure:
     direction: Vector = Z
     size: float = 1.0
     friction: float = 0.0
+    road: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

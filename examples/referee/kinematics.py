@@ -8,7 +8,7 @@ from mpmath import mp, mpf
 from referee.description import Mechanism
 from referee.vectors import IDENTITY, add, apply, cross, exact, matmul, scaled, sub, turned
 
-mp.dps = 55
+mp.dps = 50
 ZERO = mpf(0)
 
 

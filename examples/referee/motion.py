@@ -12,8 +12,8 @@ from mpmath import mpf
 from referee.derive import State, closed, state
 from referee.description import Mechanism
 
-COLUMNS = 14
-TOLERANCE = mpf(10) ** -37
+COLUMNS = 15
+TOLERANCE = mpf(10) ** -35
 
 Rate = Callable[[Sequence], list]
 

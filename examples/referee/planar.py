@@ -72,7 +72,7 @@ SLIDER_CRANK = Mechanism(
     free=(0,),
     gravity=DOWN,
     torques={0: 2.0, 2: -35.0},
-    duration=0.5,
+    duration=0.25,
 )
 
 PARALLEL_BARS = Mechanism(
@@ -92,7 +92,7 @@ PARALLEL_BARS = Mechanism(
     free=(0,),
     gravity=DOWN,
     split=LEAST,
-    duration=0.5,
+    duration=0.2,
 )
 
 # Andrews' squeezer: the numbers of the Test Set for IVP Solvers; without gravity.
@@ -203,6 +203,33 @@ STRUCK_ARM = Mechanism(
     approach=(0.3, 0.9),
 )  # fmt: skip
 
+# The car axis of the Test Set for IVP Solvers, with other numbers: a road that moves up and down
+# lifts the right end of a bar without mass. Springs carry the chassis; its left end slides along
+# the bar's own y.
+UP = ("slide", (0.0, 1.0, 0.0))
+
+CAR_AXIS = Mechanism(
+    "car_axis",
+    (
+        Body("bar", mass=0.0),
+        Body("left", (UP,), "bar", mass=4.0),
+        Body("right", PLANAR[:2], mass=6.0),
+    ),
+    (
+        Closure("wheel", "plane", "world", (0.0, 0.05, 0.0), "bar", (1.0, 0.0, 0.0),
+                direction=(0.0, 1.0, 0.0), road=(0.8, -5.0)),
+        Closure("chassis", "distance", "left", (0.0, 0.0, 0.0), "right", (0.0, 0.0, 0.0), size=1.0),
+    ),
+    q=(0.05, 0.47, 1.0, 0.5),
+    v={1: -0.3, 3: 0.6},
+    free=(1, 3),
+    gravity=DOWN,
+    springs=(
+        Spring("world", (0.0, 0.0, 0.0), "left", (0.0, 0.0, 0.0), 800.0, 0.5),
+        Spring("bar", (1.0, 0.0, 0.0), "right", (0.0, 0.0, 0.0), 700.0, 0.5),
+    ),
+)  # fmt: skip
+
 PLANAR_MECHANISMS = (
     PENDULUM,
     TWO_RODS,
@@ -214,4 +241,5 @@ PLANAR_MECHANISMS = (
     SLIDING_ARM,
     SLIDING_ROD,
     STRUCK_ARM,
+    CAR_AXIS,
 )

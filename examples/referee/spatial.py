@@ -28,7 +28,7 @@ TOP = Mechanism(
     q=(0.0, 0.0, 0.0, 0.3, 0.5, 0.1),
     v={3: 1.0, 4: 0.4, 5: 60.0},
     free=(3, 4, 5),
-    duration=0.3,
+    duration=0.1,
 )
 
 # Rods of 1 m and 1 kg along edges of a cube (IFToMM's benchmark), drawn where q = 0.
@@ -56,7 +56,7 @@ BRICARD = Mechanism(
     v={0: 1.2},
     free=(0,),
     split=LEAST,
-    duration=0.3,
+    duration=0.1,
 )
 
 LEGS = (
@@ -133,7 +133,7 @@ DELTA = Mechanism(
     v={0: 0.6, 1: -0.4, 2: 0.3},
     free=(0, 1, 2),
     torques={6: -2.0, 7: -1.5, 8: -1.0},
-    duration=0.1,
+    duration=0.05,
 )  # fmt: skip
 
 ARM_AXES = (Z, Y, Y, X, Y, X)
@@ -251,7 +251,7 @@ ROLLING_BALL = Mechanism(
     v={3: 1.0, 4: 2.5, 5: -1.5},
     free=(3, 4, 5),
     placed=(0, 1, 3, 4, 5),
-    duration=0.3,
+    duration=0.1,
 )
 
 GEARS = Mechanism(
@@ -274,7 +274,7 @@ GEARS = Mechanism(
     v={0: 9.0},
     free=(0,),
     torques={0: 0.4, 3: -0.6},
-    duration=0.5,
+    duration=0.2,
 )  # fmt: skip
 
 SPATIAL_MECHANISMS = (

@@ -20,6 +20,8 @@ from referee.description import Body, Mechanism
 
 def inertia_of(body: Body) -> SpatialInertia:
     """The inertia about the origin of the body."""
+    if body.mass == 0.0:
+        return SpatialInertia.Zero()
     about_center = RotationalInertia(*body.inertia)
     return SpatialInertia.MakeFromCentralInertia(body.mass, list(body.center), about_center)
 

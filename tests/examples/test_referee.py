@@ -1,11 +1,14 @@
 """The referee of `examples/referee`: its values by other routes, and drake_dae beside them."""
 
 import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mpmath import mp, mpf
 from numpy.testing import assert_allclose
+from referee import compare
+from referee.__main__ import main
 from referee.closures import rows_of
 from referee.compare import (
     Cell,
@@ -44,8 +47,8 @@ def moved():
     return load(MOTIONS)
 
 
-def test_there_are_twenty_mechanisms_and_a_value_for_each(stated, moved):
-    assert len(MECHANISMS) == 20
+def test_there_are_more_than_twenty_mechanisms_and_a_value_for_each(stated, moved):
+    assert len(MECHANISMS) == 21
     assert list(stated) == list(MECHANISMS)
     assert list(moved) == MOVING
     assert len(MOVING) >= 10
@@ -242,7 +245,22 @@ def test_an_engine_that_is_missing_is_one_sentence(monkeypatch):
     assert engines == [ours]
     assert missing == ["exudyn_engine: left out, since No module named 'exudyn'."]
     text = page(engines, {"pendulum": {ours.NAME: Cell(None, "it cannot")}}, {}, missing)
-    assert "| pendulum | - |  |" in text
+    assert "| pendulum | - |" in text
     assert "- drake_dae, pendulum: it cannot." in text
     assert missing[0] in text
     assert add([mpf(1)], scaled(mpf(2), [mpf(3)])) == [mpf(7)]
+
+
+def test_the_command_prints_and_keeps_the_page_of_all_mechanisms(monkeypatch, capsys):
+    table = Path(compare.__file__).with_name("table.md")
+    before = table.read_text()
+    monkeypatch.setattr("sys.argv", ["referee", "--ours", "gears"])
+    main()
+    shown = capsys.readouterr().out
+    assert "gears  drake_dae 15" in shown
+    assert "after    drake_dae 1" in shown
+    assert table.read_text() == before
+    monkeypatch.setattr("sys.argv", ["referee", "gear"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "no mechanism gear; there are pendulum" in capsys.readouterr().err

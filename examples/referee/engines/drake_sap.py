@@ -32,7 +32,7 @@ NAME = "Drake, SAP"
 NOTE = (
     "near-rigid constraints on rates in discrete time: the force of the tenth step of 1e-6 s. "
     "Contacts of 1e9 N/m: the third step of 1e-5 s; where they slide, the 30th of 1e-4 s with "
-    "Drake's lagged approximation, since SAP's own lifts what slides"
+    "Drake's lagged approximation, since SAP's own lifts what slides. Motions in steps of 1e-5 s"
 )
 STIFFNESS, RADIUS, GRIP = 1e9, 0.01, 10.0
 
@@ -52,8 +52,14 @@ RIGID, STICKING, SLIDING = (
 )
 
 
-def settings_for(mechanism: Mechanism) -> Settings:
+MOVING_STEP = 1e-5
+"""The step of motions in s."""
+
+
+def settings_for(mechanism: Mechanism, duration: float = 0.0) -> Settings:
     """The settings for its kinds of closures."""
+    if duration:
+        return Settings("sap", MOVING_STEP, round(duration / MOVING_STEP))
     if any(closure.friction for closure in mechanism.closures):
         return SLIDING
     touching = any(closure.kind in ("plane", "ball") for closure in mechanism.closures)
@@ -61,10 +67,10 @@ def settings_for(mechanism: Mechanism) -> Settings:
 
 
 def diagram_of(
-    mechanism: Mechanism, rotations: dict[str, np.ndarray]
+    mechanism: Mechanism, rotations: dict[str, np.ndarray], settings: Settings
 ) -> tuple[Diagram, MultibodyPlant]:
     """The plant with its geometry; balls that touch are placed for the given orientations."""
-    builder, settings = DiagramBuilder(), settings_for(mechanism)
+    builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=settings.step,
         discrete_contact_approximation=settings.approximation,
@@ -163,8 +169,19 @@ def rotations_at(mechanism: Mechanism, q: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`."""
+def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The forces after the motion from there."""
+    if any(closure.kind == "plane" for closure in mechanism.closures):
+        raise NotImplementedError("a ball stands for the point that touches: other motion")
+    return forces(mechanism, q, v, mechanism.duration)
+
+
+def forces(
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
+) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`, after a while."""
+    if any(any(closure.road) for closure in mechanism.closures):
+        raise NotImplementedError("no constraint or contact that moves with time")
     if mechanism.restitution is not None:
         raise NotImplementedError("compliant contact: no restitution and no impulse")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
@@ -172,8 +189,8 @@ def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.n
     touching = any(closure.kind in ("plane", "ball") for closure in mechanism.closures)
     if mechanism.split and not touching:
         raise NotImplementedError("the forces of its constraints are on no port, only their sum")
-    settings = settings_for(mechanism)
-    diagram, plant = diagram_of(mechanism, rotations_at(mechanism, q))
+    settings = settings_for(mechanism, duration)
+    diagram, plant = diagram_of(mechanism, rotations_at(mechanism, q), settings)
     simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositions(context, q)

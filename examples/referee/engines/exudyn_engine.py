@@ -15,8 +15,11 @@ from referee.vectors import exact
 NAME = "Exudyn"
 NOTE = (
     "ideal constraints of all joints in maximal coordinates; the multipliers that belong to its "
-    "solver's initial accelerations"
+    "solver's initial accelerations. Motions by Newmark's rule of index 2 in steps of 1e-4 s"
 )
+MOVING_STEP = 1e-4
+"""The step of motions in s."""
+
 REFUSED = {
     "gear": "gears couple coordinates, and joints have none in maximal coordinates",
     "ball": "its rolling joint is that of a thin disc",
@@ -34,7 +37,7 @@ def frame_along(axis: tuple) -> np.ndarray:
 class Model:
     """The mechanism in a state, assembled and with its initial accelerations solved for."""
 
-    def __init__(self, mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> None:
+    def __init__(self, mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float) -> None:
         self.mbs = exu.SystemContainer().AddSystem()
         self.mechanism = mechanism
         self.frames = frames(mechanism, exact(q), exact(v))
@@ -47,8 +50,11 @@ class Model:
         self.add_loads()
         self.closures = {c.name: self.add_closure(c) for c in mechanism.closures}
         self.mbs.Assemble()
+        if duration:
+            self.mbs.SolveDynamic(settings(duration))
+            return
         self.solver = exu.MainSolverImplicitSecondOrder()
-        if not self.solver.InitializeSolver(self.mbs, settings()):
+        if not self.solver.InitializeSolver(self.mbs, settings(MOVING_STEP)):
             raise NotImplementedError("its solver found no initial accelerations")
 
     def rotation(self, name: str) -> np.ndarray:
@@ -161,7 +167,10 @@ class Model:
             rows = self.mbs.systemData.GetObjectLTGAE(number)
             return -self.mbs.systemData.GetAECoordinates()[rows]
         kinds = exu.OutputVariableType.ForceLocal, exu.OutputVariableType.TorqueLocal
-        turned = self.rotation(closure.body_a)
+        turned = np.eye(3)
+        if closure.body_a != "world":
+            kind, body = exu.OutputVariableType.RotationMatrix, self.numbers[closure.body_a]
+            turned = self.mbs.GetObjectOutputBody(body, kind, [0.0, 0.0, 0.0]).reshape(3, 3)
         if closure.kind in ("hinge", "plane"):
             turned = turned @ frame_along(closure.direction)
         force, moment = (self.mbs.GetObjectOutput(number, kind) for kind in kinds)
@@ -172,11 +181,13 @@ class Model:
         return force if closure.kind == "plane" else np.concatenate([moment, force])
 
 
-def settings() -> exu.SimulationSettings:
-    """One implicit step, whose initial accelerations and multipliers alone are read."""
+def settings(duration: float) -> exu.SimulationSettings:
+    """Implicit steps; at the start initial accelerations and multipliers are solved for."""
     found = exu.SimulationSettings()
     found.solutionSettings.writeSolutionToFile = False
-    found.timeIntegration.numberOfSteps, found.timeIntegration.endTime = 1, 1e-7
+    found.timeIntegration.numberOfSteps = round(duration / MOVING_STEP)
+    found.timeIntegration.endTime = duration
+    found.timeIntegration.verboseMode = 0
     # Where rows are redundant, or joints that are cut elsewhere are, it pivots fully.
     found.linearSolverType = exu.LinearSolverType.EigenDense
     found.linearSolverSettings.ignoreSingularJacobian = True
@@ -186,8 +197,17 @@ def settings() -> exu.SimulationSettings:
     return found
 
 
-def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`."""
+def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The forces after the motion from there."""
+    return forces(mechanism, q, v, mechanism.duration)
+
+
+def forces(
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
+) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`, after a while."""
+    if any(any(closure.road) for closure in mechanism.closures):
+        raise NotImplementedError("constraints move with time by functions in Python alone")
     if mechanism.restitution is not None:
         raise NotImplementedError("contacts are penalties: no impulse")
     for closure in mechanism.closures:
@@ -195,5 +215,5 @@ def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.n
             raise NotImplementedError(REFUSED[closure.kind])
         if closure.friction:
             raise NotImplementedError("friction is regularized in contacts that are penalties")
-    model = Model(mechanism, q, v)
+    model = Model(mechanism, q, v, duration)
     return {closure.name: model.force(closure) for closure in mechanism.closures}

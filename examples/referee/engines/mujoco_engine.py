@@ -8,10 +8,18 @@ from referee.description import Body, Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones"
+    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in steps of 1e-5 s, with a time "
+    "constant of 2e-5 s"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
+
+MOVING_STEP = 1e-5
+STIFF = f'solimp="0.9999 0.9999 0.001 0.5 2" solref="{2 * MOVING_STEP} 1"'
+"""In motions the least time constant that MuJoCo takes as it is: two steps."""
+
+# Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
+mujoco.set_mju_user_warning(lambda message: None)
 
 RADIUS = 0.01
 GRIP = 10.0
@@ -101,10 +109,18 @@ def xml(mechanism: Mechanism, geoms: dict[str, list[str]]) -> str:
 
 
 def solved(
-    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, geoms: dict[str, list[str]]
+    mechanism: Mechanism,
+    q: np.ndarray,
+    v: np.ndarray,
+    geoms: dict[str, list[str]],
+    duration: float = 0.0,
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The model, and its data after the forward dynamics at a state."""
-    model = mujoco.MjModel.from_xml_string(xml(mechanism, geoms))
+    """The model, and its data after the forward dynamics at a state, or a while later."""
+    text = xml(mechanism, geoms)
+    if duration:
+        text = text.replace(HARD, STIFF)
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep, model.opt.integrator = MOVING_STEP, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
@@ -114,6 +130,8 @@ def solved(
         if closure.kind == "distance":
             length = model.tendon_length0[model.tendon(closure.name).id]
             model.eq_data[model.equality(closure.name).id, 0] = closure.size - length
+    for _ in range(round(duration / MOVING_STEP)):
+        mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
 
@@ -158,13 +176,24 @@ def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarra
     return full[np.ix_(order, order)]
 
 
-def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """The force of each closure in the components of `force_names`."""
+def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The forces after the motion from there."""
+    if any(closure.kind == "plane" for closure in mechanism.closures):
+        raise NotImplementedError("a ball stands for the point that touches: other motion")
+    return forces(mechanism, q, v, mechanism.duration)
+
+
+def forces(
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
+) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`, after a while."""
+    if any(any(closure.road) for closure in mechanism.closures):
+        raise NotImplementedError("no constraint that moves with time")
     if mechanism.restitution is not None:
         raise NotImplementedError("contacts are soft: an impact takes time and has no impulse")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among the equality constraints")
-    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v))
+    model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v), duration)
     found = {}
     for closure in mechanism.closures:
         if closure.kind in ("plane", "ball"):

@@ -33,6 +33,7 @@ def model_of(mechanism: Mechanism) -> dd.RobotModel:
         mechanism.q,
         mechanism.name,
         forces=[],
+        exogenous=[f"{c.name}.position" for c in mechanism.closures if any(c.road)],
         compliances={} if mechanism.split else None,
     )
 
@@ -97,6 +98,14 @@ def context_of(plant: dd.RobotPlant, mechanism: Mechanism, q: np.ndarray, v: np.
     context = plant.CreateDefaultContext()
     plant.set_state(context, np.concatenate([q, v]))
     plant.GetInputPort("control").FixValue(context, np.array(controls(mechanism)))
+    for closure in mechanism.closures:
+        if any(closure.road):
+            place, normal = np.array(closure.point_a), np.array(closure.direction)
+            course = np.column_stack([place, *(part * normal for part in closure.road)])
+            # Signal by signal, each with the derivatives that the plant needs.
+            degrees = plant.exogenous_layout.degrees
+            needed = [row[: degree + 1] for row, degree in zip(course, degrees, strict=True)]
+            plant.GetInputPort("exogenous").FixValue(context, np.concatenate(needed))
     return context
 
 

@@ -6,8 +6,11 @@ import pinocchio as pin
 from referee.description import Mechanism
 
 NAME = "Pinocchio"
-NOTE = "constraintDynamics: rigid, proximal, mu = 1e-10, up to 100 iterations to 1e-15"
-PROXIMAL = (1e-15, 1e-10, 100)
+NOTE = (
+    "constraintDynamics: rigid; proximal with mu = 1e-3, up to 100 iterations to 1e-15, that leads "
+    "to the least of redundant forces"
+)
+PROXIMAL = (1e-15, 1e-3, 100)
 KINDS = {"point": pin.ContactType.CONTACT_3D, "weld": pin.ContactType.CONTACT_6D}
 REFUSED = {
     "hinge": "no hinge among its constraints",
