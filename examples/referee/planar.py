@@ -71,8 +71,8 @@ SLIDER_CRANK = Mechanism(
     v={0: 12.0},
     free=(0,),
     gravity=DOWN,
-    torques={0: 2.0, 2: -35.0},
-    duration=0.25,
+    torques={0: 0.3, 2: -4.0},
+    duration=0.2,
 )
 
 PARALLEL_BARS = Mechanism(
@@ -169,7 +169,7 @@ SLIDING_ARM = Mechanism(
     free=(0,),
     gravity=DOWN,
     torques={0: 9.0, 1: 6.0},
-    duration=0.1,
+    duration=0.04,
 )  # fmt: skip
 
 SLIDING_ROD = Mechanism(
@@ -183,7 +183,7 @@ SLIDING_ROD = Mechanism(
     v={0: 1.5, 2: -0.7},
     free=(0, 2),
     gravity=DOWN,
-    duration=0.1,
+    duration=0.04,
 )  # fmt: skip
 
 STRUCK_ARM = Mechanism(

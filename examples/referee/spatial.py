@@ -31,33 +31,46 @@ TOP = Mechanism(
     duration=0.1,
 )
 
-# Rods of 1 m and 1 kg along edges of a cube (IFToMM's benchmark), drawn where q = 0.
-EDGES = ((0.0, 0.0, 0.0), X, (1.0, 0.0, -1.0), (1.0, 1.0, -1.0), (0.0, 1.0, -1.0), (0.0, 1.0, 0.0))
+# Rods of 1 m and 1 kg along edges of a cube (IFToMM's benchmark), where q = 0; one edge is fixed.
+CORNERS = (
+    (0.0, 0.0, 0.0), X, (1.0, 0.0, -1.0), (1.0, 1.0, -1.0), (0.0, 1.0, -1.0), (0.0, 1.0, 0.0),
+)  # fmt: skip
 HINGES = (Y, Z, X, Y, Z, X)
 
 
-def edge(i: int) -> Body:
-    """The rod from corner i of the cube to the next; its hinge is at corner i."""
-    start, end = EDGES[i], EDGES[i + 1]
-    way = tuple(b - a for a, b in zip(start, end, strict=True))
-    last = EDGES[i - 1] if i else start
+def between(start: tuple, end: tuple) -> tuple:
+    """From one point to another."""
+    return tuple(b - a for a, b in zip(start, end, strict=True))
+
+
+def edge(start: int, end: int, parent: str = "world", origin: tuple = (0.0, 0.0, 0.0)) -> Body:
+    """The rod from a corner of the cube, where its hinge is, to another one."""
+    way = between(CORNERS[start], CORNERS[end])
     inertia = tuple(0.0008 if abs(part) == 1.0 else 0.084 for part in way)
-    parent = f"rod{i - 1}" if i else "world"
-    at = tuple(b - a for a, b in zip(last, start, strict=True))
-    return Body(f"rod{i}", (("turn", HINGES[i]),), parent, at, 1.0,
-                tuple(part / 2 for part in way), inertia)  # fmt: skip
+    at, center = between(origin, CORNERS[start]), tuple(part / 2 for part in way)
+    joint = (("turn", HINGES[start]),)
+    return Body(f"rod{start}{end}", joint, parent, at, 1.0, center, inertia)
 
 
 BRICARD = Mechanism(
     "bricard",
-    tuple(edge(i) for i in range(5)),
-    (Closure("last", "hinge", "world", EDGES[5], "rod4", (0.0, 0.0, 1.0), direction=HINGES[5]),),
-    q=(0.3, -0.3, 0.3, -0.3, 0.3),
+    (
+        edge(0, 1),
+        edge(1, 2, "rod01", CORNERS[0]),
+        edge(2, 3, "rod12", CORNERS[1]),
+        edge(5, 4),
+        edge(4, 3, "rod54", CORNERS[5]),
+    ),
+    (
+        Closure("last", "hinge", "rod23", between(CORNERS[2], CORNERS[3]), "rod43",
+                between(CORNERS[4], CORNERS[3]), direction=HINGES[3]),
+    ),
+    q=(0.3, -0.23, 0.29, 0.23, -0.3),
     v={0: 1.2},
     free=(0,),
     split=LEAST,
     duration=0.1,
-)
+)  # fmt: skip
 
 LEGS = (
     ((0.5, 0.1, 0.0), (0.22, 0.14, 0.0)), ((0.34, 0.38, 0.0), (0.02, 0.26, 0.0)),
