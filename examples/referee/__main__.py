@@ -24,7 +24,7 @@ def main() -> None:
         mechanism = MECHANISMS[name]
         states[name] = {e.NAME: compare_state(e, mechanism, start) for e in engines}
         print(name, *(f"{key} {cell}" for key, cell in states[name].items()), sep="  ", flush=True)
-        if mechanism.duration:
+        if name in end:
             title = f"{name}, {mechanism.duration:g} s"
             motions[title] = {e.NAME: compare_motion(e, mechanism, start, end) for e in engines}
             cells = (f"{key} {cell}" for key, cell in motions[title].items())

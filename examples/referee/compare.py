@@ -80,16 +80,16 @@ def find_engines(names: Sequence[str] = ENGINES) -> tuple[list[ModuleType], list
 def compare_state(engine: ModuleType, mechanism: Mechanism, lines: Lines) -> Cell:
     """The digits of an engine's forces at the stated state."""
     q, v = state_of(mechanism, lines)
+    try:
+        found = stacked(mechanism, engine.forces(mechanism, q, v))
+    except NotImplementedError as error:
+        return Cell(None, str(error))
     if hasattr(engine, "mass_matrix"):
         M, _ = balance(mechanism, frames(mechanism, exact(q), exact(0 * v)))
         wanted = np.array(M, dtype=float)
         apart = np.max(np.abs(engine.mass_matrix(mechanism, q, v) - wanted))
         if apart > SAME_MODEL * np.max(np.abs(wanted)):
             return Cell(None, f"its mass matrix differs by {apart:.1g}: another model")
-    try:
-        found = stacked(mechanism, engine.forces(mechanism, q, v))
-    except NotImplementedError as error:
-        return Cell(None, str(error))
     return Cell(correct_digits(found, wanted_forces(mechanism, lines)))
 
 

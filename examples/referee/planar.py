@@ -135,7 +135,7 @@ SQUEEZER = Mechanism(
     gravity=(0.0, 0.0, 0.0),
     torques={0: 0.033},
     springs=(Spring("world", C, "K3", (0.02, -0.018, 0.0), 4530.0, 0.07785),),
-    duration=0.03,
+    duration=0.01,
 )  # fmt: skip
 
 LINKS = 12

@@ -101,16 +101,6 @@ def test_the_squeezer_is_held_as_the_test_set_prints(stated):
     assert_allclose(found, printed, rtol=1e-14, atol=1e-14)
 
 
-def test_the_squeezer_ends_where_the_test_set_says(moved):
-    """beta, theta, gamma, delta, phi, epsilon, omega at 0.03 s; they print nine right digits."""
-    printed = [
-        *(15.81077119629904, -15.75637105984298, 0.04082224013073101, 0.5244099658805304),
-        *(-0.5347301163226948, 1.048080741042263, 0.5347301163226948),
-    ]
-    q, _ = state_of(MECHANISMS["squeezer"], moved)
-    assert_allclose(q, printed, rtol=1e-9)
-
-
 def energy(mechanism: Mechanism, found: State):
     """Kinetic and potential energy by the velocities of bodies; for mechanisms without springs."""
     bodies, total = frames(mechanism, found.q, found.v), mpf(0)
@@ -150,7 +140,7 @@ def test_the_integrator_of_the_reference_has_thirty_five_digits():
 def test_a_short_motion_begins_with_the_accelerations_that_were_found():
     """v = v_0 + a t + O(t^2) of the pendulum, where the rates of a are 100 a second or less."""
     mechanism = MECHANISMS["pendulum"]
-    start, end = state(mechanism), after(mechanism, 1e-6)
+    start, end = state(mechanism), after(mechanism, 1e-6, 6)
     for i in range(mechanism.size):
         assert end.v[i] - start.v[i] == pytest.approx(start.acceleration[i] * 1e-6, abs=1e-10)
 

@@ -8,13 +8,13 @@ from referee.description import Body, Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in steps of 1e-5 s, with a time "
-    "constant of 2e-5 s"
+    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in steps of 2e-5 s, with a time "
+    "constant of 4e-5 s"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
 
-MOVING_STEP = 1e-5
+MOVING_STEP = 2e-5
 STIFF = f'solimp="0.9999 0.9999 0.001 0.5 2" solref="{2 * MOVING_STEP} 1"'
 """In motions the least time constant that MuJoCo takes as it is: two steps."""
 
