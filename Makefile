@@ -30,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet benches clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet benches referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -45,6 +45,7 @@ help:
 	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
+	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
@@ -114,6 +115,10 @@ friction: $(VENV)/installed
 
 peers: $(VENV)/installed
 	PYTHONPATH=examples $(BIN)/python -m contact_peers $(ARGS)
+
+# Engines that are not installed are left out: .[referee] brings them.
+referee: $(VENV)/installed-dev
+	PYTHONPATH=examples $(BIN)/python -m referee $(ARGS)
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/support/draw_house.py $(HOUSE)

@@ -1,0 +1,103 @@
+"""Drake's MultibodyPlant in continuous time: reaction forces of the joints of its tree.
+
+It has no loops in continuous time, so only mechanisms whose closures are the joints of a tree can
+be written: free bodies, each pinned to the world or to another one.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+
+from referee.description import Body, Mechanism
+from referee.tree import add_tree
+
+NAME = "Drake, joints"
+NOTE = (
+    "reaction forces of joints in continuous time; trees alone. Motions by runge_kutta5 with error "
+    "control at 1e-14"
+)
+CONFIG = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-14, use_error_control=True)
+
+
+def as_tree(mechanism: Mechanism) -> tuple[Mechanism, list[int]]:
+    """The mechanism with its closures as joints, and the numbers of the turns that stay."""
+    pinned = {closure.body_b: closure for closure in mechanism.closures}
+    free = all(body.parent == "world" and slides(body) for body in mechanism.bodies)
+    points = all(closure.kind == "point" for closure in mechanism.closures)
+    if not (free and points and set(pinned) == {body.name for body in mechanism.bodies}):
+        raise NotImplementedError("no loops in continuous time")
+    bodies, turns = [], []
+    for body in mechanism.bodies:
+        closure, first = pinned[body.name], mechanism.first_joint(body.name)
+        if any(closure.point_b):
+            raise NotImplementedError("the joint is not at the origin of its body")
+        kept = [k for k, (kind, _) in enumerate(body.joints) if kind == "turn"]
+        turns += [first + k for k in kept]
+        joints = tuple(body.joints[k] for k in kept)
+        bodies.append(replace(body, joints=joints, parent=closure.body_a, at=closure.point_a))
+    return replace(mechanism, bodies=tuple(bodies), torques={}), turns
+
+
+def slides(body: Body) -> bool:
+    """Whether its joints begin with shifts in all directions of its motion."""
+    kinds = [kind for kind, _ in body.joints]
+    return kinds[:2] == ["slide", "slide"] and (kinds.count("slide") == 3 or kinds == [
+        "slide", "slide", "turn"])  # fmt: skip
+
+
+def relative(tree: Mechanism, turns: list[int], values: np.ndarray) -> np.ndarray:
+    """Angles, or rates, of the joints from those of the bodies in the world."""
+    own, found = {"world": 0.0}, []
+    for body, value in zip(tree.bodies, values[turns], strict=True):
+        own[body.name] = value
+        found.append(value - own[body.parent])
+    return np.array(found)
+
+
+def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """M of the tree before it is pinned."""
+    plant = MultibodyPlant(0.0)
+    add_tree(plant, mechanism)
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    return plant.CalcMassMatrix(context)
+
+
+def after(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    """The forces after the motion from there."""
+    return forces(mechanism, q, v, mechanism.duration)
+
+
+def forces(
+    mechanism: Mechanism, q: np.ndarray, v: np.ndarray, duration: float = 0.0
+) -> dict[str, np.ndarray]:
+    """The force of each closure in the components of `force_names`, after a while."""
+    tree, turns = as_tree(mechanism)
+    plant = MultibodyPlant(0.0)
+    add_tree(plant, tree)
+    plant.Finalize()
+    simulator = Simulator(plant)
+    ApplySimulatorConfig(CONFIG, simulator)
+    context = simulator.get_mutable_context()
+    chained = any(body.parent != "world" for body in tree.bodies)
+    plant.SetPositions(context, relative(tree, turns, q) if chained else q[turns])
+    plant.SetVelocities(context, relative(tree, turns, v) if chained else v[turns])
+    if duration:
+        simulator.AdvanceTo(duration)
+    reactions = plant.get_reaction_forces_output_port().Eval(context)
+    found = {}
+    for closure, number in zip(mechanism.closures, first_turns(tree), strict=True):
+        joint = plant.GetJointByName(f"j{number}")
+        rotation = joint.frame_on_child().CalcRotationMatrixInWorld(context)
+        force = rotation @ reactions[int(joint.index())].translational()
+        found[closure.name] = force[["xyz".index(axis) for axis in closure.axes]]
+    return found
+
+
+def first_turns(tree: Mechanism) -> Iterator[int]:
+    """The number of the first joint of each body."""
+    return (tree.first_joint(body.name) for body in tree.bodies)

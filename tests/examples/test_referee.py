@@ -1,0 +1,258 @@
+"""The referee of `examples/referee`: its values by other routes, and drake_dae beside them."""
+
+import importlib
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+from numpy.testing import assert_allclose
+from referee import compare
+from referee.__main__ import main
+from referee.closures import rows_of
+from referee.compare import (
+    Cell,
+    compare_motion,
+    compare_state,
+    correct_digits,
+    find_engines,
+    page,
+    state_of,
+    wanted_forces,
+)
+from referee.derive import State, balance, state
+from referee.description import Mechanism, force_names
+from referee.engines import ours
+from referee.kinematics import frames
+from referee.mechanisms import MECHANISMS
+from referee.motion import after, integrated
+from referee.reference import MOTIONS, STATES, lines_of, load
+from referee.vectors import add, apply, dot, exact, scaled, sub, transposed
+
+WIDE = ("stewart", "delta", "two_arms", "grasp", "humanoid")
+"""Those that take more than half a second to build."""
+
+MOVING = [name for name, mechanism in MECHANISMS.items() if mechanism.duration]
+
+ALL = [pytest.param(name, marks=pytest.mark.slow if name in WIDE else ()) for name in MECHANISMS]
+
+
+@pytest.fixture(scope="module")
+def stated():
+    return load(STATES)
+
+
+@pytest.fixture(scope="module")
+def moved():
+    return load(MOTIONS)
+
+
+def test_there_are_more_than_twenty_mechanisms_and_a_value_for_each(stated, moved):
+    assert len(MECHANISMS) == 21
+    assert list(stated) == list(MECHANISMS)
+    assert list(moved) == MOVING
+    assert len(MOVING) >= 10
+
+
+@pytest.mark.parametrize("name", [name for name in MECHANISMS if name not in WIDE])
+def test_the_values_are_those_that_are_derived_now(name, stated):
+    """All 40 digits but the last."""
+    mechanism = MECHANISMS[name]
+    for _, key, value in lines_of(mechanism, state(mechanism)):
+        assert mpf(value) == pytest.approx(mpf(stated[name][key]), rel=1e-38, abs=1e-44), key
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_drake_dae_has_twelve_digits_of_all_forces(name, stated):
+    cell = compare_state(ours, MECHANISMS[name], stated)
+    assert cell.digits is not None, cell.reason
+    assert cell.digits >= 12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendulum", "four_bar", "sliding_rod", "rolling_ball", "gears"])
+def test_drake_dae_has_ten_digits_after_a_motion(name, stated, moved):
+    assert compare_motion(ours, MECHANISMS[name], stated, moved).digits >= 10
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", MOVING)
+def test_drake_dae_has_ten_digits_after_each_motion(name, stated, moved):
+    assert compare_motion(ours, MECHANISMS[name], stated, moved).digits >= 10
+
+
+def test_a_pendulum_is_held_as_in_a_textbook(stated):
+    """A uniform rod at the angle a: m w^2 l / 2 inward and its weight, 3/4 of it accelerated."""
+    own = {key: mpf(value) for key, value in stated["pendulum"].items()}
+    c, s, m, g, half = mp.cos(own["q2"]), mp.sin(own["q2"]), mpf("1.3"), mpf("9.81"), mpf("0.4")
+    # The moment of inertia in the description is rounded to six decimals.
+    about = m * half**2 + mpf("0.069333")
+    turning = -m * g * half * c / about
+    inward, across = m * half * own["v2"] ** 2, m * half * turning
+    assert own["pivot.fx"] == pytest.approx(-inward * c - across * s, rel=1e-38)
+    assert own["pivot.fy"] == pytest.approx(-inward * s + across * c + m * g, rel=1e-38)
+
+
+def test_the_squeezer_is_held_as_the_test_set_prints(stated):
+    """Mazzia and Magherini's multipliers of the start; here they act the other way."""
+    printed = [-98.5668703962410896, 6.12268834425566266, 0.0, 0.0, 0.0, 0.0]
+    found = wanted_forces(MECHANISMS["squeezer"], stated)
+    assert_allclose(found, printed, rtol=1e-14, atol=1e-14)
+
+
+def energy(mechanism: Mechanism, found: State):
+    """Kinetic and potential energy by the velocities of bodies; for mechanisms without springs."""
+    bodies, total = frames(mechanism, found.q, found.v), mpf(0)
+    for body in mechanism.bodies:
+        frame = bodies[body.name]
+        center, mass = frame.point(exact(body.center)), mpf(repr(body.mass))
+        spin = apply(transposed(frame.rotation), frame.spin)
+        total += mass * dot(center.velocity, center.velocity) / 2
+        total += sum(i * w * w for i, w in zip(exact(body.inertia), spin, strict=True)) / 2
+        total -= mass * dot(exact(mechanism.gravity), center.place)
+    return total
+
+
+@pytest.mark.parametrize(
+    "name", ["pendulum", "two_rods", "parallel_bars", "top", "bricard", "rolling_ball"]
+)
+def test_motions_of_the_reference_keep_their_energy_to_thirty_digits(name, stated, moved):
+    mechanism = MECHANISMS[name]
+
+    def at(lines):
+        own = lines[name]
+        values = [[mpf(own[f"{part}{i}"]) for i in range(mechanism.size)] for part in "qv"]
+        return energy(mechanism, State(*values, [], {}))
+
+    assert at(moved) == pytest.approx(at(stated), rel=1e-30)
+    free = f"q{mechanism.free[0]}"
+    assert abs(mpf(moved[name][free]) - mpf(stated[name][free])) > mpf("0.01")
+
+
+def test_the_integrator_of_the_reference_has_thirty_five_digits():
+    """x'' = -x for a while, against the cosine."""
+    y = integrated(lambda y: [y[1], -y[0]], [mpf(1), mpf(0)], mpf(2), 14)
+    assert abs(y[0] - mp.cos(2)) < mpf(10) ** -35
+    assert abs(y[1] + mp.sin(2)) < mpf(10) ** -35
+
+
+def test_a_short_motion_begins_with_the_accelerations_that_were_found():
+    """v = v_0 + a t + O(t^2) of the pendulum, where the rates of a are 100 a second or less."""
+    mechanism = MECHANISMS["pendulum"]
+    start, end = state(mechanism), after(mechanism, 1e-6, 6)
+    for i in range(mechanism.size):
+        assert end.v[i] - start.v[i] == pytest.approx(start.acceleration[i] * 1e-6, abs=1e-10)
+
+
+@pytest.mark.parametrize("name", ["two_rods", "top", "sliding_rod", "table", "rolling_ball"])
+def test_the_world_pushes_as_much_as_momentum_changes(name):
+    """sum f = sum m (a - g) where bodies touch the world through closures alone: by Newton."""
+    mechanism = MECHANISMS[name]
+    found = state(mechanism)
+    bodies = frames(mechanism, found.q, found.v)
+    needed = exact((0.0, 0.0, 0.0))
+    for body in mechanism.bodies:
+        frame = bodies[body.name]
+        center = frame.point(exact(body.center))
+        _, C = frame.columns(center.place, mechanism.size)
+        moved = [scaled(a, c) for a, c in zip(found.acceleration, C, strict=True)]
+        rate = sub(add(center.acceleration, *moved), exact(mechanism.gravity))
+        needed = add(needed, scaled(mpf(repr(body.mass)), rate))
+    pushed = dict.fromkeys("xyz", mpf(0))
+    for closure in mechanism.closures:
+        if closure.body_a == "world":
+            for key in force_names(closure):
+                pushed[key[-1]] += found.forces[key]
+    for axis, force in zip("xyz", needed, strict=True):
+        assert abs(pushed[axis] - force) < mpf(10) ** -45
+
+
+@pytest.mark.parametrize("name", ["parallel_bars", "table", "bricard"])
+def test_redundant_forces_are_the_least_of_all_with_their_sum(name, stated):
+    """They have no part that does not act: G f = 0 has only solutions across to them."""
+    mechanism = MECHANISMS[name]
+    q, v = state_of(mechanism, stated)
+    bodies = frames(mechanism, exact(q), exact(v))
+    closures = mechanism.closures
+    rows = [row for c in closures for row in rows_of(mechanism, c, bodies, exact(q))]
+    J = np.array([[float(g) for g in row.gradient] for row in rows])
+    _, sizes, axes = np.linalg.svd(J.T)
+    idle = axes[np.sum(sizes > 1e-10) :]
+    assert len(idle) == 1
+    values = wanted_forces(mechanism, stated)
+    if name == "table":
+        values = values[2::3]
+    if name == "bricard":
+        # Its moments about the axes of body A that are held.
+        axes = np.array(transposed(bodies[closures[0].body_a].rotation), dtype=float)
+        held = axes[np.array(closures[0].direction) == 0.0]
+        values = np.concatenate([held @ values[:3], values[3:]])
+    assert_allclose(idle @ values, 0.0, atol=1e-10 * np.abs(values).max())
+
+
+def test_an_impact_keeps_momentum_and_restores_its_share():
+    """M (v+ - v-) = J^T f with J v+ = -e J v-, by M of the description in double precision."""
+    mechanism = MECHANISMS["struck_arm"]
+    found = state(mechanism)
+    bodies = frames(mechanism, found.q, exact(mechanism.approach))
+    M = np.array(balance(mechanism, bodies)[0], dtype=float)
+    (row,) = rows_of(mechanism, mechanism.closures[0], bodies, found.q)
+    J, before = np.array(row.gradient, dtype=float), np.array(mechanism.approach)
+    approach = J @ before
+    impulse = -(1 + 0.5) * approach / (J @ np.linalg.solve(M, J))
+    assert approach < 0.0
+    assert_allclose(-float(found.forces["wall.fx"]), impulse, rtol=1e-13)
+
+
+def test_digits_count_the_largest_error_in_the_size_of_the_largest_value():
+    assert correct_digits([1.0, 1e-3], [1.0, 0.0]) == pytest.approx(3.0)
+    assert correct_digits([2.0, 0.0], [2.0, 0.0]) == 16.0
+    assert correct_digits([-5.0], [2.0]) == 0.0
+    assert correct_digits([np.nan], [2.0]) == 0.0
+
+
+def test_a_wrong_mass_is_another_model_and_a_wrong_force_is_seen(stated, monkeypatch):
+    mechanism = MECHANISMS["pendulum"]
+    matrix, force = ours.mass_matrix, ours.forces
+    monkeypatch.setattr(ours, "mass_matrix", lambda *given: matrix(*given) * 1.001)
+    assert "another model" in compare_state(ours, mechanism, stated).reason
+    monkeypatch.setattr(ours, "mass_matrix", matrix)
+    monkeypatch.setattr(
+        ours, "forces", lambda *given: {k: f * 1.001 for k, f in force(*given).items()}
+    )
+    assert compare_state(ours, mechanism, stated).digits == pytest.approx(3.0, abs=0.01)
+
+
+def test_an_engine_that_is_missing_is_one_sentence(monkeypatch):
+    real = importlib.import_module
+
+    def absent(name):
+        if name.endswith("exudyn_engine"):
+            raise ImportError("No module named 'exudyn'")
+        return real(name)
+
+    monkeypatch.setattr(importlib, "import_module", absent)
+    engines, missing = find_engines(("ours", "exudyn_engine"))
+    assert engines == [ours]
+    assert missing == ["exudyn_engine: left out, since No module named 'exudyn'."]
+    text = page(engines, {"pendulum": {ours.NAME: Cell(None, "it cannot")}}, {}, missing)
+    assert "| pendulum | - |" in text
+    assert "- drake_dae, pendulum: it cannot." in text
+    assert missing[0] in text
+    assert add([mpf(1)], scaled(mpf(2), [mpf(3)])) == [mpf(7)]
+
+
+def test_the_command_prints_and_keeps_the_page_of_all_mechanisms(monkeypatch, capsys):
+    table = Path(compare.__file__).with_name("table.md")
+    before = table.read_text()
+    monkeypatch.setattr("sys.argv", ["referee", "--ours", "gears"])
+    main()
+    shown = capsys.readouterr().out
+    # 12 digits or more, in the state and after the motion.
+    assert re.search(r"gears  drake_dae 1\d\n +after +drake_dae 1\d\n", shown)
+    assert table.read_text() == before
+    monkeypatch.setattr("sys.argv", ["referee", "gear"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "no mechanism gear; there are pendulum" in capsys.readouterr().err

@@ -1,0 +1,274 @@
+"""Answers that textbooks print, each by the library's own multipliers and events.
+
+The sources were read where they are published on the web; each test names its own.
+"""
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import error_controlled
+from numpy.testing import assert_allclose
+from pydrake.math import RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
+
+from drake_dae import (
+    Blade,
+    CoincidentPoints,
+    DaePlant,
+    DaeSystem,
+    FixedDistance,
+    JointCoupler,
+    LinkExpressions,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    RobotPlant,
+    RollingBall,
+    Signal,
+    Sphere,
+    UnilateralRobotPlant,
+    simulate,
+)
+from drake_dae.systems.plants.contact_events import ContactChange
+
+G = 9.81
+NOTHING = np.zeros((3, 0))
+
+
+def flat(mass, about_center, center=0.0, gravity=G):
+    """A body in the x-z plane: its origin, and the angle of its x axis above the horizontal.
+
+    Its center of mass is on its x axis.
+    """
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    c, s = ca.cos(q[2]), ca.sin(q[2])
+    turned = ca.vertcat(ca.horzcat(c, 0, -s), ca.horzcat(0, 1, 0), ca.horzcat(s, 0, c))
+    lever = mass * center
+    M = ca.blockcat(
+        [[mass, 0, -lever * s], [0, mass, lever * c],
+         [-lever * s, lever * c, about_center + mass * center**2]]
+    )  # fmt: skip
+    spun = -lever * v[2] ** 2
+    H = ca.vertcat(spun * c, spun * s + mass * gravity, lever * gravity * c)
+    links = {"body": (turned, ca.vertcat(q[0], 0, q[1]))}
+    return LinkExpressions(q, v, M, H, links, actuation_matrix=NOTHING)
+
+
+def point(mass):
+    """A point in space under gravity."""
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    H = ca.vertcat(0, 0, mass * G)
+    return LinkExpressions(q, v, mass * ca.SX.eye(3), H, {"point": q}, actuation_matrix=NOTHING)
+
+
+def force_at(model, state):
+    """The constraint forces at a state."""
+    plant = RobotPlant(model)
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, state)
+    return plant.GetOutputPort("constraint_force").Eval(context)
+
+
+def opening(model, contacts, state, until):
+    """When the first of the contacts opens, which, and the state then.
+
+    The state is that of the same robot with constraints that hold in both directions.
+    """
+    plant = UnilateralRobotPlant(model, contacts)
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, state)
+    simulate(plant, context, until, error_controlled(1e-11))
+    event = plant.events(context)[0]
+    assert event.kind is ContactChange.OPENING
+    held = RobotPlant(model)
+    context = held.CreateDefaultContext()
+    held.set_state(context, state)
+    simulate(held, context, event.time, error_controlled(1e-11))
+    return event.contacts, held.state(context)
+
+
+@pytest.mark.slow
+def test_a_ladder_leaves_a_smooth_wall_at_two_thirds_of_its_sine():
+    """sin a = 2/3 sin a_0, whatever its length and mass; a window of 1e-13 s leaves 1e-9.
+
+    S. B. Cahn and B. E. Nadgorny, A Guide to Physics Problems, part 1, "Sliding Ladder".
+    """
+    mass, half, start = 3.0, 1.7, 1.1
+    wall = PointOnSurface("body", Plane((0, 0, 0), (1, 0, 0)), (half, 0, 0), "wall")
+    floor = PointOnSurface("body", Plane((0, 0, 0), (0, 0, 1)), (-half, 0, 0), "floor")
+    q = [half * np.cos(start), half * np.sin(start), np.pi - start]
+    links = flat(mass, mass * half**2 / 3)
+    model = RobotModel(links, [wall, floor], [], q, "ladder", forces=[])
+    who, state = opening(model, {"wall": 0.0, "floor": 0.0}, [*q, 0, 0, 0], 1.2)
+    assert who == ("wall",)
+    assert_allclose(np.sin(state[2]), 2 / 3 * np.sin(start), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_particle_leaves_a_smooth_sphere_where_the_cosine_is_two_thirds():
+    """cos t = 2/3 from rest at the top; from the top at a speed v, v^2 / (3 g r) more.
+
+    BYJU'S, "A particle slides on the surface of a fixed smooth sphere".
+    """
+    radius, speed = 0.8, 0.05
+    ball = PointOnSurface("point", Sphere((0, 0, 0), radius, (1, 0, 0)), name="ball")
+    q = [0.0, 0.0, radius]
+    model = RobotModel(point(0.7), [ball], [], q, "particle", forces=[])
+    _, state = opening(model, {"ball": 0.0}, [*q, 0.0, speed, 0.0], 2.0)
+    wanted = 2 / 3 + speed**2 / (3 * G * radius)
+    assert_allclose(state[2] / radius, wanted, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_ball_rolls_down_a_slope_with_five_sevenths_and_needs_two_sevenths():
+    """a = 5/7 g sin t, friction 2/7 m g sin t, and m g cos t across the slope.
+
+    Mini Physics, "UY1: More About Rolling Motion".
+    """
+    mass, radius, slope = 1.3, 0.2, 0.5
+    tilt = RotationMatrix.MakeYRotation(slope).matrix()
+    plant = MultibodyPlant(0.0)
+    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(mass, radius))
+    plant.AddJoint(RpyFloatingJoint("free", plant.world_frame(), ball.body_frame()))
+    plant.Finalize()
+    normal = tilt[:, 2]
+    hill = RollingBall("ball", Plane((0, 0, 0), tuple(normal)), radius, name="hill")
+    start = [0, 0, 0, *(radius * normal)]
+    model = RobotModel.from_multibody(plant, [hill], [], start, "ball", forces=[])
+    block = RobotPlant(model)
+    context = block.CreateDefaultContext()
+    block.set_state(context, [*start, *np.zeros(6)])
+    force = block.GetOutputPort("constraint_force").Eval(context)
+    down, weight = G * np.sin(slope), mass * G * np.cos(slope)
+    assert_allclose(force, [weight, -2 / 7 * mass * down, 0.0], atol=1e-13)
+    simulate(block, context, 1.2, error_controlled(1e-11))
+    way = (block.state(context)[3:6] - start[3:]) @ tilt
+    assert_allclose(way, [5 / 7 * down * 1.2**2 / 2, 0.0, 0.0], atol=1e-10)
+
+
+def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():
+    """A solid ball that rolls without slip on a table that turns at W goes round at 2/7 W.
+
+    H. Nakanishi, Sphere Rolling on a Turntable, 2024: it makes two turns while the table makes
+    seven. Here after half a turn of the ball it is across the circle, after a turn back.
+    """
+    mass, radius, table = 0.6, 0.15, 3.0
+    about = 0.4 * mass * radius**2
+    # x, y, their rates, and the spins about x and y; that about z is constant and does not act.
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy", "wx", "wy"],
+        f=lambda s: [s[2], s[3], 0.0, 0.0, 0.0, 0.0],
+        g=lambda s: [
+            *([0.0, 0.0], [0.0, 0.0], [1 / mass, 0.0], [0.0, 1 / mass]),
+            *([0.0, radius / about], [-radius / about, 0.0]),
+        ],
+        k=lambda s: [s[2] - radius * s[5] + table * s[1], s[3] + radius * s[4] - table * s[0]],
+        name="turntable",
+    )
+    plant = DaePlant(system)
+    assert plant.structure.constraint_degrees == (1, 1)
+    place, speed = np.array([0.3, 0.1]), np.array([0.4, -0.2])
+    spin = [(table * place[0] - speed[1]) / radius, (speed[0] + table * place[1]) / radius]
+    start = np.array([*place, *speed, *spin])
+    rate = 2 / 7 * table
+    across = 2 / rate * np.array([-speed[1], speed[0]])
+    for turns, wanted in ((0.5, place + across), (1.0, place)):
+        context = plant.CreateDefaultContext()
+        plant.set_state(context, start)
+        simulate(plant, context, turns * 2 * np.pi / rate, error_controlled(1e-12))
+        assert_allclose(plant.state(context)[:2], wanted, atol=1e-9)
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    assert_allclose(force, mass * rate * np.array([-speed[1], speed[0]]), atol=1e-9)
+
+
+def test_chaplygins_sleigh_comes_out_of_its_turn_as_a_hyperbolic_tangent():
+    """v' = a w^2, w' = -m a / (I + m a^2) v w: v = c tanh(a c t / k^2), k^2 = (I + m a^2) / m.
+
+    Bloch, Nonholonomic Mechanics and Control, 1.7, as quoted at Mathematica Stack Exchange 162070.
+    With c^2 = v^2 + k^2 w^2, which is the energy, v' = a (c^2 - v^2) / k^2.
+    """
+    mass, about, ahead, spin = 2.0, 0.3, 0.4, 2.5
+    # The plane x-z lies on the ice, where there is no weight.
+    blade = Blade("body", (0, 0, 1))
+    links = flat(mass, about, ahead, gravity=0.0)
+    model = RobotModel(links, [blade], [], [0, 0, 0], "sleigh", forces=[])
+    plant = RobotPlant(model)
+    assert plant.structure.constraint_degrees == (1,)
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, [0, 0, 0, 0, 0, spin])
+    simulate(plant, context, 1.5, error_controlled(1e-12))
+    gyration = (about + mass * ahead**2) / mass
+    energy = np.sqrt(gyration) * spin
+    way = ahead * energy * 1.5 / gyration
+    *_, angle, vx, vz, rate = plant.state(context)
+    assert_allclose(vx * np.cos(angle) + vz * np.sin(angle), energy * np.tanh(way), atol=1e-10)
+    assert_allclose(rate, spin / np.cosh(way), atol=1e-10)
+    # The blade bears m (v w + a w') across.
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    speed, slowing = energy * np.tanh(way), -ahead / gyration * energy * np.tanh(way) * rate
+    assert_allclose(force, mass * (speed * rate + ahead * slowing), atol=1e-9)
+
+
+def test_atwoods_string_pulls_with_twice_the_harmonic_share_of_the_weights():
+    """T = 2 m_1 m_2 g / (m_1 + m_2), at any speed.
+
+    Wikipedia, "Atwood machine": m_1 g - T = m_1 a, T - m_2 g = m_2 a.
+    """
+    first, second = 2.0, 3.5
+    q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
+    links = LinkExpressions(
+        q,
+        v,
+        ca.diag(ca.SX([first, second])),
+        ca.vertcat(first * G, second * G),
+        actuation_matrix=np.zeros((2, 0)),
+        position_signals=(Signal("one", "m"), Signal("other", "m")),
+    )
+    string = JointCoupler("other", "one", -1.0, unit="m", name="string")
+    model = RobotModel(links, [string], [], [0, 0], "atwood", forces=[])
+    tension = 2 * first * second * G / (first + second)
+    assert_allclose(force_at(model, [0.2, -0.2, 1.3, -1.3]), [tension], rtol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [1.3, 0.6, -0.2])
+def test_a_stick_that_swings_down_pulls_its_hinge_as_printed(angle):
+    """Along the stick M g (5 cos t - 3 cos t_0) / 2, across it M g sin t / 4, from rest at t_0.
+
+    SolutionInn, "A uniform stick of length L and mass M is hinged at one end".
+    """
+    mass, length, released = 1.7, 1.1, 1.4
+    hinge = CoincidentPoints("world", (0, 0, 0), "body", (0, 0, 0), "xz", "hinge")
+    links = flat(mass, mass * length**2 / 12, length / 2)
+    model = RobotModel(links, [hinge], [], [0, 0, angle - np.pi / 2], "stick", forces=[])
+    rate = np.sqrt(3 * G / length * (np.cos(angle) - np.cos(released)))
+    force = force_at(model, [0, 0, angle - np.pi / 2, 0, 0, rate])
+    # Toward the hinge, and toward larger angles.
+    inward, across = [-np.sin(angle), np.cos(angle)], [np.cos(angle), np.sin(angle)]
+    along = mass * G * (5 * np.cos(angle) - 3 * np.cos(released)) / 2
+    assert_allclose(np.dot(inward, force), along, rtol=1e-13)
+    assert_allclose(np.dot(across, force), mass * G * np.sin(angle) / 4, rtol=1e-13)
+
+
+def test_a_conical_pendulum_pulls_with_its_weight_by_the_cosine_and_comes_round():
+    """T = m g / cos t, and the period 2 pi sqrt(L cos t / g).
+
+    NoteTube, "Conical pendulum"; sookshmas.com, "Conical Pendulum".
+    """
+    mass, length, tilt = 0.4, 1.5, 0.7
+    string = FixedDistance("world", (0, 0, 0), "point", (0, 0, 0), length, "string")
+    q = [length * np.sin(tilt), 0.0, -length * np.cos(tilt)]
+    model = RobotModel(point(mass), [string], [], q, "conical pendulum", forces=[])
+    plant = RobotPlant(model)
+    rate = np.sqrt(G / (length * np.cos(tilt)))
+    context = plant.CreateDefaultContext()
+    start = np.array([*q, 0.0, rate * q[0], 0.0])
+    plant.set_state(context, start)
+    for share in (0.5, 0.5):
+        config = error_controlled(1e-12)
+        config.start_time = context.get_time()
+        simulate(plant, context, share * 2 * np.pi / rate, config)
+        start[[0, 4]] *= -1.0
+        assert_allclose(plant.state(context), start, atol=1e-9)
+        force = plant.GetOutputPort("constraint_force").Eval(context)
+        assert_allclose(force, [-mass * G / np.cos(tilt)], rtol=1e-10)
