@@ -69,6 +69,11 @@ def add_exogenous(
         )
     if not exogenous:
         return None
+    if any(reference.parameters for reference in exogenous):
+        raise WiringError(
+            "references of exogenous signals take no parameters: write their numbers into the "
+            "expressions"
+        )
     generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
     generator.set_name(f"{block.get_name()}_exogenous")
     builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
