@@ -68,7 +68,9 @@ def pressed_mass():
     )
     tracking = TrackingLaw(dae, poles(-2.0))
     loop = make_closed_loop(
-        DaePlant(dae), tracking, [SinusoidReference(0.0, 0.0, 1.0), SinusoidReference(9.0, 0.0, 1.0)]
+        DaePlant(dae),
+        tracking,
+        [SinusoidReference(0.0, 0.0, 1.0), SinusoidReference(9.0, 0.0, 1.0)],
     )
     context = loop.diagram.CreateDefaultContext()
     loop.set_state(context, dae.nominal_state)
@@ -93,7 +95,9 @@ def test_gains_of_least_quadratic_cost_are_those_of_the_riccati_equation():
 
     free = {"gains.z0": (0.1, 50.0)}
     result = optimize(loop, context, times, free, cost, config=config)
-    assert result.converged and result.active == () and not result.without_effect
+    assert result.converged
+    assert result.active == ()
+    assert not result.without_effect
     np.testing.assert_allclose(result.values, [rho**-0.5, 2.0**0.5 * rho**-0.25], rtol=2e-4)
     assert result.cost < result.cost_before
 
@@ -119,11 +123,16 @@ def test_of_a_drake_diagram():
         )
 
     free, bounded = best(10.0), best(1.5)
-    assert free["source"] == pytest.approx(2.0, abs=1e-5) and free.active == ()
-    assert bounded["source"] == pytest.approx(1.5, abs=1e-6) and bounded.active == ("source",)
+    assert free["source"] == pytest.approx(2.0, abs=1e-5)
+    assert free.active == ()
+    assert bounded["source"] == pytest.approx(1.5, abs=1e-6)
+    assert bounded.active == ("source",)
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(*with_compiler.values, marks=[*with_compiler.marks, pytest.mark.slow])])
+@pytest.mark.parametrize(
+    "compiled",
+    [False, pytest.param(*with_compiler.values, marks=[*with_compiler.marks, pytest.mark.slow])],
+)
 def test_derivatives_are_those_of_differences(compiled):
     """By the start off N*, a moved wall, masses, gains and parameters of references.
 
@@ -191,8 +200,10 @@ def test_the_context_of_the_result_runs_as_it_says():
         loop,
         context,
         free={"push": (0.0, 100.0), "wall.position[0]": (1.1, 1.3)},
-        cost=lambda run: ca.sumsqr(run["constraint_force"][-1, 0] - 24.0)
-        + ca.sumsqr(run["wall.position"] - 1.15),
+        cost=lambda run: (
+            ca.sumsqr(run["constraint_force"][-1, 0] - 24.0)
+            + ca.sumsqr(run["wall.position"] - 1.15)
+        ),
     )
     assert result["push"] == pytest.approx(40.0, abs=1e-3)
     assert result["wall.position[0]"] == pytest.approx(1.15, abs=1e-5)
@@ -227,10 +238,12 @@ def test_limits_hold_and_are_named():
         },
     )
     record = result.run.record
-    assert result.converged and result.violated == ()
+    assert result.converged
+    assert result.violated == ()
     assert np.abs(record["control"]).max() <= result["peak"] * (1.0 + 1e-5)
     assert np.abs(record["tracking_error"][15:, 0]).max() <= 2e-3 * (1.0 + 1e-5)
-    assert result.active[:2] == ("torque", "error") and "force" not in result.active
+    assert result.active[:2] == ("torque", "error")
+    assert "force" not in result.active
     # Not even a tenth less torque leaves as little error: gains on a grid about the optimum.
     start, parameters = start_values(loop, context)
     for first in np.linspace(20.0, 120.0, 6):
@@ -246,7 +259,8 @@ def test_limits_that_cannot_be_met_are_said_with_the_nearest():
     result = found(
         loop, context, limits=lambda run: {"torque": (-1.0, run["control"], 1.0)}, iterations=20
     )
-    assert not result.converged and result.violated == ("torque",)
+    assert not result.converged
+    assert result.violated == ("torque",)
     assert "Limit torque is not met: beyond it by" in result.text()
     before = np.abs(result.run.record["control"]).max() - 1.0
     assert result.limits[0].violation == pytest.approx(before)
@@ -265,8 +279,10 @@ def test_an_interrupted_search_has_the_best_so_far():
 
     loop, context = two_link()
     result = found(loop, context, seed=Seeds())
-    assert result.interrupted is signal.SIGINT and not result.converged
-    assert result.cost < result.cost_before and result.runs < 10
+    assert result.interrupted is signal.SIGINT
+    assert not result.converged
+    assert result.cost < result.cost_before
+    assert result.runs < 10
     assert "The search was interrupted; this is the best so far." in result.text()
 
 
@@ -346,7 +362,8 @@ def test_runs_that_fail_on_the_way_are_avoided():
     """Gains beyond 2 / 5 ms make steps of 5 ms unstable; the search goes on with lower ones."""
     loop, context = two_link()
     result = found(loop, context, end=0.5, free={"gains.tool.z": (1.0, 1e6)}, iterations=15)
-    assert result.cost < result.cost_before and np.isfinite(result.cost)
+    assert result.cost < result.cost_before
+    assert np.isfinite(result.cost)
     assert result.run.failure is None
 
 
