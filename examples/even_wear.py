@@ -47,7 +47,7 @@ def force(t: ca.SX, mean: ca.SX, amplitudes: ca.SX) -> ca.SX:
 
 
 def main(folder: Path) -> tuple[float, float, float]:
-    """Returns the variation over what it was, its excess over the least, and the error of the mean."""
+    """Returns the variation over what it was, its excess over the least, and the mean's error."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(dd.shipped_model("two_link_arm.urdf")))
     plant.Finalize()

@@ -134,10 +134,8 @@ class ReferenceGenerator(DifferentiableSystem):
             raise ReferenceSignalError(error)
         size = self.reference_parameters[name].size
         given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (size,)) or not np.isfinite(given).all():
-            raise ReferenceSignalError(
-                f"parameter '{name}' must have {size} finite entries, got {value!r}"
-            )
+        if given.shape not in ((), (size,)):
+            raise ReferenceSignalError(f"parameter '{name}' has {size} entries, got {value!r}")
         values = context.get_numeric_parameter(0).CopyToVector()
         values[self.places(name)] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)

@@ -10,7 +10,7 @@ from arms import arm, law
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
-from runs import scenario, with_compiler
+from runs import scenario
 
 from drake_dae import (
     DaePlant,
@@ -129,11 +129,7 @@ def test_of_a_drake_diagram():
     assert bounded.active == ("source",)
 
 
-@pytest.mark.parametrize(
-    "compiled",
-    [False, pytest.param(*with_compiler.values, marks=[*with_compiler.marks, pytest.mark.slow])],
-)
-def test_derivatives_are_those_of_differences(compiled):
+def test_derivatives_are_those_of_differences():
     """By the start off N*, a moved wall, masses, gains and parameters of references.
 
     To 1e-7 of the largest: differences of fourth order with steps of 1e-3 leave 1e-12, and
@@ -154,7 +150,6 @@ def test_derivatives_are_those_of_differences(compiled):
     loop.plant.set_consistent_state(
         loop.plant.GetMyMutableContextFromRoot(context), chosen.model.dae.nominal_state
     )
-    program_of(loop).choice = compiled
     start, parameters = start_values(loop, context)
     free = dict.fromkeys(
         ("start.joint1", "link2.mass", "plant.link1.mass", "gains.tool.z", "wall.position[0]"),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from actuated import actuated
@@ -16,6 +17,7 @@ from drake_dae import (
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
+    ExpressionReference,
     ForceSensor,
     MotionLimits,
     Observing,
@@ -61,6 +63,15 @@ def measured_law(integral, gain=0.5):
 
 def references():
     height, force = SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)
+    return ReferenceGenerator([height, force], law("two_link").degrees)
+
+
+def references_with_parameters():
+    def push(t, level, wave):
+        return level + wave[0] * ca.sin(wave[1] * t)
+
+    height = SinusoidReference(0.3, 0.3, 1.5)
+    force = ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
     return ReferenceGenerator([height, force], law("two_link").degrees)
 
 
@@ -143,6 +154,7 @@ BLOCKS = {
         actuated("two_link", "flexible").model, PointMaterial(0.01, friction=0.3)
     ),
     "ReferenceGenerator": references,
+    "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: TrackingController(law("two_link")),
     "TrackingController that knows its references": lambda: TrackingController(
         law("two_link"), references=references()

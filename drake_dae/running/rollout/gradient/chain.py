@@ -14,7 +14,6 @@ from drake_dae.running.rollout.run import Problem, Tableau
 from drake_dae.running.rollout.stepping.called import Called
 from drake_dae.running.rollout.stepping.course import REACHED
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
-from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
 MOST = 8
 """So often two Newton steps may follow each other, as the rollout has it."""
@@ -37,16 +36,10 @@ class Link(NamedTuple):
 
 
 class Differentiable:
-    """A function with its derivatives in both directions, made when they are needed.
+    """A function with its derivatives in both directions, made when they are needed."""
 
-    Args:
-        function: The function.
-        compiled: Whether the derivatives forward become machine code, see `trace.compiled`.
-    """
-
-    def __init__(self, function: ca.Function, compiled: Compiled) -> None:
+    def __init__(self, function: ca.Function) -> None:
         self._function, self.value = function, Called(function)
-        self._compiled = compiled
         self.forward = cache(self._forward)
         self.backward = cache(self._backward)
 
@@ -56,8 +49,7 @@ class Differentiable:
         Args:
             count: How many changes are followed at once, side by side.
         """
-        function = _forward(self._function, count)
-        return OftenCalled(function, self._compiled, int(function.n_instructions()))
+        return Called(_forward(self._function, count))
 
     def _backward(self) -> Called:
         """(arguments, weights of the result) -> the gradient by state, held and parameters."""
@@ -74,15 +66,14 @@ class Step(Differentiable):
     Args:
         rate: The derivative of the state.
         tableau: The method.
-        compiled: As of `Differentiable`.
     """
 
-    def __init__(self, rate: ca.Function, tableau: Tableau, compiled: Compiled) -> None:
-        super().__init__(_step(rate, tableau), compiled)
+    def __init__(self, rate: ca.Function, tableau: Tableau) -> None:
+        super().__init__(_step(rate, tableau))
         self._rate, self._tableau = rate, tableau
 
     def _forward(self, count: int) -> Called:
-        # The stages share one function, which keeps the code of many changes short.
+        # The stages share one function, which keeps the derivatives by many changes short.
         rate, sizes = _forward(self._rate, count), [self._rate.numel_in(i) for i in range(4)]
         time, state, held, parameters = (ca.MX.sym("x", size) for size in sizes)
         step = ca.MX.sym("step")
@@ -96,35 +87,7 @@ class Step(Differentiable):
         b = self._tableau.b
         found = [state + step * _sum(b, values), changes[0] + step * _sum(b, slopes)]
         symbols = [time, state, held, parameters, step, *changes]
-        function = ca.Function("forward", symbols, found)
-        return OftenCalled(function, self._compiled, len(b) * int(rate.n_instructions()))
-
-
-class OftenCalled(Called):
-    """A function that becomes machine code once it has been called so often that this pays.
-
-    Args:
-        function: The function.
-        compiled: The choice, see `trace.compiled`.
-        operations: How many operations it has.
-    """
-
-    def __init__(self, function: ca.Function, compiled: Compiled, operations: int) -> None:
-        super().__init__(function)
-        self._function, self._compiled = function, compiled
-        self._attempts = attempts(compiled, operations)
-        self._left = self._attempts[0].calls if self._attempts else -1
-
-    def __call__(self, *arguments: FloatArray | float) -> list[FloatArray]:
-        self._left -= 1
-        if not self._left:
-            make = self._attempts.pop(0).make
-            code = machine_code(self._function, self._compiled, make)
-            if code is not None:
-                self._bind(code)
-            elif self._attempts:
-                self._left = self._attempts[0].calls
-        return super().__call__(*arguments)
+        return Called(ca.Function("forward", symbols, found))
 
 
 class Links:
@@ -196,15 +159,15 @@ class Links:
         return self._functions[name]
 
     def _made(self, name: str) -> "Differentiable":
-        compiled, choice = self._program.compiled, self._program.choice
+        compiled = self._program.compiled
         if name == "row":
-            return Differentiable(compiled.row, choice)
+            return Differentiable(compiled.row)
         if name == "newton":
             return _newton(self._program)
         if name == "step":
-            return Step(compiled.rate, self._tableau, choice)
+            return Step(compiled.rate, self._tableau)
         _, due, kind = name.split()
-        return Differentiable(_updates(compiled, int(due), kind == "True"), choice)
+        return Differentiable(_updates(compiled, int(due), kind == "True"))
 
 
 def projected(
@@ -231,9 +194,7 @@ def projected(
 
 def _newton(program: Program) -> Differentiable:
     """Two Newton steps to N*."""
-    return program.kept(
-        "gradient newton", lambda: Differentiable(program.compiled.newton(2), program.choice)
-    )
+    return program.kept("gradient newton", lambda: Differentiable(program.compiled.newton(2)))
 
 
 def _symbols(function: ca.Function) -> list[ca.SX]:

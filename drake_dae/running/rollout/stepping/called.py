@@ -22,10 +22,6 @@ class Called:
 
         self._arrays = [array(function.size_in(i)) for i in range(function.n_in())]
         self.results = [array(function.size_out(i)) for i in range(function.n_out())]
-        self._bind(function)
-
-    def _bind(self, function: ca.Function) -> None:
-        """Binds a function to the arrays, to be called from now on."""
         self._buffer, self._evaluate = function.buffer()
         for index, own in enumerate(self._arrays):
             self._buffer.set_arg(index, own.reshape(-1).data)
