@@ -136,6 +136,10 @@ from .studies.excitation.excite import excite as excite
 from .studies.excitation.promised import Promised as Promised
 from .studies.identification.identified import Identified as Identified
 from .studies.identification.identify import identify as identify
+from .studies.optimization.expressions import RunSymbols as RunSymbols
+from .studies.optimization.optimize import optimize as optimize
+from .studies.optimization.optimum import LimitState as LimitState
+from .studies.optimization.optimum import Optimum as Optimum
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations
@@ -149,11 +153,11 @@ from .systems.control.command_filter import CommandLimits as CommandLimits
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
+from .systems.control.drake_references import SystemReference as SystemReference
+from .systems.control.drake_references import TrajectoryReference as TrajectoryReference
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
-from .systems.control.references import SystemReference as SystemReference
-from .systems.control.references import TrajectoryReference as TrajectoryReference
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
 from .systems.observing.estimator import StateEstimator as StateEstimator

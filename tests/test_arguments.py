@@ -53,6 +53,7 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.surfaces.surface import Surface
+from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -60,6 +61,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.identification.identified import Identified, Noise
 from drake_dae.studies.identification.unknowns import Unknown
+from drake_dae.studies.optimization.variables import Variable as Variable_
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
@@ -170,6 +172,13 @@ def textbook() -> dd.LinkExpressions:
 
 
 @cache
+def rolled() -> Rollout:
+    start, parameters = dd.start_values(loop(), context_of(None))
+    (found,) = dd.rollout(loop(), start, parameters, [0.0, 0.01], config=fixed_step())
+    return found
+
+
+@cache
 def scenario() -> Scenario:
     return dd.load_scenario(find_scenario("two_link_wall"))
 
@@ -194,6 +203,13 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Excitation: lambda: dd.Excitation(
         scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
     ),
+    Rollout: rolled,
+    Variable_: lambda: Variable_("link1.mass"),
+    dd.LimitState: lambda: dd.LimitState("torque", 0.0, 1, 2),
+    dd.Optimum: lambda: dd.Optimum(
+        context_of(None), rolled(), (), np.zeros(0), {}, 1.0, 0.5, (), 1, 2, True, "Solve_Succeeded"
+    ),
+    dd.RunSymbols: lambda: dd.RunSymbols([0.0, 0.1], {"x": [dd.Signal("x")]}, ["link1.mass"]),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,

@@ -261,7 +261,7 @@ class CompiledDiagram:
         parts = dict(self.parameters)
         found = np.full(len(parameters), bool(self.twins))
         for plant, controller in self.twins.items():
-            own, of_law = parts[plant], parts[controller]
+            own, of_law = parts.get(plant, slice(0, 0)), parts[controller]
             size = own.stop - own.start
             same = parameters[:, own] == parameters[:, of_law][:, :size]
             same[:, list(self.blocks[plant].moving)] = True

@@ -84,6 +84,11 @@ def _add_exogenous(
         )
     if not exogenous:
         return None
+    if any(reference.parameters for reference in exogenous):
+        raise WiringError(
+            "references of exogenous signals take no parameters: write their numbers into the "
+            "expressions"
+        )
     degrees, signals = block.exogenous_layout.degrees, dae.exogenous.signals
     made = ReferenceGenerator(exogenous, degrees)
     if commands is not None:

@@ -34,8 +34,9 @@ from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.drake_references import SystemReference
 from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.references import ReferenceGenerator, SystemReference
+from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.contract import Plant
@@ -102,7 +103,7 @@ def make_closed_loop(
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
     is_fed_back = (
-        reference.follows_time
+        reference.is_by_time
         and plant.HasInputPort("feedback")
         and can_be_fed_back(law, settings.sampling, settings.control_limits)
     )
@@ -179,7 +180,6 @@ def wire_loop(
         builder.Connect(control, plant.GetInputPort("control"))
         if goal is not None and controller.HasInputPort("reference"):
             builder.Connect(goal, controller.GetInputPort("reference"))
-
     if controller.HasInputPort("acting_control"):
         builder.Connect(control, controller.GetInputPort("acting_control"))
 

@@ -7,6 +7,7 @@ that order, "tool.yz"; or a list of such names, "tool.y, joint3".
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -44,6 +45,13 @@ class ReferenceRows(Reference):
     @property
     def size(self) -> int:
         return len(self.rows)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:  # type: ignore[override]
+        return self.reference.parameters
+
+    def with_parameters(self, values: Mapping[str, Any]) -> Reference:
+        return ReferenceRows(self.reference.with_parameters(values), self.rows)
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         needed = self._needed(degrees)

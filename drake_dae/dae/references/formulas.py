@@ -1,8 +1,10 @@
 """References that are expressions of time: constants, sinusoids, moves, and any other."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from math import comb
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import vector
 from drake_dae.dae.references.reference import FormulaReference, Reference
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.given import result_of
@@ -131,35 +134,57 @@ class PointToPointReference(FormulaReference):
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ExpressionReference(FormulaReference):
-    """A reference that is any CasADi expression of time.
+    """A reference that is any CasADi expression of time, and of parameters by their names.
+
+    ExpressionReference(lambda t, height: height * casadi.sin(2 * t), {"height": 0.1}) has a
+    parameter, which stands in the context of the `ReferenceGenerator`: `optimize` and studies
+    change it without tracing again. References with a parameter of the same name share it.
 
     Attributes:
-        function: Takes the time in s, a CasADi scalar; returns an expression, or a list of these.
+        function: Takes the time in s, a CasADi scalar, and each parameter by its name, a CasADi
+            column; returns an expression, or a list of these.
+        parameters: Name -> value, a number or shape (k,).
 
     Raises:
-        ReferenceSignalError: The function returns no such expression; or, when `derivatives` is
-            called with mu_i >= 1, the expression has a constant that is not finite, or an
-            operation on time that is not smooth, such as fabs.
+        ReferenceSignalError: The function returns no such expression, or a parameter is no finite
+            number; or, when `derivatives` is called with mu_i >= 1, the expression has a constant
+            that is not finite, or an operation on time that is not smooth, such as fabs.
     """
 
-    function: Callable[[ca.SX], Any]
+    function: Callable[..., Any]
+    parameters: Mapping[str, ArrayLike | ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        known = {}
+        for name, value in self.parameters.items():
+            if not isinstance(value, ca.SX):
+                what = f"parameter '{name}'"
+                value = vector(what, np.atleast_1d(value), None, ReferenceSignalError)
+            known[name] = value
+        object.__setattr__(self, "parameters", MappingProxyType(known))
         time = ca.SX.sym("t")
         rows = self.rows(time)
-        unknown = [s.name() for s in ca.symvar(rows) if not ca.is_equal(s, time)]
+        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in known.values())))
+        own = {symbol.element_hash() for symbol in symbols}
+        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in own]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
-                "a reference must be a column of expressions of the time alone, got shape "
-                f"{rows.shape} with {', '.join(unknown) or 'no'} other symbols"
+                "a reference must be a column of expressions of the time and its parameters "
+                f"alone, got shape {rows.shape} with {', '.join(unknown) or 'no'} other symbols"
             )
 
     @property
     def size(self) -> int:
         return int(self.rows(ca.SX.sym("t")).numel())
 
+    def with_parameters(self, values: Mapping[str, ArrayLike | ca.SX]) -> "ExpressionReference":
+        own = {name: values.get(name, value) for name, value in self.parameters.items()}
+        return ExpressionReference(self.function, own)
+
     def rows(self, time: ca.SX) -> ca.SX:
-        value = result_of("function", self.function, time, error=ReferenceSignalError)
+        given = {name: ca.SX(value) for name, value in self.parameters.items()}
+        function = partial(self.function, **given)
+        value = result_of("function", function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
         except (NotImplementedError, RuntimeError) as error:

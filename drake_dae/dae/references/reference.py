@@ -1,10 +1,11 @@
 """The contract of a reference, and all references as one function of time."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar, Self
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -31,9 +32,14 @@ class Reference(ABC):
        remedy. The function refuses a time without a value.
     6. A reference that is an expression of time returns it in `expression`, so that all references
        are traced as one function. The values are the same.
-    7. A reference with a file reads it when it is used. `beside` makes its path absolute. `remark`
+    7. Numbers that a study changes in a context are `parameters`, and `with_parameters` is the same
+       reference with other values, or with symbols. Most references have none.
+    8. A reference with a file reads it when it is used. `beside` makes its path absolute. `remark`
        describes approximations of the file's data.
     """
+
+    parameters: Mapping[str, Any] = MappingProxyType({})
+    """Name -> values of the numbers that a study changes, each of shape (k,)."""
 
     is_table: ClassVar[bool] = False
     """Whether its function takes less time than its expression, as that of many polynomials."""
@@ -62,6 +68,10 @@ class Reference(ABC):
         """
         return None
 
+    def with_parameters(self, values: Mapping[str, Any]) -> "Reference":
+        """The same reference with other values of its parameters, or with columns of symbols."""
+        return self
+
     def beside(self, folder: Path) -> Self:
         """The same reference with its file relative to a folder."""
         return self
@@ -84,8 +94,9 @@ class FormulaReference(Reference):
         """Refuses references without derivatives up to the degrees."""
         time = ca.SX.sym("t")
         rows = self.rows(time)
+        others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
         for i, degree in enumerate(degrees):
-            flaw = find_flaw(rows[i], time, ca.SX(0, 1))
+            flaw = find_flaw(rows[i], time, ca.vertcat(ca.SX(0, 1), *others))
             if degree and flaw:
                 raise ReferenceSignalError(
                     f"row {i} of the reference {flaw.describe('the time')}. The law needs {degree} "
@@ -142,7 +153,7 @@ def stack_references(
     def evaluate(time: float) -> FloatArray:
         value = np.concatenate([function(time) for function in functions])
         if not np.isfinite(value).all():
-            raise _not_finite(time, value)
+            raise not_finite(time, value)
         return value
 
     return evaluate
@@ -156,11 +167,12 @@ def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
     def evaluate(time: float) -> FloatArray:
         moment[0] = time
         if not function.run():
-            raise _not_finite(time, value)
+            raise not_finite(time, value)
         return value
 
     return evaluate
 
 
-def _not_finite(time: float, value: FloatArray) -> NonFiniteError:
+def not_finite(time: float, value: FloatArray) -> NonFiniteError:
+    """The error of a reference without a value at a time in s."""
     return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)

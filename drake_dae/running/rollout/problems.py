@@ -213,7 +213,7 @@ def _plants(
     for system, block in compiled.blocks.items():
         if block.check_start is None:
             continue
-        now = row[parameters[system]]
+        now = row[parameters.get(system, slice(0, 0))]
         if system in compiled.moved_parameters:
             now = compiled.moved_parameters[system](time, state, held, row).full()[:, 0]
         found.append((states[system], now, block))

@@ -67,9 +67,9 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     if "exogenous" in values:  # Logged, since it does not follow from the time.
         known["parameters"][:, plant.exogenous_places] = values["exogenous"]
     elif loop.plant_exogenous is not None:
-        values["exogenous"] = loop.plant_exogenous.along(times)
+        values["exogenous"] = _along(loop.plant_exogenous, times, context)
     if loop.generator is not None and "reference" not in values:
-        values["reference"] = loop.generator.along(times)
+        values["reference"] = _along(loop.generator, times, context)
     if "control" not in known:
         given = {**known, "reference": values["reference"]}
         values["control"] = known["control"] = _control_along(loop, context, times, given)
@@ -114,8 +114,12 @@ def _parameters_along(
     values = block.parameters_along(block.GetMyContextFromRoot(context), times)
     moving = loop.plant_exogenous if block is loop.plant else loop.exogenous
     if moving is not None:
-        values[:, block.exogenous_places] = moving.along(times)
+        values[:, block.exogenous_places] = _along(moving, times, context)
     return values
+
+
+def _along(generator: ReferenceGenerator, times: FloatArray, context: Context) -> FloatArray:
+    return generator.along(times, generator.GetMyContextFromRoot(context))
 
 
 def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:

@@ -15,7 +15,9 @@ AGAIN = 1e-3
 
 
 @contextmanager
-def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
+def ending_signals(
+    handle: Callable[[signal.Signals], None], *, in_callbacks: bool = False
+) -> Iterator[None]:
     """Calls a function when a signal asks the process to end, as long as the block lasts.
 
     Python allows this in the main thread only; in other threads nothing changes. A SIGHUP that is
@@ -24,6 +26,7 @@ def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
     Args:
         handle: Gets the signal, between two instructions of Python outside of callbacks from
             CasADi, which loses exceptions raised in them.
+        in_callbacks: Whether it gets the signal in these, too, since it raises nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -31,7 +34,7 @@ def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
     previous = {}
 
     def received(number: int, frame: FrameType | None) -> None:
-        if _is_called_by_casadi(frame):
+        if not in_callbacks and _is_called_by_casadi(frame):
             # Again, a moment later.
             later = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
             later.daemon = True

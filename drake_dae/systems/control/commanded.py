@@ -45,7 +45,7 @@ class CommandedReferences(ReferenceGenerator):
         has_speed, depth: As of `CommandFilter`.
 
     Raises:
-        ReferenceSignalError: As of `ReferenceGenerator`.
+        ReferenceSignalError: As of `ReferenceGenerator`; or a reference has parameters.
     """
 
     def __init__(
@@ -60,6 +60,11 @@ class CommandedReferences(ReferenceGenerator):
         depth: int = 0,
     ) -> None:
         super().__init__(references, degrees)
+        if self.reference_parameters:
+            raise ReferenceSignalError(
+                "references with parameters cannot be commanded: write the numbers of "
+                f"{', '.join(self.reference_parameters)} into the expressions"
+            )
         self.filter = CommandFilter(signals, degrees, limits, has_speed=has_speed, depth=depth)
         self.DeclareNumericParameter(BasicVector(self.filter.defaults))
         self.DeclareContinuousState(BasicVector(self.filter.start(start_time)))

@@ -123,7 +123,7 @@ class TrackingController(ParameterizedSystem, Controller):
         self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
         self._references = references
         if references is not None:
-            self._reference_at = references.function
+            self._reference_at = references.by_time
             self._reference_port = self.GetInputPort("reference")
             self._evaluators[1] = weakly(self.reference_now)
         self._declare_exogenous(law.exogenous_degrees)

@@ -1,176 +1,27 @@
-"""References as a LeafSystem, and Drake's trajectories as references.                (28)"""
+"""References as a LeafSystem.                                                         (28)"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket, System
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, vector
+from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
 from drake_dae.dae.references import Reference, ReferenceRows, stack_references
 from drake_dae.dae.references.pieces import MOST_IN_EXPRESSION
-from drake_dae.dae.references.reference import with_degrees
+from drake_dae.dae.references.reference import not_finite, with_degrees
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.along import signal_along
 from drake_dae.systems.blocks.block import DifferentiableSystem
-from drake_dae.systems.blocks.formulas import Formula
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import TIME, Block, Computation
+from drake_dae.systems.blocks.traced import PARAMETERS, TIME, Block, Computation
 from drake_dae.trace.functions import TracedFunction
-
-
-@checked(ReferenceSignalError)
-@dataclass(frozen=True, eq=False)
-class TrajectoryReference(Reference):
-    """A reference that is a Drake Trajectory, with the derivatives that it provides itself.
-
-    Attributes:
-        trajectory: Any column-valued Trajectory, shape (k, 1).
-
-    Raises:
-        ReferenceSignalError: The Trajectory is not a column; when `derivatives` is called, it has
-            no derivatives, or is a PiecewisePolynomial of which a derivative below the highest one
-            jumps at a break; or, during a run, the time is outside its range, which Drake would
-            silently clip.
-    """
-
-    trajectory: Trajectory
-
-    def __post_init__(self) -> None:
-        if self.trajectory.cols() != 1:
-            raise ReferenceSignalError(
-                "a reference Trajectory must be a column, this one is "
-                f"{self.trajectory.rows()} x {self.trajectory.cols()}"
-            )
-
-    @property
-    def size(self) -> int:
-        return int(self.trajectory.rows())
-
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        highest = max(degrees)
-        path = self.trajectory
-        if highest and not path.has_derivative():
-            raise ReferenceSignalError(
-                f"{type(path).__name__} has no derivatives, the law needs {highest}"
-            )
-        if isinstance(path, PiecewisePolynomial):
-            self._check_breaks(path, degrees)
-        first, last = path.start_time(), path.end_time()
-        slack = 1e-9 * max(1.0, abs(last))
-
-        def evaluate(time: float) -> FloatArray:
-            if not first - slack <= time <= last + slack:
-                raise ReferenceSignalError(
-                    f"the reference Trajectory covers {first:g} to {last:g} s and was asked for "
-                    f"t = {time:g} s; extend it over the whole simulation"
-                )
-            table = [path.value(time)] + [
-                path.EvalDerivative(time, k) for k in range(1, highest + 1)
-            ]
-            return np.array(
-                [table[k][i, 0] for i, degree in enumerate(degrees) for k in range(degree + 1)]
-            )
-
-        return evaluate
-
-    @staticmethod
-    def _check_breaks(path: PiecewisePolynomial, degrees: Sequence[int]) -> None:
-        breaks = path.get_segment_times()[1:-1]
-        for order in range(max(degrees)):
-            derivative = path.derivative(order) if order else path
-            for index, time in enumerate(breaks):
-                left = derivative.getPolynomialMatrix(index)
-                right = derivative.getPolynomialMatrix(index + 1)
-                width = time - path.get_segment_times()[index]
-                for i, degree in enumerate(degrees):
-                    before, after = (
-                        left[i, 0].EvaluateUnivariate(width),
-                        right[i, 0].EvaluateUnivariate(0.0),
-                    )
-                    if order < degree and abs(before - after) > 1e-6 * (1.0 + abs(before)):
-                        raise ReferenceSignalError(
-                            f"derivative {order} of row {i} of the reference Trajectory jumps by "
-                            f"{after - before:.3g} at t = {time:g} s, but the law needs a "
-                            f"reference with {degree} derivatives; use a smoother trajectory"
-                        )
-
-
-@checked(ReferenceSignalError)
-@dataclass(frozen=True, eq=False)
-class SystemReference(Reference):
-    """A reference that a Drake System computes from the time alone, with its derivatives.
-
-    The system has one output port: r_1, r_1', ..., r_1^(nu_1), r_2, ..., output-major. A LeafSystem
-    may compute any function; it must ensure that each value is the derivative of the one before it.
-
-    Attributes:
-        system: The system; it has no inputs and no state.
-        degrees: The number of derivatives nu_1, ..., nu_k of each output.
-
-    Raises:
-        ReferenceSignalError: The system has inputs, a state or another output; or, when
-            `derivatives` is called, too few derivatives.
-    """
-
-    system: System
-    degrees: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "degrees", tuple(self.degrees))
-        system, size = self.system, Layout(self.degrees).reference_size
-        if not self.degrees or min(self.degrees) < 0:
-            raise ReferenceSignalError(
-                f"degrees must be one whole number from 0 for each output, got {self.degrees}"
-            )
-        name = system.get_name() or type(system).__name__
-        context = system.CreateDefaultContext()
-        if system.num_input_ports() or not context.is_stateless():
-            raise ReferenceSignalError(
-                f"'{name}' has inputs or a state, so that its output does not follow from the time "
-                "alone. Wire it yourself: make a RobotPlant and a TrackingController(law), and "
-                f"builder.Connect its output, of size {size}, to "
-                'controller.GetInputPort("reference")'
-            )
-        ports = [system.get_output_port(index) for index in range(system.num_output_ports())]
-        if [port.size() for port in ports] != [size]:
-            found = ", ".join(f"{port.get_name()} ({port.size()})" for port in ports) or "none"
-            raise ReferenceSignalError(
-                f"'{name}' must have one output port, of size {size}: each output with its "
-                f"{', '.join(map(str, self.degrees))} derivatives, as r_1, r_1', ..., r_2, ...; it "
-                f"has {found}"
-            )
-
-    @property
-    def size(self) -> int:
-        return len(self.degrees)
-
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        for row, (needed, given) in enumerate(zip(degrees, self.degrees, strict=True)):
-            if needed > given:
-                raise ReferenceSignalError(
-                    f"the law needs {needed} derivatives of row {row}, its system gives {given}"
-                )
-        context, port = self.system.CreateDefaultContext(), self.system.get_output_port()
-        table = Layout(self.degrees)
-        places = [
-            first + k
-            for first, degree in zip(table.lowest, degrees, strict=True)
-            for k in range(degree + 1)
-        ]
-
-        def evaluate(time: float) -> FloatArray:
-            context.SetTime(time)
-            return np.asarray(port.Eval(context))[places]
-
-        return evaluate
 
 
 @checked(ReferenceSignalError)
@@ -187,13 +38,16 @@ class ReferenceGenerator(DifferentiableSystem):
 
     Attributes:
         references, degrees: The arguments.
-        function: R(t) as a function of the time in s, whose array the next call overwrites.
+        reference_parameters: Name -> default of each parameter of its references, shape (k,); they
+            stand below each other in numeric parameter 0. Those of one name are one.
+        function: R(t) with these defaults as a function of the time in s, whose array the next call
+            overwrites.
 
     The block converts to AutoDiffXd. If the time has derivatives, each reference needs one more.
 
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
-            enough.
+            enough; or two of them have a parameter of one name and different values.
         NonFiniteError: A reference is not finite on the way; the exception has the time.
     """
 
@@ -209,6 +63,10 @@ class ReferenceGenerator(DifferentiableSystem):
             )
         self.references, self.degrees = tuple(references), tuple(degrees)
         self.function = stack_references(references, degrees)
+        self.reference_parameters = _common_parameters(self.references)
+        if self.reference_parameters:
+            values = np.concatenate([*self.reference_parameters.values()])
+            self.DeclareNumericParameter(BasicVector(values))
         self.DeclareVectorOutputPort(
             "reference",
             sum(degree + 1 for degree in degrees),
@@ -218,7 +76,7 @@ class ReferenceGenerator(DifferentiableSystem):
 
     def _sources(self) -> set[DependencyTicket]:
         """What R depends on."""
-        return {self.time_ticket()}
+        return {self.time_ticket(), self.all_parameters_ticket()}
 
     @property
     def further_signals(self) -> dict[str, tuple[Signal, ...]]:
@@ -227,29 +85,132 @@ class ReferenceGenerator(DifferentiableSystem):
 
     @property
     def follows_time(self) -> bool:
-        """Whether R follows from the time alone."""
+        """Whether R follows from the time and the parameters in a context."""
         return not (self.num_input_ports() or self.num_continuous_states())
 
     def reference(self, time: float) -> FloatArray:
-        """R(t) at a time in s, shape (sum (mu_i + 1),)."""
+        """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
         return self.function(time).copy()
 
-    def along(self, times: ArrayLike) -> FloatArray:
-        """R(t) at many times in s, one row for each; nan for times without a value."""
+    def along(self, times: ArrayLike, context: Context | None = None) -> FloatArray:
+        """R(t) at many times in s, one row for each; nan for times without a value.
+
+        Args:
+            times: The times.
+            context: The block's context with the values of parameters; the defaults if None.
+        """
         moments = vector("times", times, None, ReferenceSignalError)
-        return signal_along(self.function, self.get_output_port().size(), moments)
+        function = self.function if context is None else self._in(context)
+        return signal_along(function, self.get_output_port().size(), moments)
+
+    @property
+    def is_by_time(self) -> bool:
+        """Whether R follows from the time alone."""
+        return self.follows_time and not self.reference_parameters
+
+    @property
+    def by_time(self) -> Callable[[float], FloatArray]:
+        """R(t) as a function of the time alone.
+
+        Raises:
+            ModelError: It has parameters, whose values stand in a context.
+        """
+        if self.reference_parameters:
+            raise ModelError(
+                "references with parameters need a wire from their ReferenceGenerator, whose "
+                "context has the values: leave out references="
+            )
+        return self.function
+
+    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
+        """Changes a parameter of its references in a context.
+
+        Args:
+            context: The context of this system.
+            name: Its name.
+            value: The new value, shape (k,), or a number for all entries.
+
+        Raises:
+            ReferenceSignalError: There is no such parameter, or the value does not fit.
+        """
+        self.check_context(context)
+        if name not in self.reference_parameters:
+            error = unknown_name("parameter of references", name, self.reference_parameters)
+            raise ReferenceSignalError(error)
+        size = self.reference_parameters[name].size
+        given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
+        if given.shape not in ((), (size,)):
+            raise ReferenceSignalError(f"parameter '{name}' has {size} entries, got {value!r}")
+        values = context.get_numeric_parameter(0).CopyToVector()
+        values[self.places(name)] = given
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+    def places(self, name: str) -> slice:
+        """Where a parameter stands in numeric parameter 0."""
+        first = 0
+        for known, value in self.reference_parameters.items():
+            if known == name:
+                return slice(first, first + value.size)
+            first += value.size
+        raise ReferenceSignalError(
+            unknown_name("parameter of references", name, self.reference_parameters)
+        )
+
+    def _in(self, context: Context) -> Callable[[float], FloatArray]:
+        """R(t) by the parameters of a context."""
+        if not self.reference_parameters:
+            return self.function
+        values = context.get_numeric_parameter(0).value()
+
+        def evaluate(time: float) -> FloatArray:
+            (found,) = self._traced.evaluate(np.array([time]), values)
+            if not self._traced.is_valid:
+                raise not_finite(time, found)
+            return found
+
+        return evaluate
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.function(context.get_time()))
+        output.SetFromVector(self._in(context)(context.get_time()))
+
+    @cached_property
+    def _traced(self) -> TracedFunction:
+        """R by the time and, if there are any, the parameters."""
+        inputs = {"time": ca.SX.sym("t")}
+        symbols = {
+            name: ca.SX.sym(name, value.size) for name, value in self.reference_parameters.items()
+        }
+        references = [each.with_parameters(symbols) for each in self.references]
+        rows = traced_references(references, self.degrees, inputs["time"])
+        if symbols:
+            inputs["parameters"] = ca.vertcat(*symbols.values())
+        return TracedFunction("reference", inputs, {"R": rows})
 
     def traced(self) -> Block:
-        time = ca.SX.sym("t")
-        rows = traced_references(self.references, self.degrees, time)
-        function = TracedFunction("reference", {"time": time}, {"R": rows})
-        return Block(self, (Computation.of(function, (TIME,), ("reference",)),))
+        sources = (TIME, PARAMETERS) if self.reference_parameters else (TIME,)
+        return Block(self, (Computation.of(self._traced, sources, ("reference",)),))
 
     def _formulas(self) -> dict[str, Formula]:
+        if self.reference_parameters:
+            return {"reference": TracedFormula(self._traced, "R")}
         return {"reference": _ReferenceFormula(self.references, self.degrees)}
+
+
+def _common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
+    """The parameters of all references.
+
+    Raises:
+        ReferenceSignalError: Two have different values for one name.
+    """
+    found: dict[str, FloatArray] = {}
+    for reference in references:
+        for name, value in reference.parameters.items():
+            if not np.array_equal(found.setdefault(name, value), value):
+                raise ReferenceSignalError(
+                    f"two references have a parameter '{name}', with {found[name]} and {value}: "
+                    "give them one value, or two names"
+                )
+    return found
 
 
 def traced_references(

@@ -78,6 +78,11 @@ class PathGovernor(ReferenceGenerator):
         sample_period: float = 0.0,
     ) -> None:
         super().__init__(references, law.degrees)
+        if self.reference_parameters:
+            raise ModelError(
+                "a governor takes references without parameters, these have "
+                f"{', '.join(self.reference_parameters)}: write their numbers into the expressions"
+            )
         self.law, self.governing = law, Governing(law, tuple(references), limits)
         self.sample_period = sample_period
         self._steps = StepWatch(self)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from actuated import actuated
@@ -18,6 +19,7 @@ from drake_dae import (
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
+    ExpressionReference,
     ForceSensor,
     MotionLimits,
     Observing,
@@ -70,6 +72,15 @@ def commanded():
     of = law("two_link")
     own, signals = references().references, of.system.output_signals
     return CommandedReferences(own, of.degrees, signals, CommandLimits(), 0.4)
+
+
+def references_with_parameters():
+    def push(t, level, wave):
+        return level + wave[0] * ca.sin(wave[1] * t)
+
+    height = SinusoidReference(0.3, 0.3, 1.5)
+    force = ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
+    return ReferenceGenerator([height, force], law("two_link").degrees)
 
 
 def narrow():
@@ -152,6 +163,7 @@ BLOCKS = {
     ),
     "ReferenceGenerator": references,
     "CommandedReferences": commanded,
+    "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: TrackingController(law("two_link")),
     "TrackingController that knows its references": lambda: TrackingController(
         law("two_link"), references=references()

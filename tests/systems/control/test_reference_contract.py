@@ -70,6 +70,10 @@ MEMBERS = {
     "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
     "point to point": PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
     "expression": ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
+    "parameters": ExpressionReference(
+        lambda t, rise, sway: [rise * ca.sin(2 * t), ca.dot(sway, ca.vertcat(t, t**2))],
+        {"rise": 0.3, "sway": [0.5, -0.2]},
+    ),
     "trajectory": TrajectoryReference(PATH),
     "line": LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
     "circle": CircleReference([0.0, 1.0], 0.3, period=2.0),
@@ -161,6 +165,27 @@ def test_rule_5_what_is_too_rough_is_refused_before_it_is_used(name):
     ROUGH[name].derivatives([0] * size)
     with pytest.raises(ReferenceSignalError, match="needs"):
         ROUGH[name].derivatives([3] * size)
+
+
+def test_rule_7_with_other_parameters_it_is_another_reference_of_the_same_form(reference):
+    """With its own values it is the same, with symbols an expression of these."""
+    own = reference.with_parameters(reference.parameters)
+    degrees = [1] * reference.size
+    for time in TIMES:
+        np.testing.assert_array_equal(
+            own.derivatives(degrees)(time), reference.derivatives(degrees)(time)
+        )
+    if not reference.parameters:
+        return
+    symbols = {name: ca.SX.sym(name, value.size) for name, value in reference.parameters.items()}
+    time = ca.SX.sym("t")
+    rows = reference.with_parameters(symbols).expression(degrees, time)
+    for factor in (1.0, -2.0):
+        values = {name: factor * value for name, value in reference.parameters.items()}
+        found = ca.Function("R", [time, *symbols.values()], [rows])(0.4, *values.values())
+        wanted = reference.with_parameters(values).derivatives(degrees)(0.4)
+        np.testing.assert_allclose(found.full()[:, 0], wanted, rtol=1e-13)
+        assert factor == 1.0 or not np.allclose(wanted, reference.derivatives(degrees)(0.4))
 
 
 def test_rule_6_traced_together_the_values_are_the_same(reference):

@@ -5,6 +5,8 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
+from arms import arm, law
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient
 from pydrake.common import RandomDistribution
 from pydrake.math import BsplineBasis
 from pydrake.systems.primitives import ConstantVectorSource, Integrator, RandomSource
@@ -13,13 +15,18 @@ from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 from drake_dae import (
     ConstantReference,
     ExpressionReference,
+    LoopSettings,
     PointToPointReference,
     ReferenceGenerator,
+    RobotPlant,
     SinusoidReference,
     SystemReference,
+    TrackingController,
     TrajectoryReference,
+    make_closed_loop,
+    robot_motion_limits,
 )
-from drake_dae.errors import NonFiniteError, ReferenceSignalError
+from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError
 
 
 def table(signal, degree, time):
@@ -251,3 +258,73 @@ def test_what_is_no_reference_is_refused():
     message = r"references\[1\] must be a Reference, got 0\.5$"
     with pytest.raises(ReferenceSignalError, match=message):
         ReferenceGenerator([ConstantReference(0.3), 0.5], [0, 0])
+
+
+def pushing():
+    """Two references that share a parameter, and one with two entries."""
+    rise = ExpressionReference(lambda t, rise: rise * ca.sin(2 * t), {"rise": 0.3})
+    push = ExpressionReference(
+        lambda t, rise, push: rise + ca.dot(push, ca.vertcat(1, t)),
+        {"rise": 0.3, "push": [5.0, 1.0]},
+    )
+    return ReferenceGenerator([rise, push], [1, 0])
+
+
+def test_parameters_stand_in_the_context():
+    generator = pushing()
+    context = generator.CreateDefaultContext()
+    context.SetTime(0.5)
+    port = generator.GetOutputPort("reference")
+    np.testing.assert_array_equal(port.Eval(context), generator.reference(0.5))
+    generator.set_parameter(context, "rise", 0.1)
+    generator.set_parameter(context, "push", [2.0, 4.0])
+    wanted = [0.1 * np.sin(1.0), 0.2 * np.cos(1.0), 0.1 + 2.0 + 4.0 * 0.5]
+    np.testing.assert_allclose(port.Eval(context), wanted, rtol=1e-15)
+    np.testing.assert_allclose(generator.along([0.0, 0.5], context)[1], wanted, rtol=1e-15)
+    np.testing.assert_allclose(generator.along([0.5])[0], generator.reference(0.5), rtol=0)
+
+
+def test_parameters_have_derivatives_by_the_time_in_autodiff():
+    generator = pushing()
+    converted = generator.ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    context.SetTime(AutoDiffXd(0.5, [1.0]))
+    found = ExtractGradient(converted.GetOutputPort("reference").Eval(context))[:, 0]
+    wanted = [0.6 * np.cos(1.0), -1.2 * np.sin(1.0), 1.0]
+    np.testing.assert_allclose(found, wanted, rtol=1e-14)
+
+
+def test_wrong_parameters_are_refused():
+    generator = pushing()
+    context = generator.CreateDefaultContext()
+    with pytest.raises(ReferenceSignalError, match="did you mean 'rise'"):
+        generator.set_parameter(context, "ris", 0.1)
+    with pytest.raises(ReferenceSignalError, match="has 2 entries"):
+        generator.set_parameter(context, "push", [1.0, 2.0, 3.0])
+    with pytest.raises(ReferenceSignalError, match="value must be finite real numbers, got nan"):
+        generator.set_parameter(context, "rise", np.nan)
+    with pytest.raises(ReferenceSignalError, match="parameter 'a'"):
+        ExpressionReference(lambda t, a: a * t, {"a": [np.inf]})
+    with pytest.raises(ReferenceSignalError, match="function failed: TypeError"):
+        ExpressionReference(lambda t: t, {"a": 1.0})
+    with pytest.raises(ReferenceSignalError, match="with b other symbols"):
+        ExpressionReference(lambda t, a: a * t + ca.SX.sym("b"), {"a": 1.0})
+    one, two = (ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
+    with pytest.raises(ReferenceSignalError, match="two references have a parameter 'a'"):
+        ReferenceGenerator([one, two], [0, 0])
+
+
+def test_what_takes_no_parameters_says_so():
+    moving = ExpressionReference(lambda t, rise: 0.3 + rise * t, {"rise": 0.1})
+    tracking, chosen = law("two_link"), arm("two_link")
+    generator = ReferenceGenerator([moving, ConstantReference(20.0)], tracking.degrees)
+    with pytest.raises(ModelError, match="need a wire from their ReferenceGenerator"):
+        TrackingController(tracking, references=generator, feedback=True)
+    limits = robot_motion_limits(chosen.model)
+    with pytest.raises(ModelError, match="a governor takes references without parameters"):
+        make_closed_loop(
+            RobotPlant(chosen.model, structure=chosen.structure),
+            tracking,
+            [moving, ConstantReference(20.0)],
+            LoopSettings(governed=limits),
+        )

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Problem, Tableau
 from drake_dae.running.rollout.stepping.called import Called
@@ -42,16 +43,13 @@ class Differentiable:
         self.forward = cache(self._forward)
         self.backward = cache(self._backward)
 
-    def _forward(self) -> Called:
-        """(arguments, changes of state, held and parameters) -> the change of the result."""
-        symbols = _symbols(self._function)
-        changes = [ca.SX.sym("d", symbol.numel()) for symbol in symbols[1:4]]
-        value = self._function.call(symbols)[0]
-        found = sum(
-            (ca.jtimes(value, x, d) for x, d in zip(symbols[1:4], changes, strict=True)),
-            ca.SX.zeros(value.shape),
-        )
-        return self._called("forward", [*symbols, *changes], [found])
+    def _forward(self, count: int) -> Called:
+        """(arguments, changes of state, held and parameters) -> the result, and its change.
+
+        Args:
+            count: How many changes are followed at once, side by side.
+        """
+        return Called(_forward(self._function, count))
 
     def _backward(self) -> Called:
         """(arguments, weights of the result) -> the gradient by state, held and parameters."""
@@ -59,12 +57,37 @@ class Differentiable:
         value = self._function.call(symbols)[0]
         weights = ca.SX.sym("weights", value.numel())
         found = [ca.jtimes(value, x, weights, True) for x in symbols[1:4]]
-        return self._called("backward", [*symbols, weights], found)
+        return Called(_dense("backward", [*symbols, weights], found))
 
-    @staticmethod
-    def _called(name: str, given: Sequence[ca.SX], found: Sequence[ca.SX]) -> Called:
-        dense = [ca.densify(each) for each in found]
-        return Called(ca.Function(name, list(given), ca.cse(dense), {"cse": False}))
+
+class Step(Differentiable):
+    """A Runge-Kutta step, (time, state, held, parameters, step) -> the state.
+
+    Args:
+        rate: The derivative of the state.
+        tableau: The method.
+    """
+
+    def __init__(self, rate: ca.Function, tableau: Tableau) -> None:
+        super().__init__(_step(rate, tableau))
+        self._rate, self._tableau = rate, tableau
+
+    def _forward(self, count: int) -> Called:
+        # The stages share one function, which keeps the derivatives by many changes short.
+        rate, sizes = _forward(self._rate, count), [self._rate.numel_in(i) for i in range(4)]
+        time, state, held, parameters = (ca.MX.sym("x", size) for size in sizes)
+        step = ca.MX.sym("step")
+        changes = [ca.MX.sym("d", size, count) for size in sizes[1:]]
+        values, slopes = list[ca.MX](), list[ca.MX]()
+        for row, part in zip(self._tableau.a, self._tableau.c, strict=True):
+            x, d = state + step * _sum(row, values), changes[0] + step * _sum(row, slopes)
+            value, slope = rate(time + part * step, x, held, parameters, d, *changes[1:])
+            values.append(value)
+            slopes.append(slope)
+        b = self._tableau.b
+        found = [state + step * _sum(b, values), changes[0] + step * _sum(b, slopes)]
+        symbols = [time, state, held, parameters, step, *changes]
+        return Called(ca.Function("forward", symbols, found))
 
 
 class Links:
@@ -74,6 +97,8 @@ class Links:
         self._program, self._problem, self._tableau = program, problem, tableau
         self._state, self._held, self._event = problem.state, problem.held, 0
         self._given = (problem.parameters,)
+        self._key = repr(tableau)
+        self._functions: dict[str, Differentiable] = {}
         self.found: list[Link] = []
 
     def run(self, longest: float) -> None:
@@ -128,25 +153,75 @@ class Links:
             self._held = value
 
     def _function(self, name: str) -> "Differentiable":
-        return self._program.kept(f"gradient {name} {self._key(name)}", lambda: self._made(name))
-
-    def _key(self, name: str) -> str:
-        return repr(self._tableau) if name == "step" else ""
+        if name not in self._functions:
+            key = f"gradient {name} {self._key if name == 'step' else ''}"
+            self._functions[name] = self._program.kept(key, lambda: self._made(name))
+        return self._functions[name]
 
     def _made(self, name: str) -> "Differentiable":
         compiled = self._program.compiled
         if name == "row":
             return Differentiable(compiled.row)
         if name == "newton":
-            return Differentiable(compiled.newton(2))
+            return _newton(self._program)
         if name == "step":
-            return Differentiable(_step(compiled.rate, self._tableau))
+            return Step(compiled.rate, self._tableau)
         _, due, kind = name.split()
         return Differentiable(_updates(compiled, int(due), kind == "True"))
 
 
+def projected(
+    program: Program, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+) -> tuple[FloatArray, list[Link]]:
+    """A state brought to N*, and the functions that did it.
+
+    Raises:
+        InconsistentStateError: Newton's steps do not reach it.
+    """
+    links = list[Link]()
+    if not program.compiled.projects:
+        return state, links
+    newton, start = _newton(program), state
+    for _ in range(MOST):
+        arguments = time, state, held, parameters
+        links.append(Link("state", newton, arguments))
+        found, left = newton.value(*arguments)
+        state = found.copy()
+        if left[0] <= REACHED:
+            return state, links
+    raise InconsistentStateError(f"{program.name}: no start on N* near {show(start)}", left.copy())
+
+
+def _newton(program: Program) -> Differentiable:
+    """Two Newton steps to N*."""
+    return program.kept("gradient newton", lambda: Differentiable(program.compiled.newton(2)))
+
+
 def _symbols(function: ca.Function) -> list[ca.SX]:
     return [ca.SX.sym("x", function.numel_in(i)) for i in range(function.n_in())]
+
+
+def _dense(name: str, given: Sequence[ca.SX], found: Sequence[ca.SX]) -> ca.Function:
+    dense = [ca.densify(each) for each in found]
+    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})
+
+
+def _forward(function: ca.Function, count: int) -> ca.Function:
+    """(arguments, changes of state, held and parameters) -> the result, and its change."""
+    symbols = _symbols(function)
+    changes = [ca.SX.sym("d", symbol.numel(), count) for symbol in symbols[1:4]]
+    value = function.call(symbols)[0]
+    found = sum(
+        (ca.jtimes(value, x, d) for x, d in zip(symbols[1:4], changes, strict=True)),
+        ca.SX.zeros(value.numel(), count),
+    )
+    return _dense("forward", [*symbols, *changes], [value, found])
+
+
+def _sum(weights: FloatArray, values: Sequence[ca.MX]) -> ca.MX:
+    """The weighted sum of the values that there are so far."""
+    pairs = zip(weights.tolist(), values, strict=False)
+    return sum((weight * each for weight, each in pairs if weight), ca.MX(0.0))
 
 
 def _step(rate: ca.Function, tableau: Tableau) -> ca.Function:

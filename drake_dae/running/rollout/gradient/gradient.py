@@ -65,7 +65,7 @@ def rollout_gradient(
         InconsistentStateError: The start is not on N*.
         SimulationError: The run fails.
     """
-    chain = _Chain.of(loop, start, parameters, times, config, seed)
+    chain = Chain.of(loop, start, parameters, times, config, seed)
     seeds = np.zeros((chain.problem.times.size, chain.program.width))
     for name, given in weights.items():
         part = chain.part(name)
@@ -102,7 +102,7 @@ def rollout_tangent(
     Returns:
         Name of a signal -> its derivative, of the shape that the signal has in the record.
     """
-    chain = _Chain.of(loop, start, parameters, times, config, seed)
+    chain = Chain.of(loop, start, parameters, times, config, seed)
     changes = []
     for what, given, size in (
         ("start_change", start_change, chain.size),
@@ -111,14 +111,21 @@ def rollout_tangent(
         change = np.zeros(size) if given is None else numbers(what, given)
         if change.shape != (size,):
             raise ModelError(f"{what} must have shape ({size},), got {change.shape}")
-        changes.append(change)
-    rows = chain.forward(*changes)
+        changes.append(change[None])
+    (rows,) = chain.forward(*changes)
     return {name: rows[:, chain.part(name)] for name in chain.program.signals}
 
 
 @dataclass(frozen=True, eq=False)
-class _Chain:
-    """A run as a chain of functions, each of which has a derivative."""
+class Chain:
+    """A run as a chain of functions, each of which has a derivative.
+
+    Attributes:
+        program: What is run.
+        run: The run.
+        problem: Its start and its settings.
+        links: The functions, in their order.
+    """
 
     program: Program
     run: Rollout
@@ -134,7 +141,7 @@ class _Chain:
         times: ArrayLike,
         config: SimulatorConfig,
         seed: Seed | None,
-    ) -> "_Chain":
+    ) -> "Chain":
         asked = Asked.of(loop, times, config, None, None)
         program, settings = asked.program, asked.settings
         if settings.tableau is None:
@@ -175,15 +182,23 @@ class _Chain:
         return slice(stops[index], stops[index + 1])
 
     def forward(self, start: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The changes of all rows, by those of the start and the parameters."""
-        size = self.program.size
-        state, held = start[:size], np.zeros(self.problem.held.size)
-        held[self.program.kept_places] = start[size:]
-        rows = np.zeros((self.problem.times.size, self.program.width))
+        """The changes of all rows, by those of the start and the parameters.
+
+        Args:
+            start, parameters: The changes, shapes (k, n) and (k, m).
+
+        Returns:
+            Those of the rows, shape (k, j, width).
+        """
+        count, size = len(start), self.program.size
+        state, held = start[:, :size], np.zeros((count, self.problem.held.size))
+        held[:, self.program.kept_places] = start[:, size:]
+        rows = np.zeros((count, self.problem.times.size, self.program.width))
         for link in self.links:
-            change = link.function.forward()(*link.arguments, state, held, parameters)[0].copy()
+            function = link.function.forward(count)
+            change = function(*link.arguments, state, held, parameters)[1].copy()
             if link.kind == "row":
-                rows[link.row] = change
+                rows[:, link.row] = change
             elif link.kind == "state":
                 state = change
             else:
