@@ -19,6 +19,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,7 +154,8 @@ def _run_command(command: str) -> tuple[int, str]:
     """The exit code of a command, and what it prints; `drake-dae` runs in this process."""
     words = shlex.split(command)
     if words[0] == "drake-dae" and not set("|<>&;*$") & set(command):
-        with _printed() as printed:
+        with _printed() as printed, warnings.catch_warnings():
+            warnings.simplefilter("default")  # As on a command line: a page may show them.
             return main(words[1:]), printed.getvalue()
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     finished = subprocess.run(

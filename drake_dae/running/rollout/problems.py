@@ -172,6 +172,9 @@ def problems_of(
     hint = "see start_values"
     states = _table("starts", starts, size + program.kept_places.size, hint)
     given = _table("parameters", parameters, compiled.sizes["parameters"], hint)
+    count = max(len(states), len(given), len(seeds or ()))
+    if len(states) == 1:
+        states = np.repeat(states, count, axis=0)
     count = len(states)
     if len(given) not in (1, count):
         raise ModelError(f"{len(given)} rows of parameters for {count} starts")

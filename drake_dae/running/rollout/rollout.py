@@ -94,7 +94,7 @@ def rollout(
             of blocks that can be traced: the record then has its vector-valued output ports. What
             is drawn or logged in it plays no part.
         starts: Where runs start, as `start_values` has it: the state, and what blocks hold; shape
-            (n,), or (k, n) for k runs.
+            (n,) for all runs or (k, n).
         parameters: All parameters as `start_values` has them; shape (m,) for all runs or (k, m);
             the defaults of the diagram if None.
         times: When the record has rows, in s, from the start of the runs to their end, shape (j,).
@@ -108,7 +108,8 @@ def rollout(
             that need more than the usual Newton steps, go on here.
 
     Returns:
-        A run for each start. One that fails has its failure, and its record up to there.
+        k runs: one for each start, row of parameters or seed. One that fails has its failure, and
+        its record up to there.
 
     Raises:
         ModelError: Arguments have wrong shapes, or a block cannot be traced: its name and why; or

@@ -326,6 +326,23 @@ def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
+def test_one_start_is_that_of_all_rows_of_parameters_or_seeds():
+    noisy = ["sampling={period: 0.01}", "encoders={position_noise: 1.0e-4}"]
+    loop, context = build_scenario(scenario("two_link_wall", *fixed(step=0.01), *noisy))
+    start, parameters = start_values(loop, context)
+    rows, seeds, times = np.array([parameters, 1.01 * parameters]), [3, 4], grid(0.1, 0.01)
+    place = loop.plant.dae.parameter_slice("wall.position")
+    rows[1, place] = parameters[place]  # The start is on this wall.
+    config = SimulatorConfig(max_step_size=0.01, use_error_control=False)
+    for given in ({"parameters": rows}, {"parameters": parameters, "seeds": seeds}):
+        wanted = rollout(loop, [start, start], times=times, config=config, **given)
+        found = rollout(loop, start, times=times, config=config, **given)
+        assert len(found) == 2
+        assert np.any(found[0].record["state"] != found[1].record["state"])
+        for one, other in zip(found, wanted, strict=True):
+            assert_equal_records(one.record, other.record, 0.0)
+
+
 def test_what_cannot_be_rolled_out_is_refused():
     chosen = scenario("two_link_wall", *fixed())
     loop, context = build_scenario(chosen)
