@@ -109,7 +109,7 @@ def compare(shown: str, printed: str) -> None:
         elif part[0].isspace():
             pattern += r"\s+"
         elif part[0].lstrip("-").isdigit():
-            pattern += rf"{re.escape(part[0])}(?![\d.])"
+            pattern += rf"{re.escape(part[0])}(?!\.?\d)"
         else:
             pattern += f"({_NUMBER.pattern})"
             numbers.append(part[0])
