@@ -26,7 +26,6 @@ from pydrake.systems.framework import Context
 import drake_dae as dd
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.shipped import find_scenario
 
 FREE = ("link1.mass", "link2.mass", "wall.position[0]")
 
@@ -45,7 +44,7 @@ FORCE_NOISE = 0.1
 
 def main(folder: Path, count: int = 12) -> tuple[float, float, float]:
     """Returns what is left of both errors, and the share of intervals that miss the truth."""
-    scenario = dd.load_scenario(find_scenario("two_link_wall"), SETTINGS)
+    scenario = dd.load_scenario("two_link_wall", SETTINGS)
     loop, start = dd.build_scenario(scenario)
     nominal, random = numbers(loop, start), np.random.default_rng(0)
     before, after, hits = [], [], []

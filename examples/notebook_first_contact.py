@@ -6,9 +6,8 @@
 
 # %% A scenario is a robot, what it touches, what it shall do, and how to simulate it.
 from drake_dae import analyze, build_scenario, load_scenario, make_animation, simulate
-from drake_dae.scenario.shipped import find_scenario
 
-scenario = load_scenario(find_scenario("two_link_wall"), ["duration=3"])
+scenario = load_scenario("two_link_wall", ["duration=3"])
 scenario
 
 # %% Its closed loop: the arm, what it shall follow, and the law, wired as a Drake diagram.

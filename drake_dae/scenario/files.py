@@ -20,6 +20,7 @@ from drake_dae.scenario.forms.typed_yaml import (
     set_entry,
 )
 from drake_dae.scenario.scenario import Scenario, scenario_reader
+from drake_dae.scenario.shipped import shipped_scenarios
 from drake_dae.systems.task import phases
 
 
@@ -40,7 +41,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario file.
 
     Args:
-        path: The file.
+        path: The file, or the name of a shipped scenario such as "two_link_wall".
         settings: Changes "key=value" with dotted keys, for example "integrator.accuracy=1e-8" or
             "constraints.0.surface.point=[0.7, 0, 0]".
 
@@ -48,7 +49,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
             given twice, or values are not valid; all problems are listed.
     """
-    path = Path(path)
+    path = shipped_scenarios().get(str(path), Path(path))
     try:
         text = read_text(path, 4 * MOST_TEXT)
     except UnicodeDecodeError:

@@ -37,6 +37,7 @@ def test_page_runs_as_shown(page, tmp_path):
         ("a ... b", "a 1\n2 b"),
         ("joint2 at 1.5", "joint2  at 1.49"),
         ("12 steps", "12 steps\n"),
+        ("[20.  0.5]", "[20.  0.5]"),
     ],
 )
 def test_equal_to_the_digits_shown(shown, printed):

@@ -27,7 +27,8 @@ class Reference(ABC):
        (sum (mu_i + 1),).
     3. Each value is the exact time derivative of the one before it. All except the last of an
        output are continuous.
-    4. A value depends only on time, not on the other degrees or on earlier calls.
+    4. A value depends only on time, not on the other degrees or on other calls, and is an array of
+       its own.
     5. `derivatives` refuses an output that is not smooth enough for its degree, with the row and a
        remedy. The function refuses a time without a value.
     6. A reference that is an expression of time returns it in `expression`, so that all references
@@ -114,7 +115,8 @@ class FormulaReference(Reference):
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         time = ca.SX.sym("t")
-        return at_time(time, self.expression(degrees, time))
+        value = at_time(time, self.expression(degrees, time))
+        return lambda time: value(time).copy()
 
 
 def with_degrees(
@@ -160,7 +162,7 @@ def stack_references(
 
 
 def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
-    """An expression of time as a function of a float."""
+    """An expression of time as a function of a float; the next call overwrites its value."""
     function = TracedFunction("reference", {"time": time}, {"R": rows})
     (moment,), (value,) = function.arguments, function.outputs
 

@@ -154,8 +154,8 @@ def test_rule_3_what_the_law_integrates_is_continuous(reference):
 
 def test_rule_4_a_value_depends_on_the_time_alone(reference):
     function = reference.derivatives([1] * reference.size)
-    first = [np.array(function(time)) for time in TIMES]
-    again = [np.array(function(time)) for time in reversed(TIMES)]
+    first = [function(time) for time in TIMES]
+    again = [function(time) for time in reversed(TIMES)]
     np.testing.assert_array_equal(first, again[::-1])
 
 
