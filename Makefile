@@ -170,5 +170,5 @@ $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 $(VENV)/installed-docs: pyproject.toml | $(BIN)/python
 	$(WHOLE)
 	@echo 'Installing drake_dae and what makes its book into $(VENV): the first time this takes minutes.'
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev,docs]'
 	touch $(VENV)/installed $@

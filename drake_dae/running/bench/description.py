@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.pictures.arrows import path_of
+from drake_dae.pictures.scene.arrows import path_of
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.running.bench.controls import Controls, controls_of, prediction
 from drake_dae.running.bench.scene import (

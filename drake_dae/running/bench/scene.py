@@ -14,9 +14,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.pictures.arrows import path_of
-from drake_dae.pictures.surroundings import scene_extent
-from drake_dae.pictures.view import draw_scene, look_at, start_meshcat, view_of_links
+from drake_dae.pictures.scene.arrows import path_of
+from drake_dae.pictures.scene.surroundings import scene_extent
+from drake_dae.pictures.scene.view import draw_scene, start_meshcat, view_of_links
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
@@ -74,8 +74,8 @@ def scene_of(loop: ClosedLoop, context: Context) -> Scene:
     surfaces = [each for each in model.constraints if _moves(each)]
     targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
     state = plant.state(plant.GetMyContextFromRoot(context))
-    middle, size = scene_extent(model, wrenches, state, loop.scene_graph)
-    page = _static_page(loop, state, middle, size)
+    _, size = scene_extent(model, wrenches, state, loop.scene_graph)
+    page = _static_page(loop, state)
     # Drake's Meshcat ends the process if another thread, as of a server, collects it.
     gc.collect()
     return Scene(
@@ -90,7 +90,7 @@ def scene_of(loop: ClosedLoop, context: Context) -> Scene:
     )
 
 
-def _static_page(loop: ClosedLoop, state: FloatArray, middle: FloatArray, size: float) -> str:
+def _static_page(loop: ClosedLoop, state: FloatArray) -> str:
     """Meshcat's page of a robot in a state, from a server that is gone afterwards."""
     with _quiet():
         meshcat = start_meshcat()
@@ -105,7 +105,6 @@ def _static_page(loop: ClosedLoop, state: FloatArray, middle: FloatArray, size: 
         port = links.get_input_port()
         port.FixValue(shown, state[: port.size()])
         links.ForcedPublish(shown)
-    look_at(meshcat, middle, size)
     return str(meshcat.StaticHtml())
 
 

@@ -13,6 +13,7 @@ from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.columns import TIME, Table, name_and_unit
+from drake_dae.simulation.records.optional import optional_module
 
 NANO = 1e-9
 """MCAP counts in ns."""
@@ -37,7 +38,7 @@ def write_mcap(
     """
     if time.size and time[0] < 0.0:
         raise ModelError(f"MCAP has no times before 0 s, and the record begins at {time[0]:g} s")
-    writer = _needed("mcap.writer").Writer(str(path))
+    writer = optional_module("mcap.writer", "a log in MCAP", "mcap").Writer(str(path))
     writer.start(library="drake_dae")
     writer.add_metadata("drake_dae", {"about": json.dumps(about)})
     for name, (values, own) in signals.items():
@@ -73,7 +74,7 @@ def read_mcap(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     factories = [_Json()]
     with suppress(ImportError):
         factories.append(import_module("mcap_ros2.decoder").DecoderFactory())
-    reader = _needed("mcap.reader")
+    reader = optional_module("mcap.reader", "a log in MCAP", "mcap")
     topics = None if columns is None else sorted({_topic(name) for name in columns})
     messages = dict[str, list[tuple[int, dict[str, float]]]]()
     units = dict[str, str]()
@@ -164,10 +165,3 @@ def _topic(name: str) -> str:
 
 def _ticks(time: FloatArray) -> list[int]:
     return [round(moment / NANO) for moment in time.tolist()]
-
-
-def _needed(module: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError:
-        raise ModelError("MCAP needs mcap: pip install 'drake_dae[mcap]'") from None

@@ -4,7 +4,6 @@ import html
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TypeVar
 
@@ -20,6 +19,7 @@ from drake_dae.files import open_file
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
 from drake_dae.simulation.records.mcap_log import read_mcap, write_mcap
+from drake_dae.simulation.records.optional import optional_module
 from drake_dae.simulation.records.versions import versions
 from drake_dae.systems.plants.contact_events import ContactEvent
 
@@ -257,7 +257,7 @@ class Record:
         Raises:
             ModelError: pandas is not installed.
         """
-        pandas = _needed("pandas", "to_dataframe")
+        pandas = optional_module("pandas", "to_dataframe", "data")
         pairs = [
             (name, label(signal))
             for name, recorded in self.signals.items()
@@ -278,7 +278,7 @@ class Record:
         Raises:
             ModelError: xarray is not installed.
         """
-        xarray = _needed("xarray", "to_xarray")
+        xarray = optional_module("xarray", "to_xarray", "data")
         variables: dict[str, Any] = {}
         coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
         for name, recorded in self.signals.items():
@@ -313,18 +313,6 @@ class Record:
 
 RecordAfter = Callable[[float | None], Record]
 """From a time in s, or None, to what a run has recorded later."""
-
-
-def _needed(module: str, asked: str) -> Any:
-    """An optional module.
-
-    Raises:
-        ModelError: It is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError:
-        raise ModelError(f"{asked} needs {module}: pip install 'drake_dae[data]'") from None
 
 
 R = TypeVar("R", bound=Record)

@@ -8,6 +8,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.phases import phase_spans
+from drake_dae.simulation.records.optional import optional_module
 from drake_dae.simulation.records.record import Record
 
 
@@ -29,12 +30,7 @@ def save_rerun(record: Record, path: str | Path) -> None:
     """
     if Path(path).suffix != ".rrd":
         raise ModelError(f"a recording of rerun is an .rrd, got '{Path(path).name}'")
-    try:
-        import rerun as rr
-    except ImportError:
-        raise ModelError(
-            "a recording of rerun takes the package rerun-sdk; pip install 'drake_dae[rerun]'"
-        ) from None
+    rr = optional_module("rerun", "a recording", "rerun")
     stream: Any = rr.RecordingStream("drake_dae", make_default=False, make_thread_default=False)
     with open(path, "wb"):
         pass  # rerun reports a file that cannot be written in a thread of its own.
