@@ -7,8 +7,8 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.optional import optional_module
+from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
 
 
