@@ -32,6 +32,8 @@ HEAD = (
     "| contact force, N |\n| :-- | --: | --: | --: | --: | --: | --: |"
 )
 
+INSTALL = 'pip install crocoddyl==3.2.1 "pin<4.1"; newer pin makes it crash'
+
 Method = Callable[[dd.RobotModel, np.ndarray, np.ndarray], Plan]
 
 
@@ -45,7 +47,7 @@ def main(folder: Path, with_peers: bool = True) -> Judged:
 
             methods.append(crocoddyl_plan.plan)
         except ImportError as error:
-            print(f"crocoddyl is left out: {error}")
+            print(f"crocoddyl is left out ({error}): {INSTALL}")
     model, found = robot_model(), list[Judged]()
     first, last = ends(model)
     lines = [HEAD]

@@ -91,12 +91,12 @@ class RunSymbols:
         return self.variables[entries]
 
 
-Limits = Mapping[str, tuple[ArrayLike | None, Any, ArrayLike | None]]
+NamedLimits = Mapping[str, tuple[ArrayLike | None, Any, ArrayLike | None]]
 """Name -> (least value, expression, largest value), None for no bound."""
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class Objective:
     """Cost and limits as functions of the record and of the variables.
 
     Attributes:
@@ -121,8 +121,8 @@ class Asked:
         cls,
         run: RunSymbols,
         cost: Callable[[RunSymbols], Any],
-        limits: Callable[[RunSymbols], Limits] | None,
-    ) -> "Asked":
+        limits: Callable[[RunSymbols], NamedLimits] | None,
+    ) -> "Objective":
         """What functions of a user ask.
 
         Raises:

@@ -16,9 +16,12 @@ TOLERANCE = 1e-6
 PUSHED = 1e-2
 """A variable that begins at a bound is moved by as much of its range, others by less or not."""
 
+LEAST_PUSHED = 1e-6
+"""A variable is moved by as much at least where it begins closer to a bound."""
+
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class IpoptProblem:
     """min f(x) with low <= x <= high and lowest <= g(x) <= highest.
 
     Attributes:
@@ -39,7 +42,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Ended:
+class Solved:
     """How IPOPT ended.
 
     Attributes:
@@ -55,7 +58,7 @@ class Ended:
     iterations: int
 
 
-def solve(problem: Problem, start: FloatArray, iterations: int) -> Ended:
+def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> Solved:
     """Runs IPOPT (Waechter and Biegler, 2006), whose second derivatives are those of BFGS.
 
     A function that raises an error of this library has no value there, and IPOPT takes a shorter
@@ -68,7 +71,7 @@ def solve(problem: Problem, start: FloatArray, iterations: int) -> Ended:
     """
     functions = _Values(problem)
     room = np.minimum(start - problem.low, problem.high - start)
-    pushed = float(min(PUSHED, *room[room > 0.0], PUSHED))
+    pushed = max(LEAST_PUSHED, min([PUSHED, *room[room > 0.0].tolist()]))
     x = ca.MX.sym("x", start.size)
     both = functions(x)
     options = {
@@ -93,10 +96,10 @@ def solve(problem: Problem, start: FloatArray, iterations: int) -> Ended:
     found = solver(
         x0=start, lbx=problem.low, ubx=problem.high, lbg=problem.lowest, ubg=problem.highest
     )
-    if functions.error is not None:
-        raise functions.error
+    if functions.errors:
+        raise functions.errors[0]
     stats = solver.stats()
-    return Ended(
+    return Solved(
         found["x"].full()[:, 0],
         str(stats["return_status"]),
         bool(stats["success"]),
@@ -105,13 +108,11 @@ def solve(problem: Problem, start: FloatArray, iterations: int) -> Ended:
 
 
 class _Called(ca.Callback):
-    """A function of Python for CasADi, which loses exceptions: they are kept in `error`."""
+    """A function of Python for CasADi, which loses exceptions: they are kept in `errors`."""
 
-    error: BaseException | None = None
-
-    def __init__(self, name: str, problem: Problem) -> None:
+    def __init__(self, name: str, problem: IpoptProblem, errors: list[BaseException]) -> None:
         super().__init__()
-        self._problem, self._size = problem, problem.low.size
+        self._problem, self._size, self.errors = problem, problem.low.size, errors
         self._count = 1 + problem.lowest.size
         self.construct(name, {})
 
@@ -136,22 +137,18 @@ class _Called(ca.Callback):
     def eval(self, arguments: Any) -> list[ca.DM]:
         """The value; nan where there is none."""
         nothing = np.full(self._shape(), np.nan)
-        if self.error is not None or self._problem.is_over():
+        if self.errors or self._problem.is_over():
             return [ca.DM(nothing)]
         try:
             return [ca.DM(self._value(arguments[0].full()[:, 0]).reshape(self._shape()))]
         except DrakeDaeError:
             return [ca.DM(nothing)]
         except BaseException as error:
-            self.error = error
+            self.errors.append(error)
             return [ca.DM(nothing)]
 
 
 class _Slopes(_Called):
-    def __init__(self, values: "_Values", name: str, problem: Problem) -> None:
-        self._values = values
-        super().__init__(name, problem)
-
     def get_n_in(self) -> int:
         return 2
 
@@ -166,13 +163,13 @@ class _Slopes(_Called):
 
 
 class _Values(_Called):
-    def __init__(self, problem: Problem) -> None:
-        super().__init__("values", problem)
-        self._slopes: _Slopes | None = None
+    def __init__(self, problem: IpoptProblem) -> None:
+        super().__init__("values", problem, [])
+        self._slopes: _Slopes | None = None  # CasADi does not keep it.
 
     def has_jacobian(self, *given: Any) -> bool:
         return True
 
     def get_jacobian(self, name: str, *given: Any) -> ca.Function:
-        self._slopes = _Slopes(self, name, self._problem)
+        self._slopes = _Slopes(name, self._problem, self.errors)
         return self._slopes

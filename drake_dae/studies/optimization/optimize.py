@@ -18,10 +18,10 @@ from drake_dae.running.rollout.problems import checked_times, start_values
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.simulation.records.interruption import ending_signals
-from drake_dae.studies.optimization.expressions import Asked, RunSymbols
-from drake_dae.studies.optimization.ipopt import Ended, Problem, solve
+from drake_dae.studies.optimization.expressions import Objective, RunSymbols
+from drake_dae.studies.optimization.ipopt import IpoptProblem, Solved, solve
+from drake_dae.studies.optimization.loop_runs import LoopRuns
 from drake_dae.studies.optimization.optimum import MET, Optimum, limit_sizes, limit_states
-from drake_dae.studies.optimization.trials import Trials
 from drake_dae.studies.optimization.variables import Variable, chosen_variables
 
 
@@ -95,8 +95,8 @@ def optimize(
     if not isinstance(loop, Diagram) and loop.generator is not None:
         layout = loop.controller.law.layout
     run = RunSymbols(moments, program.signals, [*names, *extra], layout)
-    asked = Asked.of(run, cost, limits)
-    trials = Trials(loop, start, parameters, variables, moments, config, seed)
+    asked = Objective.of(run, cost, limits)
+    trials = LoopRuns(loop, start, parameters, variables, moments, config, seed)
     search = _Search(trials, asked, variables, extra)
     with ending_signals(search.hear, in_callbacks=True):
         ended = solve(search.problem, search.start, iterations)
@@ -121,8 +121,8 @@ class _Search:
 
     def __init__(
         self,
-        trials: Trials,
-        asked: Asked,
+        trials: LoopRuns,
+        asked: Objective,
         variables: list[Variable],
         extra: Mapping[str, float],
     ) -> None:
@@ -149,7 +149,7 @@ class _Search:
         low, high = (each / self._sizes for each in self._bounds)
         for place in self._idle:
             low[place] = high[place] = self.start[place]
-        self.problem = Problem(
+        self.problem = IpoptProblem(
             self._values,
             self._slopes,
             low,
@@ -245,7 +245,7 @@ class _Search:
     def _scales(self) -> FloatArray:
         return np.concatenate([[self._cost_size], self._limit_sizes])
 
-    def optimum(self, context: Context, ended: Ended) -> Optimum:
+    def optimum(self, context: Context, ended: Solved) -> Optimum:
         """The result."""
         assert self._best is not None
         values = np.clip(ended.x * self._sizes, *self._bounds)

@@ -166,7 +166,7 @@ def limit_states(
     """How limits stand.
 
     Args:
-        names, sizes: As of `Asked`.
+        names, sizes: As of `Objective`.
         values, low, high: Their entries and bounds, shape (m,).
     """
     found, first = [], 0

@@ -29,7 +29,7 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.program import program_of
-from drake_dae.studies.optimization.trials import Trials
+from drake_dae.studies.optimization.loop_runs import LoopRuns
 from drake_dae.studies.optimization.variables import chosen_variables
 
 FIXED = SimulatorConfig(
@@ -158,7 +158,7 @@ def test_derivatives_are_those_of_differences():
     free["link2.mass"] = free["plant.link1.mass"] = (1.0, 20.0)
     variables = chosen_variables(program_of(loop).compiled, start, parameters, free)
     times = np.linspace(0.0, 0.05, 3)
-    trials = Trials(loop, start, parameters, variables, times, FIXED, None)
+    trials = LoopRuns(loop, start, parameters, variables, times, FIXED, None)
     begin = np.array([one.start for one in variables])
     names = ("state", "control", "constraint_force", "reference")
     derivatives = trials.changes(begin, names)
@@ -378,7 +378,7 @@ def test_of_compliant_contact_derivatives_are_those_of_differences():
     free = {"gains.tool.y": (0.0, None), "plant.friction": (0.0, 1.0), "tool.mass": (0.1, 3.0)}
     variables = chosen_variables(program_of(loop).compiled, start, parameters, free)
     times = np.linspace(0.0, 0.03, 4)
-    trials = Trials(loop, start, parameters, variables, times, FIXED, None)
+    trials = LoopRuns(loop, start, parameters, variables, times, FIXED, None)
     begin = np.array([one.start for one in variables])
     derivatives = trials.changes(begin, ["state", "control"])
     for i in range(begin.size):
@@ -388,3 +388,25 @@ def test_of_compliant_contact_derivatives_are_those_of_differences():
             wanted = (ends[0][name] - ends[1][name]) / (2.0 * step[i])
             scale = np.abs(wanted).max()
             np.testing.assert_allclose(own[i], wanted, rtol=0.0, atol=1e-6 * scale)
+
+
+def test_what_is_raised_within_the_search_comes_out():
+    """CasADi loses exceptions of the functions that it calls; neither kind of them is lost."""
+
+    class Seeds(dict):
+        """Fails at some run: of a value, or of derivatives."""
+
+        def __init__(self, last):
+            super().__init__()
+            self.left = last
+
+        def values(self):
+            self.left -= 1
+            if not self.left:
+                raise ZeroDivisionError
+            return super().values()
+
+    loop, context = two_link()
+    for last in (8, 9, 10, 11):
+        with pytest.raises(ZeroDivisionError):
+            found(loop, context, seed=Seeds(last))

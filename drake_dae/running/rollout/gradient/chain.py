@@ -60,7 +60,7 @@ class Differentiable:
         return Called(_dense("backward", [*symbols, weights], found))
 
 
-class Step(Differentiable):
+class RungeKuttaStep(Differentiable):
     """A Runge-Kutta step, (time, state, held, parameters, step) -> the state.
 
     Args:
@@ -165,7 +165,7 @@ class Links:
         if name == "newton":
             return _newton(self._program)
         if name == "step":
-            return Step(compiled.rate, self._tableau)
+            return RungeKuttaStep(compiled.rate, self._tableau)
         _, due, kind = name.split()
         return Differentiable(_updates(compiled, int(due), kind == "True"))
 

@@ -18,7 +18,7 @@ from drake_dae.studies.optimization.variables import Variable
 
 
 @dataclass(eq=False)
-class Trials:
+class LoopRuns:
     """Runs of a loop over the same times.
 
     A start that is off N*, as where a variable moves it or the wall, is brought to N* as each step
