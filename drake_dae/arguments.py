@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import wraps
 from math import isfinite
 from numbers import Complex, Integral, Real
-from types import NoneType, SimpleNamespace, UnionType
+from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
@@ -78,8 +78,7 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
 
     def read() -> None:
         """Reads the annotations when they are needed, since they may refer to later definitions."""
-        own = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
-        hints = get_type_hints(SimpleNamespace(__annotations__=own), function.__globals__)
+        hints = get_type_hints(function)
         for name, parameter in inspect.signature(function).parameters.items():
             entry = (name, _rule(hints.get(name, Any)), parameter.default)
             if parameter.kind is parameter.VAR_POSITIONAL:

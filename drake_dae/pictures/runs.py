@@ -20,6 +20,8 @@ from drake_dae.simulation.records.record import Record
 if TYPE_CHECKING:  # Loaded with the first figure.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+else:
+    Figure = Any  # `checked` reads all annotations.
 
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
 """Where a name is looked up first."""

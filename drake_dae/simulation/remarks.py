@@ -72,8 +72,9 @@ def limit_remarks(record: Record, limits: Limits) -> list[str]:
         lower, upper = limits.state
         values = record["state"][:, : lower.size]
         left = np.minimum(values - lower, upper - values).min(axis=0)
-        # A joint with one limit alone has no range to compare with.
-        shares = np.where(np.isfinite(upper - lower), left / (upper - lower), np.inf)
+        # A joint with one limit alone, or none, has no range to compare with.
+        shares = np.full(lower.size, np.inf)
+        np.divide(left, upper - lower, out=shares, where=np.isfinite(upper - lower))
         place, signal = int(np.argmin(shares)), record.signals["state"].signals
         if np.isfinite(shares[place]):
             unit = f" {signal[place].unit}".rstrip()
