@@ -98,3 +98,14 @@ class Chain:
 def triangle(matrices: FloatArray) -> FloatArray:
     """The triangular factors R of one matrix or of many, A = Q R."""
     return np.asarray(np.linalg.qr(matrices, mode="r"))
+
+
+def alone(own: FloatArray, scale: FloatArray, weak: float) -> FloatArray:
+    """The deviations of the states that a piece leads to by itself: their median, shape (n,)."""
+    count, n = len(own), scale.size
+    bound = np.broadcast_to(np.eye(n) / weak, (count, n, n))
+    # By the factor and not by the information, whose eigenvalues differ by more than 1e16.
+    factors = triangle(np.concatenate([own[:, :, :n] * scale, bound], axis=1))
+    deviations = np.linalg.norm(np.linalg.inv(factors), axis=2)
+    found: FloatArray = scale * np.minimum(np.median(deviations, axis=0), 1.0)
+    return found

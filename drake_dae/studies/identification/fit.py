@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.studies.identification.chain import Chain, triangle
+from drake_dae.studies.identification.chain import Chain, alone, triangle
 from drake_dae.studies.identification.pieces import Pieces, Slopes
 
 COUPLINGS = (1e-1, 1e-3, 1e-6)
@@ -31,6 +31,9 @@ MOST = 25
 CLOSE, NEAR = 0.03, 0.3
 """A step is the last one with a coupling if it is shorter than the first part of the deviations;
 of `MOST` steps the last one may have the second, since contact and friction bend sharply."""
+
+EXPECTED = 1.5
+"""After the last step no column has errors that are larger than expected by this factor."""
 
 SHORTER = 0.5
 """With derivatives of before, a step must be shorter than the last one by this factor."""
@@ -158,8 +161,12 @@ class Fit:
                 known = slopes if length < SHORTER * before else None
                 before = length
                 if length < CLOSE:
-                    if is_new or not is_last:
+                    if not is_last:
                         break
+                    if is_new:
+                        found = self._chained(coupling, slopes)
+                        if self._is_expected(found[0]):
+                            return self._fitted(*found)
                     known = None
             else:
                 if is_last and length > NEAR:
@@ -168,8 +175,15 @@ class Fit:
                         "the record does not fit this robot (look for a wrong unit or sign), or "
                         "the values to begin with are far off; free fewer parameters first"
                     )
-        # Errors are those after the last step.
         return self._fitted(*self._chained(couplings[-1], slopes))
+
+    def _is_expected(self, slopes: Sequence[Slopes]) -> bool:
+        """Whether a step has left the errors that were expected, also in the states alone."""
+        pairs = zip(slopes, self._noise, strict=True)
+        sizes = [
+            np.sqrt(np.nanmean(np.square(s.errors / noise), axis=(0, 1))) for s, noise in pairs
+        ]
+        return bool(np.nanmax(sizes) < EXPECTED)
 
     def known(self, noise: Sequence[FloatArray]) -> Fitted:
         """The information about the unknowns at the values and states to begin with.
@@ -239,7 +253,7 @@ class Fit:
         moves = np.concatenate([slopes.of_ends[:-1], defects[..., None]], axis=2)
         # Across an event of a contact nothing is known of the next state.
         is_joined = self._pieces[index].is_joined[:, None]
-        loose = np.where(is_joined, coupling * _known(own, scale), WEAK * scale)
+        loose = np.where(is_joined, coupling * alone(own, scale, WEAK), WEAK * scale)
         return Chain.of(own, np.where(is_joined[..., None], moves, 0.0), loose, WEAK * scale)
 
     def _step(self, chains: Sequence[Chain]) -> tuple[FloatArray, float]:
@@ -328,14 +342,3 @@ class Fit:
             self._last,
             (sum(int(cut.sum()) for cut in cuts), sum(cut.size for cut in cuts)),
         )
-
-
-def _known(own: FloatArray, scale: FloatArray) -> FloatArray:
-    """The deviations of the states that a piece leads to by itself: their median, shape (n,)."""
-    count, n = len(own), scale.size
-    weak = np.broadcast_to(np.eye(n) / WEAK, (count, n, n))
-    # By the factor and not by the information, whose eigenvalues differ by more than 1e16.
-    factors = triangle(np.concatenate([own[:, :, :n] * scale, weak], axis=1))
-    deviations = np.linalg.norm(np.linalg.inv(factors), axis=2)
-    found: FloatArray = scale * np.minimum(np.median(deviations, axis=0), 1.0)
-    return found
