@@ -246,8 +246,9 @@ def test_without_a_browser_the_address_is_told_and_save_writes_files(built, tmp_
     monkeypatch.setattr(Server, "serve_forever", used)
     live(built.loop, built.context, folder=tmp_path / "kept", tell=told.append)
     assert told[0].startswith("http://127.0.0.1:")
-    assert told[1:] == ["found no browser here; open this address in one on this machine"] + [
-        str(tmp_path / "kept")
+    assert told[1:] == [
+        "found no browser here; open this address in one on this machine",
+        str(tmp_path / "kept"),
     ]
     assert Commands.load(tmp_path / "kept" / "commands.json").end == 3
     assert (tmp_path / "kept" / "record.npz").is_file()
