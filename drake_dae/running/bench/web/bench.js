@@ -88,6 +88,7 @@ function let_go() {
 
 /* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
+  if (bench.failure) return;
   if (bench.push) follow_push();
   if (bench.pulled.length) let_go();
   try {
