@@ -62,8 +62,12 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
     while True:
         try:
             found = scenario
-            for add in parts.values():
-                found = add(found)
+            for name, add in parts.items():
+                added = add(found)
+                if isinstance(added, str):
+                    left_out[name] = f"{name}: {added}"
+                else:
+                    found = added
             completed, loop = build_completed(found, commands=limits)
             # At rest, where the scenario itself starts at rest.
             begun = replace(completed.scenario, exogenous=scenario.exogenous)
@@ -77,23 +81,35 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
             left_out[name] = f"{name}: {error}"
 
 
-def _with_moving_surfaces(scenario: Scenario) -> Scenario:
-    """Surfaces whose positions are exogenous signals that stand still."""
-    if scenario.task is not None or scenario.observer is not None or scenario.is_advised:
-        return scenario
+_COMPLIANT = "none, since the contact of the plant is compliant"
+
+
+def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
+    """Surfaces whose positions are exogenous signals that stand still; or why there are none."""
+    if scenario.plant.material is not None:
+        return _COMPLIANT
+    if scenario.task is not None:
+        return "none, since tasks support no moving surfaces"
+    if scenario.observer is not None:
+        return "none, since an observer supports no exogenous signals"
     moving = dict[str, Any]()
     for constraint in scenario.constraints:
-        if isinstance(constraint, PointOnSurface) and scenario.plant.material is None:
+        if isinstance(constraint, PointOnSurface):
             position = constraint.parameters[0]
             if position.name not in scenario.exogenous:
                 moving[position.name] = [ConstantReference(x) for x in position.value.tolist()]
     return replace(scenario, exogenous={**scenario.exogenous, **moving})
 
 
-def _with_friction(scenario: Scenario) -> Scenario:
-    """Surfaces with the parameters of friction, which is zero."""
-    if scenario.actuation or scenario.task is not None or scenario.plant.material is not None:
-        return scenario
+def _with_friction(scenario: Scenario) -> Scenario | str:
+    """Surfaces with the parameters of friction, which is zero; or why without."""
+    lacks = any(
+        isinstance(each, PointOnSurface) and each.friction is None for each in scenario.constraints
+    )
+    if not lacks or scenario.plant.material is not None:
+        return scenario  # The plant may have a friction of its own.
+    if scenario.actuation:
+        return "none, since the law would differentiate it; give the constraint a friction"
     constraints = [
         replace(each, friction=0.0)
         if isinstance(each, PointOnSurface) and each.friction is None
@@ -103,10 +119,10 @@ def _with_friction(scenario: Scenario) -> Scenario:
     return replace(scenario, constraints=constraints)
 
 
-def _with_pushes(scenario: Scenario) -> Scenario:
-    """Links with wrenches that are zero."""
+def _with_pushes(scenario: Scenario) -> Scenario | str:
+    """Links with wrenches that are zero; or why there are none."""
     if scenario.plant.material is not None:
-        return scenario
+        return _COMPLIANT
     plant = robot_links(scenario.robot, SceneGraph())[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
@@ -117,7 +133,7 @@ def _with_pushes(scenario: Scenario) -> Scenario:
     return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
 
 
-_PARTS: Mapping[str, Callable[[Scenario], Scenario]] = {
+_PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError, describe_os_error
+from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
 from drake_dae.files import read_text
 from drake_dae.running.bench.controls import Inputs
 from drake_dae.running.bench.description import TICK, Bench, shown_function
@@ -110,6 +110,7 @@ class HandRun:
         self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
         self.count = 0
+        self._failure: Exception | None = None
         self._log: list[tuple[int, str, float]] = []
 
     @property
@@ -134,9 +135,15 @@ class HandRun:
         """Runs one tick.
 
         Raises:
-            DrakeDaeError: The loop cannot go on: where and why.
+            DrakeDaeError: The loop cannot go on: where and why; the same at each further call.
         """
-        self._simulator.AdvanceTo(self._start + (self.count + 1) * self.tick)
+        if self._failure is not None:
+            raise self._failure
+        try:
+            self._simulator.AdvanceTo(self._start + (self.count + 1) * self.tick)
+        except (DrakeDaeError, RuntimeError) as error:
+            self._failure = error
+            raise
         self.count += 1
 
     @property

@@ -11,7 +11,7 @@ import pytest
 from browser import needs_chromium, opened, with_script
 from runs import scenario
 
-from drake_dae import Commands, build_commanded, replay
+from drake_dae import Commands, build_commanded, live, replay
 from drake_dae.cli import main
 from drake_dae.errors import ModelError
 from drake_dae.running.bench.live import Server
@@ -40,6 +40,7 @@ MOVED = """
   await run(0.1);
   document.getElementById("bench-save").click();
   await sleep(300);
+  found.loaded = performance.getEntriesByType("resource").map(({ name }) => name);
   return found;
 """
 
@@ -83,6 +84,7 @@ def test_what_is_done_in_a_browser_happens_and_is_replayed_exactly(built, tmp_pa
     assert found["after"][0] - found["before"][0] == pytest.approx(-0.05, abs=5e-3)
     assert found["after"][3] - found["before"][3] == pytest.approx(-0.05, abs=5e-3)
     assert found["pushed"] > 1e-3
+    assert all(name.startswith((server.address, "data:", "blob:")) for name in found["loaded"])
     (record,) = kept
     commands = Commands.load(tmp_path / "commands.json")
     assert len({name for _, name, _ in commands.commands}) > 5
@@ -230,3 +232,23 @@ def test_a_contact_that_is_lost_is_searched_again(tmp_path):
         server.page = with_script(server.page, body)
         found = opened(server.address, tmp_path / "profile")
     assert found == {"before": "Move 2", "after": "Approach", "force": 0, "failure": ""}
+
+
+def test_without_a_browser_the_address_is_told_and_save_writes_files(built, tmp_path, monkeypatch):
+    told = []
+
+    def used(server, patience):
+        server.answer("advance", {"ticks": 3, "set": []})
+        told.append(server.answer("save", None)["saved"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    monkeypatch.setattr(Server, "serve_forever", used)
+    live(built.loop, built.context, folder=tmp_path / "kept", tell=told.append)
+    assert told[0].startswith("http://127.0.0.1:")
+    assert told[1:] == [
+        "found no browser here; open this address in one on this machine",
+        str(tmp_path / "kept"),
+    ]
+    assert Commands.load(tmp_path / "kept" / "commands.json").end == 3
+    assert (tmp_path / "kept" / "record.npz").is_file()

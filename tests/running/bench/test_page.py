@@ -136,6 +136,7 @@ def test_names_stay_text_and_a_phone_shows_all_of_it(page, tmp_path):
       return [left, right, top, bottom];
     }),
     tall: innerHeight,
+    loaded: performance.getEntriesByType("resource").map(({ name }) => name.slice(0, 5)),
   };
 """,
         tmp_path / "x.html",
@@ -144,6 +145,7 @@ def test_names_stay_text_and_a_phone_shows_all_of_it(page, tmp_path):
     )
     assert found["title"] == found["head"] == TITLE
     assert found["images"] == found["bold"] == 0
+    assert set(found["loaded"]) <= {"data:", "blob:"}
     assert found["wide"][0] <= found["wide"][1]
     below = 0.0
     for left, right, top, bottom in found["boxes"]:

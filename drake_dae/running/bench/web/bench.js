@@ -88,6 +88,7 @@ function let_go() {
 
 /* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
+  if (bench.failure) return;
   if (bench.push) follow_push();
   if (bench.pulled.length) let_go();
   try {
@@ -101,18 +102,18 @@ async function advance(ticks) {
 function draw() {
   const last = bench.samples.at(-1);
   view.show(last);
-  const chosen = Number(element("signal").value), { unit } = data.outputs[chosen];
+  const chosen = Number(element("signal").value);
   plots.signal.draw(bench.samples, [
     { value: ({ z }) => z[chosen], color: COLORS[1] },
     { value: ({ r }) => r[chosen], color: DESIRED, dashed: true },
-  ], unit, [["actual", COLORS[1], false], ["desired", DESIRED, true]]);
+  ], [["actual", COLORS[1], false], ["desired", DESIRED, true]]);
   const errors = element("error").value.split(",").map(Number);
   const legend = [["error", COLORS[0], false]];
   if (prediction) legend.push(["predicted", PREDICTED, true]);
   plots.error.draw(bench.samples, errors.flatMap((i, k) => [
     { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
     ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
-  ]), data.outputs[errors[0]].unit, legend);
+  ]), legend);
   const slow = bench.isRunning && bench.speed < 0.95 ? `, runs at ${bench.speed.toFixed(2)} of that` : "";
   const rate = RATES[bench.rate] === 1 ? "real time" : `${RATES[bench.rate]} x real time`;
   element("clock").textContent = `t = ${last.time.toFixed(2)} s, ${rate}${slow}` +

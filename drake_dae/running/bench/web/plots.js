@@ -7,7 +7,7 @@ class Plot {
     this.canvas = canvas;
   }
   /* curves: [{ value: sample -> number, color, dashed }]. */
-  draw(samples, curves, unit, legend) {
+  draw(samples, curves, legend) {
     const { canvas } = this;
     const ratio = window.devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -50,18 +50,15 @@ class Plot {
     for (let t = Math.ceil(first); t <= last; t++) pen.fillText(`${t} s`, x(t), height - 5);
     pen.textAlign = "left";
     let place = 6;
-    for (const [text, color, dashed] of [...legend, [unit && `[${unit}]`, "#667"]]) {
-      pen.fillStyle = color;
+    for (const [text, color, dashed] of legend) {
+      pen.fillStyle = pen.strokeStyle = color;
       pen.fillText(text, place, 14);
-      if (dashed !== undefined) {
-        pen.strokeStyle = color;
-        pen.setLineDash(dashed ? [5, 4] : []);
-        pen.lineWidth = 2;
-        pen.beginPath();
-        pen.moveTo(place, 20);
-        pen.lineTo(place + pen.measureText(text).width, 20);
-        pen.stroke();
-      }
+      pen.setLineDash(dashed ? [5, 4] : []);
+      pen.lineWidth = 2;
+      pen.beginPath();
+      pen.moveTo(place, 20);
+      pen.lineTo(place + pen.measureText(text).width, 20);
+      pen.stroke();
       place += pen.measureText(text).width + 12;
     }
     curves.forEach(({ color, dashed }, i) => {
