@@ -51,7 +51,10 @@ class Model:
         self.closures = {c.name: self.add_closure(c) for c in mechanism.closures}
         self.mbs.Assemble()
         if duration:
-            self.mbs.SolveDynamic(settings(duration))
+            try:
+                self.mbs.SolveDynamic(settings(duration))
+            except exu.SolverError:
+                raise NotImplementedError("its solver ends early") from None
             return
         self.solver = exu.MainSolverImplicitSecondOrder()
         if not self.solver.InitializeSolver(self.mbs, settings(MOVING_STEP)):

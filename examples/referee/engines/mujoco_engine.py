@@ -197,7 +197,7 @@ def forces(
     found = {}
     for closure in mechanism.closures:
         if closure.kind in ("plane", "ball"):
-            found[closure.name] = contact_force(model, data, mechanism, closure)
+            found[closure.name] = contact_force(model, data, closure)
             continue
         number = model.equality(closure.name).id
         rows = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (data.efc_id == number)
@@ -223,19 +223,16 @@ def moment(
     return np.linalg.lstsq((turns[0] - turns[1]).T, own.T, rcond=None)[0]
 
 
-def contact_force(
-    model: mujoco.MjModel, data: mujoco.MjData, mechanism: Mechanism, closure: Closure
-) -> np.ndarray:
+def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
     if closure.kind == "ball":
         target = data.site(f"{closure.name}_b").xpos - closure.size * np.array(closure.direction)
     else:
         target = data.site(f"{closure.name}_b").xpos
-    for i in range(data.ncon):
-        contact = data.contact[i]
-        if np.linalg.norm(contact.pos - target) < 1e-6:
-            force = np.zeros(6)
-            mujoco.mj_contactForce(model, data, i, force)
-            # From the first geometry, the plane, to the second one.
-            return contact.frame.reshape(3, 3).T @ force[:3]
-    raise ValueError(f"{mechanism.name}: no contact at {closure.name}")
+    if not data.ncon:
+        raise NotImplementedError("the contact opened")
+    near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))
+    force = np.zeros(6)
+    mujoco.mj_contactForce(model, data, near, force)
+    # From the first geometry, the plane, to the second one.
+    return data.contact[near].frame.reshape(3, 3).T @ force[:3]
