@@ -8,15 +8,14 @@ from referee.description import Body, Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in steps of 2e-5 s, with a time "
-    "constant of 4e-5 s"
+    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in 10,000 steps, with a "
+    "time constant of two steps, the least"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
 
-MOVING_STEP = 2e-5
-STIFF = f'solimp="0.9999 0.9999 0.001 0.5 2" solref="{2 * MOVING_STEP} 1"'
-"""In motions the least time constant that MuJoCo takes as it is: two steps."""
+STEPS = 10_000
+"""The steps of a motion."""
 
 # Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
 mujoco.set_mju_user_warning(lambda message: None)
@@ -117,10 +116,12 @@ def solved(
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The model, and its data after the forward dynamics at a state, or a while later."""
     text = xml(mechanism, geoms)
+    step = duration / STEPS
     if duration:
-        text = text.replace(HARD, STIFF)
+        text = text.replace('solref="-1e-9 -1e-9"', f'solref="{2 * step} 1"')
     model = mujoco.MjModel.from_xml_string(text)
-    model.opt.timestep, model.opt.integrator = MOVING_STEP, mujoco.mjtIntegrator.mjINT_RK4
+    if duration:
+        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
@@ -130,7 +131,7 @@ def solved(
         if closure.kind == "distance":
             length = model.tendon_length0[model.tendon(closure.name).id]
             model.eq_data[model.equality(closure.name).id, 0] = closure.size - length
-    for _ in range(round(duration / MOVING_STEP)):
+    for _ in range(STEPS if duration else 0):
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
