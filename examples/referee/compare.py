@@ -101,6 +101,8 @@ def compare_motion(engine: ModuleType, mechanism: Mechanism, start: Lines, end: 
         found = engine.after(mechanism, *state_of(mechanism, start))
     except NotImplementedError as error:
         return Cell(None, str(error))
+    except (RuntimeError, ValueError) as error:  # The other mechanisms go on.
+        return Cell(None, f"it fails with {str(error).splitlines()[0]!r}")
     q, v = state_of(mechanism, end)
     parts = [(stacked(mechanism, found), wanted_forces(mechanism, end))]
     parts += [(found[key], value) for key, value in (("q", q), ("v", v)) if key in found]

@@ -32,7 +32,7 @@ NAME = "Drake, SAP"
 NOTE = (
     "near-rigid constraints on rates in discrete time: the force of the tenth step of 1e-6 s. "
     "Contacts of 1e9 N/m: the third step of 1e-5 s; where they slide, the 30th of 1e-4 s with "
-    "Drake's lagged approximation, since SAP's own lifts what slides. Motions in steps of 2e-5 s"
+    "Drake's lagged approximation, since SAP's own lifts what slides. Motions in 10,000 steps"
 )
 STIFFNESS, RADIUS, GRIP = 1e9, 0.01, 10.0
 
@@ -52,14 +52,14 @@ RIGID, STICKING, SLIDING = (
 )
 
 
-MOVING_STEP = 2e-5
-"""The step of motions in s."""
+STEPS = 10_000
+"""The steps of a motion."""
 
 
 def settings_for(mechanism: Mechanism, duration: float = 0.0) -> Settings:
     """The settings for its kinds of closures."""
     if duration:
-        return Settings("sap", MOVING_STEP, round(duration / MOVING_STEP))
+        return Settings("sap", duration / STEPS, STEPS)
     if any(closure.friction for closure in mechanism.closures):
         return SLIDING
     touching = any(closure.kind in ("plane", "ball") for closure in mechanism.closures)

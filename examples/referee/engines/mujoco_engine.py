@@ -8,15 +8,14 @@ from referee.description import Body, Closure, Mechanism
 NAME = "MuJoCo"
 NOTE = (
     "soft constraints: regularized acceleration, impedance at its largest value of 0.9999, "
-    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in steps of 2e-5 s, with a time "
-    "constant of 4e-5 s"
+    "Newton's solver to 1e-15, elliptic cones. Motions by RK4 in 10,000 steps, with a "
+    "time constant of two steps, the least"
 )
 HARD = 'solimp="0.9999 0.9999 0.001 0.5 2" solref="-1e-9 -1e-9"'
 """At a consistent state the reference acceleration is zero, so no stiffness is needed."""
 
-MOVING_STEP = 2e-5
-STIFF = f'solimp="0.9999 0.9999 0.001 0.5 2" solref="{2 * MOVING_STEP} 1"'
-"""In motions the least time constant that MuJoCo takes as it is: two steps."""
+STEPS = 10_000
+"""The steps of a motion."""
 
 # Of the top at q = 0, where its first and last axes are one: MuJoCo writes it into a file.
 mujoco.set_mju_user_warning(lambda message: None)
@@ -117,10 +116,12 @@ def solved(
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The model, and its data after the forward dynamics at a state, or a while later."""
     text = xml(mechanism, geoms)
+    step = duration / STEPS
     if duration:
-        text = text.replace(HARD, STIFF)
+        text = text.replace('solref="-1e-9 -1e-9"', f'solref="{2 * step} 1"')
     model = mujoco.MjModel.from_xml_string(text)
-    model.opt.timestep, model.opt.integrator = MOVING_STEP, mujoco.mjtIntegrator.mjINT_RK4
+    if duration:
+        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
     data = mujoco.MjData(model)
     for i in range(mechanism.size):
         joint = model.joint(f"j{i}")
@@ -130,7 +131,7 @@ def solved(
         if closure.kind == "distance":
             length = model.tendon_length0[model.tendon(closure.name).id]
             model.eq_data[model.equality(closure.name).id, 0] = closure.size - length
-    for _ in range(round(duration / MOVING_STEP)):
+    for _ in range(STEPS if duration else 0):
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     return model, data
@@ -197,7 +198,7 @@ def forces(
     found = {}
     for closure in mechanism.closures:
         if closure.kind in ("plane", "ball"):
-            found[closure.name] = contact_force(model, data, mechanism, closure)
+            found[closure.name] = contact_force(model, data, closure)
             continue
         number = model.equality(closure.name).id
         rows = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (data.efc_id == number)
@@ -223,19 +224,16 @@ def moment(
     return np.linalg.lstsq((turns[0] - turns[1]).T, own.T, rcond=None)[0]
 
 
-def contact_force(
-    model: mujoco.MjModel, data: mujoco.MjData, mechanism: Mechanism, closure: Closure
-) -> np.ndarray:
+def contact_force(model: mujoco.MjModel, data: mujoco.MjData, closure: Closure) -> np.ndarray:
     """The force of a contact on the body, in the world."""
     if closure.kind == "ball":
         target = data.site(f"{closure.name}_b").xpos - closure.size * np.array(closure.direction)
     else:
         target = data.site(f"{closure.name}_b").xpos
-    for i in range(data.ncon):
-        contact = data.contact[i]
-        if np.linalg.norm(contact.pos - target) < 1e-6:
-            force = np.zeros(6)
-            mujoco.mj_contactForce(model, data, i, force)
-            # From the first geometry, the plane, to the second one.
-            return contact.frame.reshape(3, 3).T @ force[:3]
-    raise ValueError(f"{mechanism.name}: no contact at {closure.name}")
+    if not data.ncon:
+        raise NotImplementedError("the contact opened")
+    near = min(range(data.ncon), key=lambda i: np.linalg.norm(data.contact[i].pos - target))
+    force = np.zeros(6)
+    mujoco.mj_contactForce(model, data, near, force)
+    # From the first geometry, the plane, to the second one.
+    return data.contact[near].frame.reshape(3, 3).T @ force[:3]
