@@ -22,6 +22,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def run_page(page: Path, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     all_blocks = blocks(page)
     with contextlib.chdir(folder):
-        for block, following in zip(all_blocks, [*all_blocks[1:], None], strict=True):
+        for block, following in zip_longest(all_blocks, all_blocks[1:]):
             try:
                 if block.language == "python":
                     printed = _run_python(block, page, namespace)
