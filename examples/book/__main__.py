@@ -33,6 +33,7 @@ def main() -> int:
         (source / name).write_text(text, "utf-8")
     shutil.copy(BOOK / "conf.py", source)
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
+    shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     code = subprocess.run([*command, source, site]).returncode
     # Pages that a page frames: Sphinx copies pictures only.
