@@ -180,9 +180,9 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     os.kill(worker, signal.SIGKILL)
     said, _ = process.communicate(timeout=100)
     assert process.returncode == 1
-    assert said.startswith(
-        "6 runs: 5 finished, 1 crashed\n\nrun 3 crashed: the process ended with signal SIGKILL\n"
-    )
+    words = " ".join(said.split())  # Lines are filled.
+    assert words.startswith("6 runs: 5 finished, 1 crashed run 3, tool.z=")
+    assert ", crashed: the process ended with signal SIGKILL figure" in words
     with open(tmp_path / "runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     name = "largest error of tool.z [m]"
@@ -226,9 +226,11 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
         os.kill(int(listed.stdout), signal.SIGSTOP)
     said, error = process.communicate(timeout=100)
     assert process.returncode == 1
-    assert said.startswith(
-        "3 runs: 2 finished, 1 timed out\n\nrun 1 timed out: no end within 5 s\n"
+    words = " ".join(said.split())  # Lines are filled.
+    assert words.startswith(
+        "3 runs: 2 finished, 1 timed out run 1, integrator.target_realtime_rate"
     )
+    assert ", timed out: no end within 5 s " in words
     assert "1 run died or took too long; the same command tries again: 1" in error
 
 
@@ -302,7 +304,8 @@ def test_the_table_and_the_summary():
     }
     text = str(study)
     assert text.startswith("4 runs: 2 finished, 1 failed, 1 no start\n")
-    assert "run 1 failed: it cannot go on\nrun 3 no start: it cannot go on\n" in text
+    assert "run 1, a=0, b=[1.0], failed: it cannot go on\n" in text
+    assert "run 3, a=1, b=[1.0], no start: it cannot go on\n" in text
     assert "beyond their limits: motor in 1 run\n" in text
     row = next(line.split() for line in text.splitlines() if line.startswith("largest error"))
     assert row[-5:] == ["0", "0", "0.1", "0.2", "2"]
@@ -315,7 +318,8 @@ def test_the_table_and_the_summary():
 def test_it_leaves_its_files(tmp_path):
     written = made().save(tmp_path / "new")
     assert [path.name for path in written] == list(FILES)
-    for path in written[2:]:
+    assert written[2].read_text("utf-8").startswith("<!DOCTYPE html>")
+    for path in written[3:]:
         assert path.read_bytes().startswith(b"\x89PNG")
     with open(written[0], newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -326,5 +330,5 @@ def test_it_leaves_its_files(tmp_path):
 
 def test_without_figures_nothing_is_drawn(tmp_path):
     written = made(("no start", "no start")).save(tmp_path)
-    assert [path.name for path in written] == list(FILES[:2])
-    assert sorted(os.listdir(tmp_path)) == sorted(FILES[:2])
+    assert [path.name for path in written] == list(FILES[:3])
+    assert sorted(os.listdir(tmp_path)) == sorted(FILES[:3])
