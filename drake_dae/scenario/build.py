@@ -148,7 +148,8 @@ def build_loop(
         scene_graph = own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
-    plant = plant or make_plant(scenario, model, structure, feedback, opens)
+    pushed = commands is not None
+    plant = plant or make_plant(scenario, model, structure, feedback, opens, pushed)
 
     # The parts between them; problems are reported with their key.
     with at("force_feedback"):
@@ -215,6 +216,7 @@ def make_plant(
     structure: Structure,
     feedback: bool = False,
     opens: str = "",
+    pushed: bool = False,
 ) -> Plant:
     """The plant of a scenario.
 
@@ -224,6 +226,7 @@ def make_plant(
         structure: The structure of the model's system.
         feedback: Whether the plant may take a law itself.
         opens: The contact that a task opens and closes; empty without a task.
+        pushed: Whether the links of Drake's own plant can be pushed while it runs.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -231,7 +234,8 @@ def make_plant(
     check_disturbances(scenario.plant_disturbances, model.links)
     adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
     parameters, disturbances = scenario.plant_parameters, scenario.plant_disturbances
-    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, disturbances)
+    given = parameters, disturbances, pushed
+    robot = RobotToSimulate(model, structure, feedback, opens, adds, *given)
     return scenario.plant.plant(robot)
 
 

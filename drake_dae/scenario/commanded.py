@@ -72,6 +72,8 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
             # At rest, where the scenario itself starts at rest.
             begun = replace(completed.scenario, exogenous=scenario.exogenous)
             context = start_scenario(begun, loop)
+            if loop.plant.pushes is not None:
+                left_out.pop(_PUSHED, None)
             return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
         except DrakeDaeError as error:
             if not parts:
@@ -80,6 +82,8 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
             del parts[name]
             left_out[name] = f"{name}: {error}"
 
+
+_PUSHED = "links that are pushed"
 
 _COMPLIANT = "none, since the contact of the plant is compliant"
 
@@ -136,6 +140,6 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
-    "links that are pushed": _with_pushes,
+    _PUSHED: _with_pushes,
 }
 """What is added, in the order in which it is left out again."""

@@ -39,6 +39,7 @@ class RobotToSimulate:
         add_robot: Adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the plant's changed value.
         disturbances: Disturbance forces on the plant.
+        pushed: Whether the links of Drake's own plant can be pushed while it runs.
     """
 
     model: RobotModel
@@ -48,6 +49,7 @@ class RobotToSimulate:
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
+    pushed: bool = False
 
 
 class ScenarioPlant(ABC):
@@ -179,6 +181,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 structure=robot.structure,
                 parameters=robot.parameters,
                 disturbances=robot.disturbances,
+                pushed=robot.pushed,
             )
 
 

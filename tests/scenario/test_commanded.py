@@ -88,6 +88,29 @@ def test_a_push_that_the_law_does_not_know_moves_the_tool():
     assert pushed["controlled_output"][-1, 0] > plain["controlled_output"][-1, 0] + 0.01
 
 
+@pytest.mark.slow
+def test_links_in_drakes_own_contact_are_pushed_beside_other_forces():
+    steady = "plant_disturbances=[{frame: link4, force: [0.0, 3.0, 0.0]}]"
+    built = build_commanded(scenario("wall_point_contact", steady))
+    plant, context = built.loop.plant, built.context.Clone()
+    context.SetTime(1.0)  # The disturbance has risen.
+    inputs = Inputs.of(built.loop)
+    first = inputs.names.index("pushes.push.seven_joint_arm::tool.force[0]")
+    wrench = [1.0, -2.0, 3.0, 0.1, 0.2, -0.3]
+    inputs.set(context, {first + k: value for k, value in enumerate(wrench)})
+    port = plant.multibody.get_applied_spatial_force_input_port()
+    found = port.Eval(plant.multibody.GetMyContextFromRoot(context))
+    given = {}
+    for one in found:
+        name = plant.multibody.get_body(one.body_index).name()
+        wanted = given.setdefault(name, np.zeros(6))
+        wanted += [*one.F_Bq_W.translational(), *one.F_Bq_W.rotational()]
+        np.testing.assert_array_equal(one.p_BoBq_B, np.zeros(3))
+    np.testing.assert_allclose(given.pop("tool"), wrench)
+    np.testing.assert_allclose(given.pop("link4"), [0.0, 3.0, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    assert not np.any(list(given.values()))
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_every_shipped_scenario_is_commanded(name):
@@ -96,10 +119,11 @@ def test_every_shipped_scenario_is_commanded(name):
     names = Inputs.of(built.loop).names
     assert built.loop.generator is None or "reference.path.speed" in names
     is_compliant = given.plant.material is not None
-    assert any(".push." in each for each in names) is not is_compliant
+    is_pushed = not is_compliant or built.loop.plant.pushes is not None
+    assert any(".push." in each for each in names) is is_pushed
     # What is left out has a reason, of which none is an error of the build.
     assert all(": none, since " in sentence for sentence in built.left_out)
     parts = {sentence.partition(":")[0] for sentence in built.left_out}
-    assert ("links that are pushed" in parts) is is_compliant
+    assert ("links that are pushed" in parts) is not is_pushed
     is_held = is_compliant or given.task is not None or given.observer is not None
     assert ("surfaces that are dragged" in parts) is is_held

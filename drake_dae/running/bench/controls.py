@@ -45,7 +45,8 @@ class Inputs:
     def of(cls, loop: ClosedLoop) -> "Inputs":
         """Those of generators, plant and controller."""
         context = loop.diagram.CreateDefaultContext()
-        made = (loop.generator, loop.exogenous, loop.plant_exogenous, loop.plant, loop.controller)
+        sources = loop.generator, loop.exogenous, loop.plant_exogenous
+        made = (*sources, loop.plant, loop.controller, loop.plant.pushes)
         blocks, signals = dict[System, int](), list[Signal]()
         for block in made:
             # Drake's own contact is a Diagram, whose numbers are those of many blocks.
@@ -152,6 +153,12 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
         for name, place in places.items()
         if name.startswith(PUSH) and name.endswith(".force.0")
     }
+    if loop.plant.pushes in inputs.blocks:
+        first, end = inputs.blocks[loop.plant.pushes], f".{PUSH}"
+        for place in range(first, len(inputs.names)):
+            _, is_push, name = inputs.names[place].partition(end)
+            if is_push and name.endswith(".force[0]"):
+                pushes[name.removesuffix(".force[0]")] = place
     return Controls(inputs, found, pushes)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -74,7 +74,9 @@ class Plant(System):
         takes a law as a value; see `DaePlant`. `laws_along` are the parameters of that law at the
         times of a run, or None.
     13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
-    14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
+    14. Pushes. `pushes` is a block with wrenches on links as its numeric parameters, see
+        `LinkPushes`; None for a plant whose model has them, or that is not pushed.
+    15. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
     15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
         the law may not know; not negative.
@@ -93,6 +95,7 @@ class Plant(System):
     normals: tuple[int, ...] = ()
     projects: bool = False
     is_ideal: bool = True
+    pushes: System | None = None
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
