@@ -15,7 +15,10 @@ class View {
     this.push = new three.ArrowHelper(new three.Vector3(0, 0, 1), new three.Vector3(), 1, 0x8833bb);
     this.push.visible = false;
     viewer.scene.add(this.push);
-    new ResizeObserver(() => viewer.set_3d_pane_size()).observe(viewer.dom_element);
+    new ResizeObserver(() => {
+      viewer.set_3d_pane_size();
+      viewer.set_dirty();
+    }).observe(viewer.dom_element);
   }
   label() {
     const made = document.createElement("div");
