@@ -180,7 +180,8 @@ def replay(
     waiting = list(commands.commands)
     for name in dict.fromkeys(name for _, name, _ in waiting):
         if name not in places:
-            raise ModelError(unknown_name("input of the loop", name, places))
+            own = [place for place in places if not place.endswith("'")]
+            raise ModelError(unknown_name("input of the loop", name, own))
     for k in range(commands.end):
         now = {places[name]: value for at, name, value in waiting if at == k}
         waiting = [one for one in waiting if one[0] > k]

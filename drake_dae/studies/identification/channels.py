@@ -94,7 +94,11 @@ def is_position(signal: Signal) -> bool:
 def channels_of(
     record: Record, loop: ClosedLoop, title: str
 ) -> tuple[list[Channel], list[FloatArray]]:
-    """The measured columns, and their values: nan where there is no measurement."""
+    """The measured columns, and their values: nan where there is no measurement.
+
+    Raises:
+        ModelError: A column has no measurement, since rows are too far apart.
+    """
     plant, channels, values = loop.plant, list[Channel](), list[FloatArray]()
     # Positions, as encoders show them or as they are.
     name, biases = "state", np.zeros(plant.dae.num_states)
@@ -135,6 +139,14 @@ def channels_of(
                 column = np.where(np.diff(drawn, append=np.inf) > 0.0, column, np.nan)
         channels.append(Channel(name, signal, port, place, bias))
         values.append(column)
+    for channel, column in zip(channels, values, strict=True):
+        if np.isnan(column).all():
+            apart = float(np.median(np.diff(record.time)))
+            raise ModelError(
+                f"{title} has no row at which '{channel.signal}' was sampled; its rows are "
+                f"{apart:g} s apart: record rows at the samples, as by fixed steps of this period "
+                "(integrator.use_error_control: false, integrator.max_step_size)"
+            )
     return channels, values
 
 

@@ -221,6 +221,19 @@ def test_no_run_within_limits_is_an_error(slider):
         excite(fast, ranges, ["mass.mass"], noise=NOISE, runs=3)
 
 
+def test_rows_between_samples_are_refused():
+    """Rows of a run under error control are 2 ms apart, where the sensor samples each 1 ms."""
+    settings = [
+        "duration=2",
+        "sampling={period: 0.001}",
+        "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}",
+    ]
+    arm = load_scenario("two_link_wall", settings)
+    ranges = {"references.wall.force.offset": (10.0, 20.0)}
+    with pytest.raises(ModelError, match="no row at which 'measured_force' was sampled.*0.002 s"):
+        excite(arm, ranges, ["link2.mass"], noise={"position": 1e-5}, runs=2)
+
+
 def test_the_command(slider, tmp_path, capsys):
     out = tmp_path / "best.yaml"
     asked = ["excite", str(slider), "--free", "mass.mass", "--runs", "3", "--criterion", "A"]
