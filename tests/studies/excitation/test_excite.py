@@ -230,7 +230,7 @@ def test_rows_between_samples_are_refused():
     ]
     arm = load_scenario("two_link_wall", settings)
     ranges = {"references.wall.force.offset": (10.0, 20.0)}
-    with pytest.raises(ModelError, match="no row at which 'measured_force' was sampled.*0.002 s"):
+    with pytest.raises(ModelError, match=r"no row at which 'measured_force' was sampled.*0.002 s"):
         excite(arm, ranges, ["link2.mass"], noise={"position": 1e-5}, runs=2)
 
 
