@@ -72,7 +72,7 @@ def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys)
     assert away["reason"].endswith("where its guard has 9 N, in 2 samples")
     story = " ".join(text.split("\n\n")[0].split())
     assert story.startswith("GOOD: the task was done at")
-    assert f"{away['reason']}, and away followed, as chosen." in story
+    assert f"{away['reason']}, and away followed, as chosen" in story
     assert f"\n{away['time']:.6g} s: away, Press is ended by" in text
     record = Record.load(tmp_path / "run" / "record.npz")
     assert [one.name for one in phase_spans(record)] == ["feel", "Press", "away", "end"]

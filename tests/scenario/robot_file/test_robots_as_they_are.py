@@ -413,8 +413,10 @@ def test_a_mesh_that_meshcat_does_not_draw_is_drawn_where_trimesh_is(name, tmp_p
     (geometry,) = inspector.GetAllGeometryIds(Role.kIllustration)
     shape = inspector.GetShape(geometry)
     assert isinstance(shape, Mesh)
-    lines = Counter(line[0] for line in Path(shape.source().path()).read_text().splitlines())
-    assert lines == {"v": 4, "f": 4}
+    lines = Counter(
+        line.split()[0] for line in Path(shape.source().path()).read_text().splitlines()
+    )
+    assert lines == {"v": 4, "vn": 4, "f": 4}
     box = inspector.GetObbInGeometryFrame(geometry)
     assert np.all(box.half_width() <= 0.1)
 
