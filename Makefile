@@ -49,7 +49,7 @@ help:
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
-	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
+	@echo 'make pictures    film the demo and a task, into $(PICTURES)/'
 	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
 	@echo 'make gallery     run all scenarios and show them on one page, in build/gallery/; some minutes'
 	@echo 'make sheet       every scenario at three moments, as page and film, into runs/sheet/; chromium'
@@ -131,8 +131,6 @@ pictures: $(VENV)/installed
 	$(BIN)/drake-dae render runs/polish --out $(PICTURES)/wall_polish.gif
 	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
 	$(BIN)/drake-dae render runs/pictures --out $(PICTURES)/seven_joint_wall.gif
-	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png
-	cp runs/pictures/errors.png $(PICTURES)/seven_joint_wall_errors.png
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python examples/book --out $(BOOK)

@@ -2,9 +2,11 @@
 
 import argparse
 import hashlib
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 BOOK = Path(__file__).parent
@@ -13,6 +15,10 @@ sys.path.insert(0, str(BOOK.parent))
 import drake_dae  # noqa: E402
 from book.generated import generated_pages  # noqa: E402
 from book.pages import pages, run_page  # noqa: E402
+from drake_dae.cli import main as command  # noqa: E402
+
+NO_FIGURE = "<p>This figure needs zig: pip install 'drake_dae[compiler]'; drake-dae page {name}</p>"
+"""What is shown where the page of a scenario could not be made."""
 
 
 def main() -> int:
@@ -34,16 +40,29 @@ def main() -> int:
     shutil.copy(BOOK / "conf.py", source)
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
-    code = subprocess.run([*command, source, site]).returncode
-    # Pages that a page frames: Sphinx copies pictures only.
-    for live in source.rglob("*.html"):
-        framed = site / live.relative_to(source)
-        framed.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(live, framed)
+    _live_figures(texts.values(), library, site / "live")
+    sphinx = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    code = subprocess.run([*sphinx, source, site]).returncode
     if not code:
         print(f"open {site / 'index.html'}")
     return code
+
+
+def _live_figures(texts: Iterable[str], library: str, folder: Path) -> None:
+    """Makes the pages of scenarios that pages of the book frame, with one bundle for all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = {name for text in texts for name in re.findall(r'src="\.\./live/(\w+)\.html"', text)}
+    for name in sorted(names):
+        page, stamp = folder / f"{name}.html", folder / f"{name}.stamp"
+        if page.exists() and stamp.exists() and stamp.read_text() == library:
+            continue
+        print(f"makes the live figure {name}", flush=True)
+        if command(
+            ["page", name, "--out", str(page), "--shared-bundle", str(folder / "meshcat.js")]
+        ):
+            page.write_text(NO_FIGURE.format(name=name), "utf-8")
+        else:
+            stamp.write_text(library)
 
 
 def _run(page: Path, place: Path, library: str) -> None:
