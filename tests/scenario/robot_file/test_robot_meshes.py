@@ -288,6 +288,8 @@ def box_of_collada(file: Path, unit: float) -> None:
     file.write_bytes(written.getvalue())
 
 
+# pycollada sets the shape of arrays, also where the test writes its file.
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
 @pytest.mark.parametrize("unit", [1.0, 0.001])
 def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float, tmp_path: Path):
     """Drake's renderer of films takes a .gltf and no .dae; a .gltf has y upward, Drake turns it."""

@@ -5,6 +5,7 @@ colors and textures of its vendor, and others an .obj, which has the color of th
 """
 
 import re
+import warnings
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -90,7 +91,10 @@ def _gltf(mesh: Path) -> bytes:
     import trimesh
 
     try:
-        scene: Any = trimesh.load_scene(mesh)
+        with warnings.catch_warnings():
+            # pycollada sets the shape of arrays, which NumPy 2.5 deprecates.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            scene: Any = trimesh.load_scene(mesh)
         if scene.is_empty:
             raise ModelError(f"no mesh in '{mesh.name}'")
         unit = _UNIT.search(mesh.read_bytes())
