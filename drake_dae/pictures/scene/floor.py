@@ -36,8 +36,8 @@ class Floor:
         (x, far_x), (y, far_y), z = *zip(self.low, self.high, strict=True), self.height
         along = np.linspace(x, far_x, round((far_x - x) / self.cell) + 1)
         across = np.linspace(y, far_y, round((far_y - y) / self.cell) + 1)
-        ends = [((each, y, z), (each, far_y, z)) for each in along]
-        ends += [((x, each, z), (far_x, each, z)) for each in across]
+        ends = [((each, y, z), (each, far_y, z)) for each in along.tolist()]
+        ends += [((x, each, z), (far_x, each, z)) for each in across.tolist()]
         begins, finishes = zip(*ends, strict=True)
         return np.array(begins), np.array(finishes)
 
