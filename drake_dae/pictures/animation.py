@@ -2,10 +2,8 @@
 
 import html
 import json
-import logging
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +46,7 @@ from drake_dae.pictures.scene.view import (
     draw_scene,
     draw_surroundings,
     look_at,
-    start_meshcat,
+    start_unwatched_meshcat,
     view_of_links,
 )
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
@@ -117,8 +115,7 @@ def animate(
         moments: What happens in the run, marked on the bar of time.
     """
     # A separate server, made only now: other runs do not open a port.
-    with _quiet():
-        meshcat = start_meshcat()
+    meshcat = start_unwatched_meshcat()
     plant, acting = course.plant, course.acting
     model = course.model
     arrows = draw_scene(plant, meshcat, scene_graph)
@@ -224,18 +221,6 @@ def _add_flashes(meshcat: Meshcat, course: RunMotion, radius: float) -> dict[int
     for path in paths.values():
         meshcat.SetObject(f"{path}/ball", Sphere(radius), _FLASH)
     return paths
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppresses Drake's message about the address of a server that is not for users."""
-    log = logging.getLogger("drake")
-    level = log.level
-    log.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 def _draw_paths(

@@ -1,6 +1,7 @@
 """A constrained robot in Drake's Meshcat: links, surfaces and constraint forces."""
 
 import errno
+import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -69,6 +70,21 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     return meshcat
+
+
+def start_unwatched_meshcat() -> Meshcat:
+    """A Meshcat server for a page that is written: Drake does not print its address.
+
+    Raises:
+        OSError: There is no free port.
+    """
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        return start_meshcat()
+    finally:
+        log.setLevel(level)
 
 
 def add_live_view(

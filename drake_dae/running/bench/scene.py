@@ -1,9 +1,7 @@
 """What a bench draws: Meshcat's page of a robot, and what its parts follow, as functions."""
 
 import gc
-import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -16,7 +14,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.pictures.scene.arrows import path_of
 from drake_dae.pictures.scene.surroundings import scene_extent
-from drake_dae.pictures.scene.view import draw_scene, start_meshcat, view_of_links
+from drake_dae.pictures.scene.view import draw_scene, start_unwatched_meshcat, view_of_links
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
@@ -92,8 +90,7 @@ def scene_of(loop: ClosedLoop, context: Context) -> Scene:
 
 def _static_page(loop: ClosedLoop, state: FloatArray) -> str:
     """Meshcat's page of a robot in a state, from a server that is gone afterwards."""
-    with _quiet():
-        meshcat = start_meshcat()
+    meshcat = start_unwatched_meshcat()
     meshcat.SetProperty("/Background", "visible", True)
     for part in ("top_color", "bottom_color"):
         color = [_BACKGROUND.r(), _BACKGROUND.g(), _BACKGROUND.b()]
@@ -173,15 +170,3 @@ def surface_direction(model: RobotModel, constraint: Constraint, state: FloatArr
 def path_of_surface(constraint: Constraint) -> list[str]:
     """The path of a surface in Meshcat."""
     return path_of(constraint, "surface").strip("/").split("/")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppresses Drake's message about the address of a server that is not for users."""
-    log = logging.getLogger("drake")
-    level = log.level
-    log.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
