@@ -40,7 +40,7 @@ def main() -> int:
     shutil.copy(BOOK / "conf.py", source)
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
-    _live_figures(texts.values(), library, site / "live")
+    _live_figures(texts.values(), library, out)
     sphinx = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     code = subprocess.run([*sphinx, source, site]).returncode
     if not code:
@@ -48,12 +48,13 @@ def main() -> int:
     return code
 
 
-def _live_figures(texts: Iterable[str], library: str, folder: Path) -> None:
+def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
     """Makes the pages of scenarios that pages of the book frame, with one bundle for all."""
+    folder = out / "site" / "live"
     folder.mkdir(parents=True, exist_ok=True)
     names = {name for text in texts for name in re.findall(r'src="\.\./live/(\w+)\.html"', text)}
     for name in sorted(names):
-        page, stamp = folder / f"{name}.html", folder / f"{name}.stamp"
+        page, stamp = folder / f"{name}.html", out / f"{name}.stamp"
         if page.exists() and stamp.exists() and stamp.read_text() == library:
             continue
         print(f"makes the live figure {name}", flush=True)

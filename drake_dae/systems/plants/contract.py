@@ -78,7 +78,7 @@ class Plant(System):
         `LinkPushes`; None for a plant whose model has them, or that is not pushed.
     15. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
-    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+    16. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
         the law may not know; not negative.
     """
 
