@@ -14,7 +14,7 @@ from drake_dae.systems.plants.contact_events import ContactChange
 
 APART = 0.01
 """Of moments of one kind and place that follow each other within this fraction of the run, the
-first is shown."""
+first is shown; of impacts all are."""
 
 
 class Kind(Enum):
@@ -58,14 +58,14 @@ def moments_of(record: Record, limits: Limits | None = None) -> list[Moment]:
 
 
 def ordered(record: Record, moments: Sequence[Moment]) -> list[Moment]:
-    """Moments in order, without those that repeat shortly after."""
+    """Moments in order, without repetitions shortly after, except those of impacts."""
     if not record.time.size:
         return []
     apart = APART * float(record.time[-1] - record.time[0])
     last, found = dict[tuple[Kind, str], float](), list[Moment]()
     for moment in sorted(moments, key=lambda one: one.time):
         key = moment.kind, moment.text
-        if moment.time - last.get(key, -np.inf) > apart:
+        if moment.kind is Kind.IMPACT or moment.time - last.get(key, -np.inf) > apart:
             found.append(moment)
         last[key] = moment.time
     return found

@@ -33,7 +33,7 @@ def lines_of(mechanism: Mechanism, found: State) -> list[tuple[str, str, str]]:
 
 
 def digits(value: object) -> str:
-    """40 digits; what is zero but for the working precision is zero."""
+    """40 digits; what is zero to the working precision is zero."""
     if abs(value) < mp.mpf(10) ** -42:
         return "0"
     return mp.nstr(value, 40, strip_zeros=False, min_fixed=-5, max_fixed=5)

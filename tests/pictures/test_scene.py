@@ -81,7 +81,7 @@ def test_a_film_shows_the_whole_robot_at_all_times_below_its_clock(name):
         pixels = scene._camera.project(np.vstack([now, run.points[number]]))
         assert np.all(pixels > [0.0, _TOP * _HEIGHT])
         assert np.all(pixels < [_WIDTH, _HEIGHT])
-    # They fill the picture in one direction, but for the margins.
+    # They fill the picture in one direction, up to the margins.
     all_of_it = scene._camera.project(run_points(run, scene_graph))
     used = np.ptp(all_of_it, axis=0) / [_WIDTH, _HEIGHT * (1 - _TOP)]
     assert used.max() > 0.6

@@ -1,4 +1,4 @@
-"""What a bench in a browser is told of a loop: its scene, its controls and its outputs."""
+"""What a bench in a browser knows of a loop: its scene, its controls and its outputs."""
 
 import json
 from collections.abc import Sequence

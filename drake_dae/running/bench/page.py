@@ -101,7 +101,7 @@ def page_of(bench: Bench, data: object, engine: Sequence[str], own: str = "") ->
 
     Args:
         bench: The bench.
-        data: What its script is told.
+        data: What its script gets.
         engine: The scripts before that of the bench, which define `makeEngine`.
         own: What the page may connect to, as in a Content-Security-Policy.
     """

@@ -8,9 +8,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from scipy.integrate import solve_ivp
 
-from drake_dae import CommandedReferences, CommandLimits, ExpressionReference
+from drake_dae import CommandedReferences, CommandLimits, ExpressionReference, ReferenceGenerator
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.command_filter import CommandFilter
 
 SIGNALS = (Signal("tool.y", "m"), Signal("wall.force", "N"))
@@ -119,3 +119,21 @@ def test_the_block_follows_its_filter_and_begins_with_the_references_as_they_are
 def test_limits_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ModelError, match="CommandLimits"):
         CommandLimits(**wrong)
+
+
+def test_references_with_parameters_are_not_commanded():
+    """Both would be numeric parameter 0 of the block."""
+    given = ExpressionReference(lambda t, level: [level, 2.0 * level], {"level": 0.3})
+    with pytest.raises(ReferenceSignalError, match=r"parameters cannot be commanded.*of level"):
+        CommandedReferences([given], [2, 0], SIGNALS, LIMITS)
+
+
+def test_what_follows_time_alone_has_no_parameters():
+    """A plant may be fed by the latter; the former need not be logged."""
+    given = ExpressionReference(lambda t, level: [level, 2.0 * level], {"level": 0.3})
+    block = ReferenceGenerator([given], [2, 0])
+    assert (block.follows_time, block.is_by_time) == (True, False)
+    block = ReferenceGenerator([moving()], [2, 0])
+    assert (block.follows_time, block.is_by_time) == (True, True)
+    block = CommandedReferences([moving()], [2, 0], SIGNALS, LIMITS)
+    assert (block.follows_time, block.is_by_time) == (False, False)
