@@ -41,7 +41,7 @@ from drake_dae.analysis.findings import Assumption
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
@@ -282,7 +282,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Manifold: lambda: arm("two_link").structure.manifold,
     Derivatives: lambda: arm("two_link").structure.derivatives,
     Elimination: lambda: arm("two_link").structure.elimination,
-    Margin: lambda: arm("two_link").structure.control_margin,
+    RankMargin: lambda: arm("two_link").structure.control_margin,
     PinnedMotion: pinned_motion,
     dd.PathLimits: lambda: dd.PathLimits(0.2, 1.0),
     dd.Record: record,

@@ -19,7 +19,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.references import Reference
 from drake_dae.dae.states.contact_margin import ContactMargins
-from drake_dae.dae.states.margins import Margin, find_margin, is_regular
+from drake_dae.dae.states.margins import RankMargin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import (
@@ -205,11 +205,11 @@ def _examine(
     """All but the zero dynamics and the reference: degrees at some samples, margins at others."""
     system, elimination = samples.system, constrained.elimination
     known: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
-    margins: dict[int, Margin] = {}
+    margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
     satisfied, regular = {1, 2, 3}, True
 
-    def judge(margin: Margin, violation: Violation | None, number: int) -> None:
+    def judge(margin: RankMargin, violation: Violation | None, number: int) -> None:
         if violation:
             violations.append(violation)
             satisfied.difference_update({violation.assumption, number})
@@ -251,7 +251,7 @@ def _examine(
 def _assumptions(
     satisfied: Container[int],
     violations: Sequence[Violation],
-    margins: Mapping[int, Margin] | None = None,
+    margins: Mapping[int, RankMargin] | None = None,
     not_examined: str = "",
 ) -> tuple[Assumption, ...]:
     """Assumptions (1)-(5); one that is neither satisfied nor violated was not examined."""
@@ -271,7 +271,7 @@ def _assumptions(
     return tuple(result)
 
 
-def _independence(structure: Structure, samples: Samples) -> Margin | None:
+def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
     """The margin of the row vectors of Theorem 2.1."""
     functions = ca.vertcat(structure.manifold.residual_expression, structure.chain)
     if not functions.numel():

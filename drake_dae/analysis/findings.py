@@ -6,12 +6,12 @@ from enum import StrEnum
 from drake_dae.analysis.tables import named_values
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.states.contact_margin import ContactMargin
-from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
@@ -45,7 +45,7 @@ class Assumption:
     number: int
     statement: str
     finding: Finding
-    margin: Margin | None
+    margin: RankMargin | None
     reason: str
     violation: Violation | None = None
 
@@ -95,7 +95,7 @@ class Findings:
     assumptions: tuple[Assumption, ...]
     constraint_degrees: tuple[int, ...] | None = None
     output_degrees: tuple[int, ...] | None = None
-    independence: Margin | None = None
+    independence: RankMargin | None = None
     zero_dynamics: Stability | None = None
     equilibria: tuple[Stability, ...] = ()
     zero_dynamics_along: StabilityAlong | None = None
@@ -111,7 +111,7 @@ class Findings:
         """The outputs in the paper's order (15): those with mu_i >= 1 first."""
         if self.output_degrees is None:
             return None
-        layout = Layout(self.output_degrees)
+        layout = DerivativeLayout(self.output_degrees)
         return (*map(int, layout.dynamic), *map(int, layout.direct))
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.analysis.contact_text import contact_margin_as_dict, contact_margin_in_words
 from drake_dae.analysis.findings import Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
-from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
@@ -232,7 +232,7 @@ def _places(findings: Findings) -> list[Part]:
     return [lines] if lines else []
 
 
-def _nearest(findings: Findings, number: int, matrix: ca.SX, margin: Margin) -> str:
+def _nearest(findings: Findings, number: int, matrix: ca.SX, margin: RankMargin) -> str:
     """Where A(x) or B(x) is nearest to singular, in the states that it depends on."""
     letter, system = "A" if number == 2 else "B", findings.system
     used = ca.which_depends(ca.vec(matrix), system.state, 1, False)
@@ -255,7 +255,7 @@ def _known(values: Sequence[int] | None, index: int) -> str:
     return "?" if values is None else str(values[index])
 
 
-def _figures(margin: Margin | None) -> list[str]:
+def _figures(margin: RankMargin | None) -> list[str]:
     return (
         ["", ""] if margin is None else [f"{margin.relative:.2g}", f"{margin.singular_value:.4g}"]
     )
@@ -305,7 +305,7 @@ def _by_name(signals: Sequence[Signal], values: Sequence[int] | None) -> dict[st
     return {signal.name: value for signal, value in zip(signals, values, strict=True)}
 
 
-def _margin(margin: Margin | None) -> dict[str, Any] | None:
+def _margin(margin: RankMargin | None) -> dict[str, Any] | None:
     if margin is None:
         return None
     return {

@@ -6,13 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 
 
 def check_reference(
-    system: DaeSystem, layout: Layout, reference: Callable[[float], FloatArray], times: ArrayLike
+    system: DaeSystem,
+    layout: DerivativeLayout,
+    reference: Callable[[float], FloatArray],
+    times: ArrayLike,
 ) -> None:
     """Refuses a reference whose derivatives are not those of its values.
 

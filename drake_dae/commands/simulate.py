@@ -63,7 +63,7 @@ from drake_dae.simulation.remarks import (
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
-from drake_dae.simulation.verdict import RunVerdict, Tracking, as_data, judge
+from drake_dae.simulation.verdict import RunVerdict, TrackingResult, as_data, judge
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -276,7 +276,7 @@ def _write(run: _CommandRun) -> bool:
             notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
-        is_unexplained = verdict.tracking is Tracking.OFF and not reasons
+        is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
         run.results = {
             "missed": job.outcome is JobOutcome.BAD or is_unexplained,
             "job": job.to_dict(),

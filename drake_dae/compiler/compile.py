@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, S
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
-from drake_dae.compiler.rates import Place, Rate, dense_function
+from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions
 from drake_dae.compiler.wires import Port, Wires, leaf_port
 from drake_dae.errors import ModelError
@@ -171,7 +171,7 @@ def _compiled(
     }
     rates = _rates(expressions, blocks, places["held"], given)
     asked |= {f"update_{i}": values for i, (_, values) in enumerate(rates)}
-    guards = dict[str, list[Place]]()
+    guards = dict[str, list[ColumnPlace]]()
     for name, in_samples in (("guard", False), ("watch", True)):
         own_blocks = [
             block
@@ -234,7 +234,7 @@ def _has_state(block: Block) -> bool:
     return any(DERIVATIVE in one.outputs for one in block.computations)
 
 
-def _check_stepped(blocks: Mapping[System, Block], states: Sequence[Place]) -> None:
+def _check_stepped(blocks: Mapping[System, Block], states: Sequence[ColumnPlace]) -> None:
     """Refuses what cannot be sampled beside a block that Drake steps."""
     stepped = [block.system.get_name() for block in blocks.values() if block.stepped is not None]
     if not stepped:
@@ -261,7 +261,7 @@ def _is_vector(port: tuple[System, int]) -> bool:
 
 def _stacked(
     expressions: Expressions, blocks: Mapping[System, Block], name: str
-) -> tuple[ca.SX, list[Place]]:
+) -> tuple[ca.SX, list[ColumnPlace]]:
     """The symbols of all blocks below each other, and where those of each stand."""
     column, places = ca.SX(0, 1), []
     for system in blocks:
@@ -269,7 +269,7 @@ def _stacked(
         if symbol is None or not symbol.numel():
             continue
         first = column.numel()
-        places.append(Place(system, slice(first, first + symbol.numel())))
+        places.append(ColumnPlace(system, slice(first, first + symbol.numel())))
         column = ca.vertcat(column, symbol)
     return column, places
 
@@ -277,9 +277,9 @@ def _stacked(
 def _rates(
     expressions: Expressions,
     blocks: Mapping[System, Block],
-    held: Sequence[Place],
+    held: Sequence[ColumnPlace],
     given: Sequence[ca.SX],
-) -> list[tuple[Rate, tuple[ca.SX, ca.SX]]]:
+) -> list[tuple[UpdateRate, tuple[ca.SX, ca.SX]]]:
     """The updates of all blocks, those of one instant together, and what they compute.
 
     Those come last that Drake makes.
@@ -300,14 +300,14 @@ def _rates(
         places = [i for block, _ in members for i in _entries(parts[block.system])]
         values = expressions.checked(partial(asked, members))
         function = dense_function("update", given, expressions.expanded(values))
-        found.append((Rate(*key, function, tuple(places)), values))
+        found.append((UpdateRate(*key, function, tuple(places)), values))
     for block in blocks.values():
         if (stepped := block.stepped) is not None:
             values = expressions.checked(partial(_read, expressions, block, stepped.reads))
             function = dense_function("update", given, expressions.expanded(values))
             count = sum(stepped.system.GetOutputPort(name).size() for name in stepped.ports)
             own = tuple(_entries(parts[block.system])[:count])
-            found.append((Rate(stepped.period, 0.0, True, function, own, block), values))
+            found.append((UpdateRate(stepped.period, 0.0, True, function, own, block), values))
     return found
 
 
@@ -315,9 +315,11 @@ def _read(expressions: Expressions, block: Block, port: str) -> list[ca.SX]:
     return [expressions.source(block, port)]
 
 
-def _guards(expressions: Expressions, blocks: Sequence[Block]) -> tuple[list[ca.SX], list[Place]]:
+def _guards(
+    expressions: Expressions, blocks: Sequence[Block]
+) -> tuple[list[ca.SX], list[ColumnPlace]]:
     """What the guards of blocks compute, validity last, and where the margins of each stand."""
-    columns, places = [ca.SX(0, 1)] * 3, list[Place]()
+    columns, places = [ca.SX(0, 1)] * 3, list[ColumnPlace]()
 
     def asked() -> list[ca.SX]:
         for block in blocks:
@@ -328,7 +330,7 @@ def _guards(expressions: Expressions, blocks: Sequence[Block]) -> tuple[list[ca.
                 first = columns[i].numel()
                 columns[i] = ca.vertcat(columns[i], value)
                 if name == MARGINS:
-                    places.append(Place(block.system, slice(first, columns[i].numel())))
+                    places.append(ColumnPlace(block.system, slice(first, columns[i].numel())))
         return []
 
     _, valid = expressions.checked(asked)

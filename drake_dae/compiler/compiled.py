@@ -9,8 +9,8 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.rates import Place, Rate, dense_function
-from drake_dae.compiler.trace import Call, Expressions
+from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
+from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -40,16 +40,16 @@ class CompiledDiagram:
     wires: Wires
     context: Context
     outputs: tuple[str, ...]
-    states: tuple[Place, ...]
-    held: tuple[Place, ...]
-    parameters: tuple[Place, ...]
+    states: tuple[ColumnPlace, ...]
+    held: tuple[ColumnPlace, ...]
+    parameters: tuple[ColumnPlace, ...]
     fixed: tuple[tuple[System, str, slice], ...]
     inputs: tuple[tuple[str, slice], ...]
-    noise: tuple[Place, ...]
-    rates: tuple[Rate, ...]
+    noise: tuple[ColumnPlace, ...]
+    rates: tuple[UpdateRate, ...]
     blocks: Mapping[System, Block]
-    guards: tuple[Place, ...]
-    watched: tuple[Place, ...]
+    guards: tuple[ColumnPlace, ...]
+    watched: tuple[ColumnPlace, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
     _asked: Mapping[str, Sequence[ca.SX]] = field(repr=False)
@@ -321,7 +321,7 @@ class CompiledDiagram:
         return bool(self.rates) and self.rates[-1].stepped is not None
 
     @property
-    def stepped(self) -> tuple[Rate, Block]:
+    def stepped(self) -> tuple[UpdateRate, Block]:
         """The steps of the block that Drake runs, and this block; only where there is one."""
         rate = self.rates[-1]
         assert rate.stepped is not None
@@ -333,11 +333,11 @@ class CompiledDiagram:
         return any(block.projection is not None for block in self.blocks.values())
 
     @property
-    def calls(self) -> Sequence[Call]:
+    def calls(self) -> Sequence[TracedCall]:
         """All that is computed, each after what it needs."""
         return self._expressions.calls
 
-    def arguments_of(self, call: Call) -> ca.Function:
+    def arguments_of(self, call: TracedCall) -> ca.Function:
         """(time, state, held, parameters) -> the arguments of a computation."""
         return self._function("arguments", list(call.arguments))
 

@@ -10,7 +10,7 @@ from pydrake.systems.framework import System
 from drake_dae.systems.blocks.traced import Block
 
 
-class Place(NamedTuple):
+class ColumnPlace(NamedTuple):
     """Where a column of a block stands among those of the diagram."""
 
     system: System
@@ -18,7 +18,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Rate:
+class UpdateRate:
     """Updates of discrete states at t_k = offset + k period.
 
     Attributes:

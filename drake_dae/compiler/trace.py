@@ -23,7 +23,7 @@ from drake_dae.systems.blocks.traced import (
 
 
 @dataclass(frozen=True, eq=False)
-class Call:
+class TracedCall:
     """A computation with its arguments put in.
 
     Attributes:
@@ -42,7 +42,7 @@ class Call:
     computation: Computation
     arguments: tuple[ca.SX, ...]
     results: tuple[ca.SX, ...]
-    needed: tuple["Call", ...]
+    needed: tuple["TracedCall", ...]
     made: tuple[ca.SX, ...]
     is_given: bool
     gate: ca.SX
@@ -89,14 +89,14 @@ class Expressions:
         is_short: bool = False,
     ) -> None:
         self.time = ca.SX.sym("time")
-        self.calls: list[Call] = []
+        self.calls: list[TracedCall] = []
         self.used: dict[System, Block] = {}
         self.given: list[tuple[ca.SX, ca.SX]] = []
         self.symbols: dict[tuple[System, str], ca.SX] = {}
         self._wires, self._context, self._twins = wires, context, dict(twins or {})
-        self._found: dict[tuple[System, Computation], Call] = {}
+        self._found: dict[tuple[System, Computation], TracedCall] = {}
         self._open: list[tuple[System, Computation]] = []
-        self._needed: list[dict[int, Call]] = []
+        self._needed: list[dict[int, TracedCall]] = []
         self._owners: dict[System, dict[str, Computation]] = {}
         self._under: dict[System, tuple[Block, Computation]] = {}
         cut = {name: each.get_output_port(i) for name, (each, i) in wires.inputs.items()}
@@ -141,7 +141,7 @@ class Expressions:
         found = self.call(owner, computation)
         return found.results[computation.outputs.index(name)]
 
-    def call(self, block: Block, computation: Computation) -> Call:
+    def call(self, block: Block, computation: Computation) -> TracedCall:
         """A computation with its arguments put in; errors as of `port`."""
         key = block.system, computation
         if key in self._found:
@@ -180,7 +180,7 @@ class Expressions:
             results = [self._named(result) for result in results]
         made = tuple(one for one, old in zip(results, is_passed_on, strict=True) if not old)
         given = block, computation, tuple(arguments), tuple(results), needed, made
-        found = Call(*given, is_given, gate)
+        found = TracedCall(*given, is_given, gate)
         self._found[key] = found
         self.calls.append(found)
         self._note(found)
@@ -225,7 +225,7 @@ class Expressions:
 
         return symbols[chosen], values[chosen], put_in
 
-    def _note(self, found: Call) -> None:
+    def _note(self, found: TracedCall) -> None:
         """Keeps that what is being computed needs a call, and what that needs."""
         if self._needed:
             self._needed[-1] |= {id(one): one for one in (*found.needed, found)}

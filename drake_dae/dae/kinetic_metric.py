@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
 
@@ -26,7 +26,7 @@ class KineticMetric:
         layout: The degrees of the constraints.
     """
 
-    def __init__(self, system: DaeSystem, layout: Layout) -> None:
+    def __init__(self, system: DaeSystem, layout: DerivativeLayout) -> None:
         self._system = system
         orders, degrees = layout.orders, np.array(layout.degrees, dtype=int)
         owners = np.repeat(np.arange(degrees.size), degrees)

@@ -16,7 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
-from drake_dae.pictures.moments import Kind, Moment, moments_of, ordered
+from drake_dae.pictures.moments import RunEvent, RunEventKind, moments_of, ordered
 from drake_dae.pictures.scene.arrows import (
     FORCE_COLOR,
     LEAST_SCALE,
@@ -26,8 +26,8 @@ from drake_dae.pictures.scene.arrows import (
     path_of,
 )
 from drake_dae.pictures.scene.floor import Floor, floor_below
-from drake_dae.pictures.scene.framing import View
-from drake_dae.pictures.scene.friction import FrictionCone, friction_cones, slips
+from drake_dae.pictures.scene.framing import ViewAngles
+from drake_dae.pictures.scene.friction import DrawnFrictionCone, friction_cones, slips
 from drake_dae.pictures.scene.run_motion import (
     RunMotion,
     ShownLoop,
@@ -103,7 +103,7 @@ def animate(
     scene_graph: SceneGraph | None,
     title: str = "",
     phases: Sequence[PhaseSpan] = (),
-    moments: Sequence[Moment] = (),
+    moments: Sequence[RunEvent] = (),
 ) -> InlinePage:
     """The page of `make_animation`.
 
@@ -129,7 +129,7 @@ def animate(
     seen = run_points(course, scene_graph)
     floor = floor_below(seen, touched)
     draw_floor(meshcat, floor)
-    view = View.of(CAMERA_ANGLE, ASPECT)
+    view = ViewAngles.of(CAMERA_ANGLE, ASPECT)
     look_at(meshcat, *run_view(course, scene_graph, view, ARROW * size))
     _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
     _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
@@ -176,7 +176,7 @@ def animate(
 
 
 def _legend(
-    course: RunMotion, arrows: ForceArrows, cones: Sequence[FrictionCone], floor: Floor
+    course: RunMotion, arrows: ForceArrows, cones: Sequence[DrawnFrictionCone], floor: Floor
 ) -> list[tuple[str, str]]:
     """The color and the meaning of all that is drawn besides the robot."""
     found = []
@@ -194,16 +194,22 @@ def _legend(
     return [*found, ("#bbbbbb", f"grid of {floor.cell:g} m")]
 
 
-def _marks(moments: Sequence[Moment]) -> list[tuple[str, str]]:
+def _marks(moments: Sequence[RunEvent]) -> list[tuple[str, str]]:
     """The color and the meaning of each kind of mark."""
-    return [(kind.color, kind.label) for kind in Kind if any(one.kind is kind for one in moments)]
+    return [
+        (kind.color, kind.label)
+        for kind in RunEventKind
+        if any(one.kind is kind for one in moments)
+    ]
 
 
 def _hex(color: Rgba) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in (color.r(), color.g(), color.b()))
 
 
-def _add_cone(meshcat: Meshcat, constraint: Constraint, cone: FrictionCone, side: float) -> None:
+def _add_cone(
+    meshcat: Meshcat, constraint: Constraint, cone: DrawnFrictionCone, side: float
+) -> None:
     """Adds the friction cone of a contact, with a side of that length; its tip is the origin."""
     angle = np.arctan(cone.coefficient)
     radius = side * np.sin(angle)

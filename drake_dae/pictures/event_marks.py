@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from drake_dae.pictures.moments import Kind, Moment
+from drake_dae.pictures.moments import RunEvent, RunEventKind
 from drake_dae.simulation.open_contacts import open_spans
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
@@ -21,13 +21,13 @@ OPEN = "contact open"
 """The label of the time in which a contact was open."""
 
 
-def mark_labels(record: Record, moments: Sequence[Moment] = ()) -> tuple[str, ...]:
+def mark_labels(record: Record, moments: Sequence[RunEvent] = ()) -> tuple[str, ...]:
     """The legend entries of the marks of a record, in any order."""
     found = [OPEN] if open_spans(record) else []
     return (*found, *(kind.label for kind in _kinds(moments)))
 
 
-def mark_events(axes: Sequence[Axes], record: Record, moments: Sequence[Moment] = ()) -> None:
+def mark_events(axes: Sequence[Axes], record: Record, moments: Sequence[RunEvent] = ()) -> None:
     """Marks in axes over time where contacts were open, and on the axis of time what happens.
 
     An impact has a line through all of the plot.
@@ -38,7 +38,7 @@ def mark_events(axes: Sequence[Axes], record: Record, moments: Sequence[Moment] 
             axis.axvspan(*span, color="0.9", linewidth=0.0, zorder=0.4, label=label)
         for kind in _kinds(moments):
             times = [one.time for one in moments if one.kind is kind]
-            for time in times if kind is Kind.IMPACT else ():
+            for time in times if kind is RunEventKind.IMPACT else ():
                 axis.axvline(time, color=kind.color, linewidth=0.8, alpha=0.7, zorder=0.6)
             axis.plot(
                 times,
@@ -54,8 +54,8 @@ def mark_events(axes: Sequence[Axes], record: Record, moments: Sequence[Moment] 
             )
 
 
-def _kinds(moments: Sequence[Moment]) -> list[Kind]:
-    return [kind for kind in Kind if any(one.kind is kind for one in moments)]
+def _kinds(moments: Sequence[RunEvent]) -> list[RunEventKind]:
+    return [kind for kind in RunEventKind if any(one.kind is kind for one in moments)]
 
 
 def mark_phases(figure: Figure, record: Record) -> None:

@@ -39,7 +39,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.scene.floor import floor_below
-from drake_dae.pictures.scene.framing import View
+from drake_dae.pictures.scene.framing import ViewAngles
 from drake_dae.pictures.scene.labels import label_box, to_be_seen
 from drake_dae.pictures.scene.run_motion import (
     RunMotion,
@@ -199,7 +199,7 @@ class _Scene:
             raise ModelError("a film shows links with geometry; this robot has none")
         seen = run_points(course, scene_graph)
         self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
-        view = View.of(_ANGLE, _WIDTH / _HEIGHT, _TOP)
+        view = ViewAngles.of(_ANGLE, _WIDTH / _HEIGHT, _TOP)
         placed = run_view(course, scene_graph, view, ARROW * self._size)
         self._camera = _Camera(*placed, 10.0 * self._size, sharpness)
         self.notes = [""] * len(course.times)

@@ -17,7 +17,7 @@ APART = 0.01
 first is shown; of impacts all are."""
 
 
-class Kind(Enum):
+class RunEventKind(Enum):
     """The kind of a moment: its label in a legend, and its color."""
 
     IMPACT = "impact", "#ffbf1a"
@@ -32,7 +32,7 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True)
-class Moment:
+class RunEvent:
     """Something that happens in a run.
 
     Attributes:
@@ -42,11 +42,11 @@ class Moment:
     """
 
     time: float
-    kind: Kind
+    kind: RunEventKind
     text: str
 
 
-def moments_of(record: Record, limits: Limits | None = None) -> list[Moment]:
+def moments_of(record: Record, limits: Limits | None = None) -> list[RunEvent]:
     """The moments that a record shows, in order.
 
     Args:
@@ -57,43 +57,46 @@ def moments_of(record: Record, limits: Limits | None = None) -> list[Moment]:
     return ordered(record, found)
 
 
-def ordered(record: Record, moments: Sequence[Moment]) -> list[Moment]:
+def ordered(record: Record, moments: Sequence[RunEvent]) -> list[RunEvent]:
     """Moments in order, without repetitions shortly after, except those of impacts."""
     if not record.time.size:
         return []
     apart = APART * float(record.time[-1] - record.time[0])
-    last, found = dict[tuple[Kind, str], float](), list[Moment]()
+    last, found = dict[tuple[RunEventKind, str], float](), list[RunEvent]()
     for moment in sorted(moments, key=lambda one: one.time):
         key = moment.kind, moment.text
-        if moment.kind is Kind.IMPACT or moment.time - last.get(key, -np.inf) > apart:
+        if moment.kind is RunEventKind.IMPACT or moment.time - last.get(key, -np.inf) > apart:
             found.append(moment)
         last[key] = moment.time
     return found
 
 
-def _contacts(record: Record) -> Iterator[Moment]:
+def _contacts(record: Record) -> Iterator[RunEvent]:
     if "mode" in record.signals:
         hits = {id(event) for event in impacts(record.events)}
-        kinds = {ContactChange.CLOSING: Kind.TOUCH, ContactChange.OPENING: Kind.OPENING}
+        kinds = {
+            ContactChange.CLOSING: RunEventKind.TOUCH,
+            ContactChange.OPENING: RunEventKind.OPENING,
+        }
         for event in record.events:
-            kind = Kind.IMPACT if id(event) in hits else kinds.get(event.kind)
+            kind = RunEventKind.IMPACT if id(event) in hits else kinds.get(event.kind)
             if kind is not None:
                 names = ", ".join(event.contacts)
-                yield Moment(event.time, kind, f"{names}: {kind.label}")
+                yield RunEvent(event.time, kind, f"{names}: {kind.label}")
     elif "contact_force" in record.signals:  # Compliant contact opens and closes without events.
         forces = record.signals["constraint_force"]
         for signal, values in zip(forces.signals, forces.values.T, strict=True):
             pushes = values > 0.0
             name = signal.name.removesuffix(".force")
             for kind, changed in (
-                (Kind.TOUCH, pushes[1:] & ~pushes[:-1]),
-                (Kind.OPENING, pushes[:-1] & ~pushes[1:]),
+                (RunEventKind.TOUCH, pushes[1:] & ~pushes[:-1]),
+                (RunEventKind.OPENING, pushes[:-1] & ~pushes[1:]),
             ):
                 for time in record.time[1:][changed]:
-                    yield Moment(float(time), kind, f"{name}: {kind.label}")
+                    yield RunEvent(float(time), kind, f"{name}: {kind.label}")
 
 
-def _limits(record: Record, limits: Limits) -> Iterator[Moment]:
+def _limits(record: Record, limits: Limits) -> Iterator[RunEvent]:
     """When a control or a joint comes to its limit."""
     rows: list[tuple[str, Booleans]] = []
     controls = record.signals["control"]
@@ -110,4 +113,4 @@ def _limits(record: Record, limits: Limits) -> Iterator[Moment]:
     for name, reached in rows:
         begins = reached & ~np.concatenate([[False], reached[:-1]])
         for time in record.time[begins]:
-            yield Moment(float(time), Kind.LIMIT, f"{name} is at its limit")
+            yield RunEvent(float(time), RunEventKind.LIMIT, f"{name} is at its limit")

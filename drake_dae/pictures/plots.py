@@ -21,7 +21,7 @@ from drake_dae.pictures.axes import (
     squares,
 )
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
-from drake_dae.pictures.moments import Moment
+from drake_dae.pictures.moments import RunEvent
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
@@ -50,7 +50,7 @@ def save_plots(
     folder: str | Path,
     paths: Sequence[ContactPath] = (),
     accuracy: float | None = None,
-    moments: Sequence[Moment] = (),
+    moments: Sequence[RunEvent] = (),
 ) -> list[Path]:
     """Draws a run into PNG files: outputs, errors, constraint residual, controls, paths.
 
@@ -79,7 +79,7 @@ def save_plots(
     return files
 
 
-def plot_outputs(record: Record, predicted: FloatArray, moments: Sequence[Moment] = ()) -> Figure:
+def plot_outputs(record: Record, predicted: FloatArray, moments: Sequence[RunEvent] = ()) -> Figure:
     """Controlled outputs, with their references dashed; held ones are a line of text.
 
     Args:
@@ -117,7 +117,7 @@ def plot_errors(
     record: Record,
     predicted: FloatArray,
     accuracy: float | None = None,
-    moments: Sequence[Moment] = (),
+    moments: Sequence[RunEvent] = (),
 ) -> Figure:
     """|z - r| of every output on a log scale, over the predicted error.
 
@@ -176,7 +176,7 @@ def plot_errors(
     return figure
 
 
-def plot_residual(record: Record, moments: Sequence[Moment] = ()) -> Figure:
+def plot_residual(record: Record, moments: Sequence[RunEvent] = ()) -> Figure:
     """Constraint outputs and their derivatives, after each step and before the projection."""
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
@@ -194,7 +194,7 @@ def plot_residual(record: Record, moments: Sequence[Moment] = ()) -> Figure:
 
 
 def plot_controls(
-    record: Record, limits: FloatArray | None = None, moments: Sequence[Moment] = ()
+    record: Record, limits: FloatArray | None = None, moments: Sequence[RunEvent] = ()
 ) -> Figure:
     """Controls, with the actuators' limits if these are within the plot."""
     values = record["control"]

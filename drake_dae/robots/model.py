@@ -28,7 +28,7 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
-from drake_dae.robots.statics import Balance, Placing
+from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
 
@@ -165,8 +165,8 @@ class RobotModel:
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
-        self._placing = Placing(self.dae, links.q, phi, h_1)
-        self._balance = Balance(self.dae, links.q, links.v, self.dae.m[h_1.numel() :, :])
+        self._placing = StaticPlacement(self.dae, links.q, phi, h_1)
+        self._balance = StaticBalance(self.dae, links.q, links.v, self.dae.m[h_1.numel() :, :])
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 

@@ -9,7 +9,7 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
 
 
-class Placing:
+class StaticPlacement:
     """The equations 0 = phi(q), h_1(q) = z_1, to be solved for q: q = psi(z_1) of (58).
 
     Args:
@@ -51,7 +51,7 @@ class Placing:
         return found, residual(found)
 
 
-class Balance:
+class StaticBalance:
     """The equations 0 = f + g lambda + h u at v = 0, S lambda = z_2, for the stages' s, u, lambda.
 
     Entries of lambda that are outputs themselves (a row of the identity) are not unknowns.

@@ -26,7 +26,7 @@ from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import Timed, timed
+from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.controllers.task_controller import (
     check_task,
@@ -102,7 +102,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
-    motion: Timed | None = None,
+    motion: TimedScenario | None = None,
     commands: CommandLimits | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.

@@ -28,7 +28,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.forms.keys import at, each
-from drake_dae.scenario.parts.written import Written, made
+from drake_dae.scenario.parts.written import WrittenForm, made
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
@@ -174,7 +174,7 @@ def scenario_structure(model: RobotModel) -> Structure:
 
 
 def _constraints(
-    forms: Sequence[Constraint | Written[Constraint]],
+    forms: Sequence[Constraint | WrittenForm[Constraint]],
     loops: Sequence[Constraint],
     links: MultibodyExpressions,
 ) -> list[Constraint]:
@@ -238,7 +238,7 @@ def _check_compliances(
 
 
 def _outputs(
-    forms: Sequence[PositionOutput | Written[PositionOutput]],
+    forms: Sequence[PositionOutput | WrittenForm[PositionOutput]],
     constraints: Sequence[Constraint],
     links: Links,
 ) -> list[PositionOutput]:

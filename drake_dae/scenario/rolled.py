@@ -133,7 +133,7 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    watched = _Watched(scenario, loop, look)
+    watched = _DivergenceWatch(scenario, loop, look)
     (found,) = run_loop(
         loop,
         start,
@@ -183,7 +183,7 @@ def roll_together(
             )
             for index, run in zip(places, found, strict=True):
                 if run is not None:
-                    together[index] = _Watched(scenarios[index], loop).judged(run)
+                    together[index] = _DivergenceWatch(scenarios[index], loop).judged(run)
     return together
 
 
@@ -197,7 +197,7 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
     return found
 
 
-class _Watched:
+class _DivergenceWatch:
     """Ends a rollout that diverges."""
 
     def __init__(

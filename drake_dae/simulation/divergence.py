@@ -7,7 +7,7 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.simulation.growth import WINDOW, Amounts, Errors, Sizes, with_sizes
+from drake_dae.simulation.growth import WINDOW, ErrorGrowth, Sizes, StateGrowth, with_sizes
 from drake_dae.simulation.records.record import Record
 from drake_dae.systems.control.contract import Compared, Controller
 from drake_dae.systems.plants.contract import Plant
@@ -40,19 +40,19 @@ class DivergenceWatch:
         self._controllers *= len(self._plants) == 1
         self._diagram, self._steps, time = diagram, 0, context.get_time()
         self._states = [
-            Amounts.states(plant, time, plant.state(plant.GetMyContextFromRoot(context)))
+            StateGrowth.states(plant, time, plant.state(plant.GetMyContextFromRoot(context)))
             for plant in self._plants
         ]
-        self._errors: list[tuple[Controller, Errors]] = []
-        self._controls: Amounts | None = None
+        self._errors: list[tuple[Controller, ErrorGrowth]] = []
+        self._controls: StateGrowth | None = None
         for controller in self._controllers:
             plant = self._plants[0]
             start = _sizes(plant, self._shown(context))
-            self._controls = Amounts.controls(plant, time, start)
+            self._controls = StateGrowth.controls(plant, time, start)
             if (now := self._compared(controller, context)) is None:
                 continue
             sizes, window = with_sizes(start, now[2], now[0]), WINDOW * duration
-            errors = Errors(now[2], time, window, sizes, _least(plant))
+            errors = ErrorGrowth(now[2], time, window, sizes, _least(plant))
             self._errors.append((controller, errors))
 
     @property
@@ -133,7 +133,7 @@ class RecordWatch:
 
     def __init__(self, plant: Plant, duration: float) -> None:
         self._plant, self._duration = plant, duration
-        self._watched: tuple[Amounts, Amounts, Errors] | None = None
+        self._watched: tuple[StateGrowth, StateGrowth, ErrorGrowth] | None = None
 
     def look(self, record: Record, *, is_last: bool = False) -> None:
         """Looks at rows that follow those that were looked at.
@@ -153,9 +153,9 @@ class RecordWatch:
             start = _sizes(self._plant, lambda name: record[name][0])
             window = WINDOW * self._duration
             self._watched = (
-                Amounts.states(self._plant, time, states[0]),
-                Amounts.controls(self._plant, time, start),
-                Errors(signals, time, window, start, _least(self._plant)),
+                StateGrowth.states(self._plant, time, states[0]),
+                StateGrowth.controls(self._plant, time, start),
+                ErrorGrowth(signals, time, window, start, _least(self._plant)),
             )
         of_states, of_controls, of_errors = self._watched
         controls = of_controls.look(record.time, record["control"], states)

@@ -41,7 +41,7 @@ def with_sizes(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> S
     return found
 
 
-class Amounts:
+class StateGrowth:
     """The states, or the controls, of a plant beside their sizes."""
 
     def __init__(self, signals: Sequence[Signal], time: float, size: FloatArray) -> None:
@@ -86,7 +86,7 @@ class Amounts:
         )
 
 
-class Errors:
+class ErrorGrowth:
     """The errors of outputs beside their sizes."""
 
     def __init__(

@@ -23,7 +23,7 @@ SLACK = 10.0
 """The allowed deviation of a run, as a multiple of the accuracy of a step."""
 
 
-class Tracking(Enum):
+class TrackingResult(Enum):
     """The errors of a run compared with the predicted ones; the values start the sentence."""
 
     AS_PREDICTED = "Tracked as predicted"
@@ -44,7 +44,7 @@ class RunVerdict:
         settled: The largest relative deviation in the second half of the run.
     """
 
-    tracking: Tracking
+    tracking: TrackingResult
     worst: Signal | None = None
     off: float = 0.0
     time: float = 0.0
@@ -101,17 +101,17 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     """
     error = record["tracking_error"]
     if not error.size:
-        return RunVerdict(Tracking.AS_PREDICTED)
+        return RunVerdict(TrackingResult.AS_PREDICTED)
     signals = record.signals["tracking_error"].signals
     shares = np.abs(error - predicted) / output_sizes(record, predicted)
     row, column = map(int, np.unravel_index(np.argmax(shares), shares.shape))
     share = float(shares[row, column])
     if share <= max(CLOSE, SLACK * (accuracy or 0.0)):
-        tracking = Tracking.AS_PREDICTED
+        tracking = TrackingResult.AS_PREDICTED
     elif share <= NEAR:
-        tracking = Tracking.NEARLY
+        tracking = TrackingResult.NEARLY
     else:
-        tracking, row = Tracking.OFF, int(np.argmax(shares[:, column] > NEAR))
+        tracking, row = TrackingResult.OFF, int(np.argmax(shares[:, column] > NEAR))
     off = float(np.max(np.abs(error - predicted)[:, column]))
     settled = float(np.max(shares[len(shares) // 2 :]))
     return RunVerdict(tracking, signals[column], off, float(record.time[row]), share, settled)
@@ -164,7 +164,7 @@ def in_words(
     )
     unit = f" {verdict.worst.unit}".rstrip()
     off, name = f"{verdict.off:.2g}{unit}", verdict.worst.name
-    if verdict.tracking is Tracking.AS_PREDICTED:
+    if verdict.tracking is TrackingResult.AS_PREDICTED:
         return (
             f"{head}{verdict.tracking.value}: errors stay within {off} of the predicted ones "
             f"({name} is the farthest off); {step}."
@@ -173,7 +173,7 @@ def in_words(
         f"{verdict.share:.2g} times" if verdict.share > 1.0 else f"{100.0 * verdict.share:.2g} % of"
     )
     when = f"at {verdict.time:.3g} s"
-    if verdict.tracking is Tracking.OFF:
+    if verdict.tracking is TrackingResult.OFF:
         when = f"from {verdict.time:.3g} s on"
     text = (
         f"{head}{verdict.tracking.value}: {when} the error of {name} is off the predicted one, by "
@@ -181,10 +181,10 @@ def in_words(
     )
     if reasons:
         text = f"{text}. Likely because {', and '.join(reasons)}."
-        if verdict.tracking is Tracking.OFF and verdict.settled <= NEAR:
+        if verdict.tracking is TrackingResult.OFF and verdict.settled <= NEAR:
             late = f"{100.0 * verdict.settled:.2g} % of its size"
             text += f" In the second half of the run none is off by more than {late}."
         return text
-    if verdict.tracking is Tracking.NEARLY:
+    if verdict.tracking is TrackingResult.NEARLY:
         return f"{text}; {step}, and a finer one would tell whether that is why."
     return f"{text}; {step}. If a finer one changes nothing, plant and law differ."

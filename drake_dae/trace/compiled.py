@@ -49,7 +49,7 @@ SLOWEST = 10.0
 """Under True a compiler that takes this many times longer than expected counts as hanging."""
 
 
-class Attempt(NamedTuple):
+class CompilationAttempt(NamedTuple):
     """An attempt to get machine code.
 
     Attributes:
@@ -61,7 +61,7 @@ class Attempt(NamedTuple):
     make: bool
 
 
-def attempts(compiled: Compiled, operations: int) -> list[Attempt]:
+def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
     """The attempts to get machine code for a function.
 
     Args:
@@ -73,9 +73,11 @@ def attempts(compiled: Compiled, operations: int) -> list[Attempt]:
         if not operations:
             return []
         seconds = STARTING + COMPILING[level] * operations if level else 0.0
-        pays = [Attempt(int(seconds / (INTERPRETED * operations)), True)] if level else []
-        return [Attempt(LOOK, False), *pays]
-    return [Attempt(1, True)] if compiled else []
+        pays = (
+            [CompilationAttempt(int(seconds / (INTERPRETED * operations)), True)] if level else []
+        )
+        return [CompilationAttempt(LOOK, False), *pays]
+    return [CompilationAttempt(1, True)] if compiled else []
 
 
 def check_choice(owner: str, compiled: Any) -> None:

@@ -23,7 +23,7 @@ SINGULAR_PIVOT = 1e-12
 """A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
 
 
-class Fault(Enum):
+class FailureKind(Enum):
     """The kind of failure of a function."""
 
     INPUT = "an input is not finite"
@@ -47,7 +47,7 @@ class Failure:
     """
 
     function: str
-    fault: Fault
+    fault: FailureKind
     inputs: Mapping[str, tuple[int, ...]]
     singular: str = ""
 
@@ -224,7 +224,7 @@ class TracedFunction:
 
     def failure(self) -> Failure:
         """The failure of the last call, if it was not valid."""
-        for fault, limit in ((Fault.INPUT, np.inf), (Fault.OVERFLOW, HUGE)):
+        for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
                 for name, given in zip(self.input_names, self.arguments, strict=True)
@@ -234,9 +234,9 @@ class TracedFunction:
                 return Failure(self.name, fault, bad)
         # A value may not be finite because the matrix is singular.
         if self.is_regular and self._outside:
-            return Failure(self.name, Fault.OUTSIDE, {}, self._outside)
+            return Failure(self.name, FailureKind.OUTSIDE, {}, self._outside)
         is_singular = self.is_finite or self._pivot[0] < SINGULAR_PIVOT
-        fault = Fault.SINGULAR if is_singular else Fault.VALUE
+        fault = FailureKind.SINGULAR if is_singular else FailureKind.VALUE
         return Failure(self.name, fault, {}, self._regular)
 
     def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":

@@ -44,7 +44,7 @@ def as_constant(expression: ca.SX) -> ca.SX:
 
 
 @dataclass(frozen=True)
-class Flaw:
+class SmoothnessFlaw:
     """The reason why an expression cannot be differentiated.
 
     Attributes:
@@ -71,7 +71,7 @@ class Flaw:
         return f"holds a constant that is not finite, {self.constant}{hint}"
 
 
-def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
+def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFlaw | None:
     """Finds a constant that is not finite, or an operation that is not smooth.
 
     Args:
@@ -95,13 +95,13 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
         if operation == ca.OP_CONST:
             value = function.instruction_constant(i)
             if not np.isfinite(value):
-                return Flaw("", value)
+                return SmoothnessFlaw("", value)
         elif operation == ca.OP_INPUT:
             moves = inputs[0] == 0
         else:
             moves = any(moving[place] for place in inputs)
             if moves and operation in _KINKS:
-                return Flaw(_KINKS[operation])
+                return SmoothnessFlaw(_KINKS[operation])
         moving[function.instruction_output(i)[0]] = moves
     return None
 

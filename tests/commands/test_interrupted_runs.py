@@ -16,7 +16,7 @@ from runs import run_scenario, scenario, some
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands.run_folder import FILES, PART
-from drake_dae.running.rollout.stepping.course import Course
+from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
@@ -179,7 +179,7 @@ def test_a_killed_rollout_leaves_its_record_so_far(tmp_path, compiled):
 @pytest.mark.usefixtures("signals_of_a_shell")
 def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
     """Ctrl-C after some steps of the integrator: the record goes up to there."""
-    accept = Course.accept
+    accept = RunStepper.accept
 
     def and_interrupt(self, *arguments):
         accept(self, *arguments)
@@ -189,7 +189,7 @@ def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys)
     words = ["simulate", "two_link_wall", "--rollout", "--compiled", "false", "--set=duration=10"]
     words += [f"--set={setting}" for setting in BARE]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
-    monkeypatch.setattr(Course, "accept", and_interrupt)
+    monkeypatch.setattr(RunStepper, "accept", and_interrupt)
     assert main([*words, "--out", str(tmp_path / "part")]) == 128 + signal.SIGINT
     assert "interrupted" in capsys.readouterr().out
     whole, part = (Record.load(tmp_path / name / "record.npz") for name in ("whole", "part"))

@@ -7,7 +7,7 @@ from problems import pendulum, system_of
 
 from drake_dae import DaePlant, analyze
 from drake_dae.analysis.findings import Finding
-from drake_dae.dae.structure.assumptions import Cause
+from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Parameter
@@ -77,7 +77,7 @@ def test_an_output_whose_degree_depends_on_numbers_is_refused(name, moves):
     with pytest.raises(AssumptionError) as caught:
         find_structure(system)
     violation = caught.value.violation
-    assert (violation.assumption, violation.cause) == (4, Cause.NUMBERS)
+    assert (violation.assumption, violation.cause) == (4, ViolationKind.NUMBERS)
     assert violation.order == degree
     assert violation.deciding.names == deciding
     assert "'z0'" in str(caught.value)
@@ -128,7 +128,10 @@ def test_a_feedthrough_that_depends_on_numbers():
     )
     with pytest.raises(AssumptionError) as caught:
         find_structure(system)
-    assert (caught.value.violation.order, caught.value.violation.cause) == (0, Cause.NUMBERS)
+    assert (caught.value.violation.order, caught.value.violation.cause) == (
+        0,
+        ViolationKind.NUMBERS,
+    )
     assert find_structure(system.with_bounds({"w": (0, 0)})).output_degrees == (2,)
 
 
@@ -138,7 +141,7 @@ def test_a_constraint_whose_degree_depends_on_the_rate_of_a_signal():
     with pytest.raises(AssumptionError) as caught:
         find_constraint_structure(moves)
     violation = caught.value.violation
-    assert (violation.assumption, violation.cause, violation.order) == (1, Cause.NUMBERS, 4)
+    assert (violation.assumption, violation.cause, violation.order) == (1, ViolationKind.NUMBERS, 4)
     assert violation.deciding.names == ("w'",)
     assert violation.names == ("y0",)
     for still in (chain_that_moves([]), moves.with_bounds({"w": (0.0, 0.0)})):
@@ -150,9 +153,9 @@ def test_a_constraint_whose_degree_depends_on_the_rate_of_a_signal():
 @pytest.mark.parametrize(
     ("k", "cause"),
     [
-        (lambda x, p: [x[0], x[0] + p.w * x[1]], Cause.REDUNDANT),
-        (lambda x, p: [x[0], p.w * x[1]], Cause.NO_FORCE),
-        (lambda x, p: [x[0] + x[1], x[0] + x[1] + ca.sin(p.w) * x[1]], Cause.REDUNDANT),
+        (lambda x, p: [x[0], x[0] + p.w * x[1]], ViolationKind.REDUNDANT),
+        (lambda x, p: [x[0], p.w * x[1]], ViolationKind.NO_FORCE),
+        (lambda x, p: [x[0] + x[1], x[0] + x[1] + ca.sin(p.w) * x[1]], ViolationKind.REDUNDANT),
     ],
 )
 def test_a_constraint_that_is_there_with_other_numbers_alone(k, cause):
@@ -187,7 +190,7 @@ def test_a_rank_of_b_that_depends_on_numbers():
         find_structure(wide)
     found = analyze(wide).assumptions[4]
     assert found.finding is Finding.VIOLATED
-    assert found.violation.cause is Cause.BOUNDS
+    assert found.violation.cause is ViolationKind.BOUNDS
 
 
 def test_a_rank_of_a_within_bounds():
@@ -222,7 +225,7 @@ def test_where_no_state_is_consistent_with_numbers_nearer_ones_are_taken():
     )
     with pytest.raises(AssumptionError) as caught:
         find_structure(system)
-    assert caught.value.violation.cause is Cause.NUMBERS
+    assert caught.value.violation.cause is ViolationKind.NUMBERS
     assert caught.value.violation.deciding.names == ("w",)
 
 

@@ -8,7 +8,7 @@ from runs import scenario
 
 from drake_dae.dae.system.signals import Signal
 from drake_dae.pictures.event_marks import mark_phases
-from drake_dae.pictures.moments import Kind, Moment, moments_of, ordered
+from drake_dae.pictures.moments import RunEvent, RunEventKind, moments_of, ordered
 from drake_dae.pictures.plots import plot_controls
 from drake_dae.pictures.scene.friction import friction_cones, slips
 from drake_dae.pictures.scene.run_motion import follow
@@ -37,7 +37,7 @@ def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there(
     joint = np.minimum(TIMES, 4.0)
     limits = Limits(np.array([15.0]), (np.array([-1.0]), np.array([4.0])))
     found = moments_of(record(control=control, state=joint), limits)
-    assert {one.kind for one in found} == {Kind.LIMIT}
+    assert {one.kind for one in found} == {RunEventKind.LIMIT}
     drive = [one.time for one in found if "control0" in one.text]
     wanted = [np.arcsin(0.75) + k * np.pi for k in range(4)]
     np.testing.assert_allclose(drive, wanted[: len(drive)], atol=0.1)  # The rows are 0.1 s apart.
@@ -55,9 +55,9 @@ def test_events_of_contacts_are_marked_by_their_kind():
     ]
     found = moments_of(record(events, mode=np.ones(101), gap=np.zeros(101)))
     assert [(one.time, one.kind) for one in found] == [
-        (1.0, Kind.OPENING),
-        (2.0, Kind.IMPACT),
-        (3.0, Kind.TOUCH),
+        (1.0, RunEventKind.OPENING),
+        (2.0, RunEventKind.IMPACT),
+        (3.0, RunEventKind.TOUCH),
     ]
 
 
@@ -65,20 +65,22 @@ def test_compliant_contact_touches_and_opens_where_its_force_begins_and_ends():
     force = np.where((TIMES > 2.05) & (TIMES < 5.05), 3.0, 0.0)
     found = moments_of(record(constraint_force=force, contact_force=np.zeros((101, 3))))
     assert [(round(one.time, 9), one.kind) for one in found] == [
-        (2.1, Kind.TOUCH),
-        (5.1, Kind.OPENING),
+        (2.1, RunEventKind.TOUCH),
+        (5.1, RunEventKind.OPENING),
     ]
 
 
 def test_of_moments_that_follow_each_other_at_once_the_first_is_kept():
-    chatter = [Moment(1.0 + 0.01 * k, Kind.TOUCH, "tip: touch") for k in range(20)]
-    other = Moment(1.05, Kind.OPENING, "tip: contact opens")
-    late = Moment(5.0, Kind.TOUCH, "tip: touch")
+    chatter = [RunEvent(1.0 + 0.01 * k, RunEventKind.TOUCH, "tip: touch") for k in range(20)]
+    other = RunEvent(1.05, RunEventKind.OPENING, "tip: contact opens")
+    late = RunEvent(5.0, RunEventKind.TOUCH, "tip: touch")
     assert ordered(record(), [late, other, *chatter]) == [chatter[0], other, late]
 
 
 def test_marks_stand_at_their_times_with_one_entry_in_the_legend():
-    moments = [Moment(t, Kind.LIMIT, "x") for t in (1.0, 2.0)] + [Moment(3.0, Kind.IMPACT, "y")]
+    moments = [RunEvent(t, RunEventKind.LIMIT, "x") for t in (1.0, 2.0)] + [
+        RunEvent(3.0, RunEventKind.IMPACT, "y")
+    ]
     figure = plot_controls(record(), None, moments)
     (axis,) = figure.axes
     marks = [line for line in axis.lines if line.get_marker() == "^"]
@@ -123,7 +125,7 @@ def test_a_tool_that_goes_from_rest_slides_from_the_stiction_tolerance_on():
     assert fast.any()
     # v / sqrt(v^2 + v_s^2) of Coulomb's friction at ten times v_s.
     assert np.all(angles[fast] > np.arctan(0.3 * 0.99))
-    slides = [one for one in slips(run) if one.kind is Kind.SLIDE]
+    slides = [one for one in slips(run) if one.kind is RunEventKind.SLIDE]
     for one in slides:
         k = round((one.time - run.start_time) * 200.0)
         assert k <= 1 or speeds[k - 2] < tolerance.value[0] < speeds[k + 2]

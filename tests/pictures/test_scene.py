@@ -7,7 +7,7 @@ from runs import scenario
 
 from drake_dae.pictures.film import _HEIGHT, _TOP, _WIDTH, _Scene
 from drake_dae.pictures.scene.floor import floor_below
-from drake_dae.pictures.scene.framing import View, direction_of, framed
+from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
 from drake_dae.pictures.scene.labels import label_box, overlap, to_be_seen
 from drake_dae.pictures.scene.run_motion import follow, run_points
 from drake_dae.pictures.scene.surroundings import scene_points, surroundings
@@ -40,7 +40,7 @@ def test_a_camera_shows_all_points_and_stands_no_farther_than_it_must(seed):
     points = random.normal(size=(30, 3)) * random.uniform(0.1, 3.0, 3)
     direction = random.normal(size=3) * [1.0, 1.0, 0.5]
     direction /= np.linalg.norm(direction)
-    view = View(*random.uniform(0.2, 1.0, 3))
+    view = ViewAngles(*random.uniform(0.2, 1.0, 3))
     eye, at = framed(points, direction, view)
     x, y, depth = seen_from(eye, at, points)
     # Round-off of a few steps.

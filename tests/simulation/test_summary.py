@@ -16,7 +16,7 @@ from drake_dae.simulation.open_contacts import contact_notes, open_spans
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits, shortfalls, summary
-from drake_dae.simulation.verdict import Tracking, judge
+from drake_dae.simulation.verdict import TrackingResult, judge
 
 
 def record(**changes):
@@ -139,10 +139,10 @@ def test_a_verdict_is_the_same_in_metres_and_millimetres(unit):
 
     offs = (4e-6, 6e-6, 4.9e-3, 5.1e-3)
     assert [in_units(off).tracking for off in offs] == [
-        Tracking.AS_PREDICTED,
-        Tracking.NEARLY,
-        Tracking.NEARLY,
-        Tracking.OFF,
+        TrackingResult.AS_PREDICTED,
+        TrackingResult.NEARLY,
+        TrackingResult.NEARLY,
+        TrackingResult.OFF,
     ]
     found = in_units(0.05)
     assert found.worst is not None
@@ -153,7 +153,11 @@ def test_a_verdict_is_the_same_in_metres_and_millimetres(unit):
 
 @pytest.mark.parametrize(
     ("accuracy", "wanted"),
-    [(None, Tracking.NEARLY), (1e-6, Tracking.NEARLY), (1e-3, Tracking.AS_PREDICTED)],
+    [
+        (None, TrackingResult.NEARLY),
+        (1e-6, TrackingResult.NEARLY),
+        (1e-3, TrackingResult.AS_PREDICTED),
+    ],
 )
 def test_a_coarse_integrator_is_judged_by_what_it_was_asked_for(accuracy, wanted):
     """An error of 2e-3 of its size is within ten times an accuracy of 1e-3."""

@@ -5,7 +5,7 @@ import ctypes
 import numpy as np
 from c_controller import compile_c
 
-from drake_dae.running.export.steps.parts import Written
+from drake_dae.running.export.steps.parts import WrittenPart
 
 
 class CIntegrated:
@@ -16,7 +16,7 @@ class CIntegrated:
         flags: Options of the compiler.
     """
 
-    def __init__(self, written: Written, *flags: str) -> None:
+    def __init__(self, written: WrittenPart, *flags: str) -> None:
         source = written.files[1]
         part, kind = written.part, written.kind
         self.outputs = {}

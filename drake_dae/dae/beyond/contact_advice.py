@@ -12,7 +12,7 @@ from drake_dae.arrays import check_whole_number, positive
 from drake_dae.dae.beyond.contact_gains import ContactGains
 from drake_dae.dae.beyond.one_direction import (
     Direction,
-    Rates,
+    DirectionGains,
     SampledLoop,
     SensorNoise,
     sampled_loop,
@@ -142,7 +142,7 @@ class _Part:
     """What gains come to in one direction: the rate w, error, by noise, and roughness in N m."""
 
     rate: float
-    rates: Rates
+    rates: DirectionGains
     is_contact: bool
     error: float
     by_noise: float
@@ -242,14 +242,16 @@ def _is_stable(situation: SensedContact, part: _Part) -> bool:
     return True
 
 
-def _free_rates(w: float, fast: float | None) -> Rates:
+def _free_rates(w: float, fast: float | None) -> DirectionGains:
     p = 1.5 * w
-    return Rates((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+    return DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
 
 
-def _contact_rates(situation: SensedContact, w: float, fast: float | None, share: float) -> Rates:
+def _contact_rates(
+    situation: SensedContact, w: float, fast: float | None, share: float
+) -> DirectionGains:
     damping = min(2.3 * w, situation.best_damping)
-    return Rates((0.0, 0.0, damping), share * 0.4 * (damping or w / 2.0), share * w, fast)
+    return DirectionGains((0.0, 0.0, damping), share * 0.4 * (damping or w / 2.0), share * w, fast)
 
 
 def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:

@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -232,7 +232,7 @@ def _wanted(
     structure: Structure, rows: Sequence[int]
 ) -> tuple[TracedFunction | None, TracedFunction]:
     """`wanted` and `moving` of an `Observation`."""
-    system, layout = structure.system, Layout(structure.output_degrees)
+    system, layout = structure.system, DerivativeLayout(structure.output_degrees)
     # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
@@ -244,7 +244,7 @@ def _wanted(
     if len(starts) < len(steered):
         return None, moving
     reference, ahead = ca.SX.sym("R", layout.reference_size), ca.SX.sym("t")
-    kept = Layout(structure.constraint_degrees).ends.tolist()
+    kept = DerivativeLayout(structure.constraint_degrees).ends.tolist()
     left = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
     left += [structure.manifold.residual_expression[kept, :]]
     slope = ca.jacobian(ca.vertcat(*left), system.state[list(rows), :])

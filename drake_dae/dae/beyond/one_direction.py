@@ -49,7 +49,7 @@ class Direction:
 
 
 @dataclass(frozen=True)
-class Rates:
+class DirectionGains:
     """The gains of a law and its observer in a direction, in 1/s.
 
     Attributes:
@@ -122,7 +122,7 @@ class SampledLoop:
         return float(max(rest @ spread @ rest, 0.0)) ** 0.5
 
 
-def sampled_loop(direction: Direction, rates: Rates, noise: SensorNoise) -> SampledLoop:
+def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
     """The loop of a law whose model is right, except for what `direction` says.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
@@ -168,7 +168,7 @@ Rows = dict[str, FloatArray]
 
 
 def _step(
-    direction: Direction, rates: Rates, noise: SensorNoise, now: Rows
+    direction: Direction, rates: DirectionGains, noise: SensorNoise, now: Rows
 ) -> tuple[Rows, tuple[FloatArray, FloatArray]]:
     """What a sample makes of the quantities; and the error, and the acceleration asked for."""
     period, mass = direction.period, direction.mass_error
@@ -218,7 +218,9 @@ Known = Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]]
 Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 
 
-def _observed(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tuple[Known, Update]:
+def _observed(
+    rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
+) -> tuple[Known, Update]:
     """A `DisturbanceObserver`: what the law reads, and what is held after the sample."""
     gain = -np.expm1(-rates.observer_rate * period)
 
@@ -232,7 +234,9 @@ def _observed(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tup
     return known, update
 
 
-def _estimated(rates: Rates, period: float, noise: SensorNoise, now: Rows) -> tuple[Known, Update]:
+def _estimated(
+    rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
+) -> tuple[Known, Update]:
     """A `StateEstimator`, likewise; q, w and a are its prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None

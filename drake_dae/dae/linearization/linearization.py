@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.linearization.models import Linearization, LinearModel
 from drake_dae.dae.states.tangents import coordinates
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -177,7 +177,7 @@ class _PlantModel:
     @property
     def _carried(self) -> ca.SX:
         """c_t, shape (m, 1)."""
-        ends = Layout(self.structure.constraint_degrees).ends.tolist()
+        ends = DerivativeLayout(self.structure.constraint_degrees).ends.tolist()
         return self.system.exogenous.rate(self.structure.manifold.residual_expression[ends, :])
 
     @cached_property

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.manifold.first_steps import FOUND, STAYS, trace_first_steps
 from drake_dae.dae.manifold.residual import Residual
-from drake_dae.dae.manifold.search import CONSISTENT, Search
+from drake_dae.dae.manifold.search import CONSISTENT, ConsistentStateSearch
 from drake_dae.dae.manifold.settling import Settling
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -40,7 +40,7 @@ class Manifold:
         self.residual_signals = self._residual.signals
         self.residual_function = self._residual.function
         self._first_steps = trace_first_steps(self._residual)
-        self._search = Search(self._residual, self._first_steps)
+        self._search = ConsistentStateSearch(self._residual, self._first_steps)
         self._settling = Settling(system, self._residual)
 
     @property

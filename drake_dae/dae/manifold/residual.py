@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import norm
@@ -36,7 +36,7 @@ class Residual:
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         self.system = system
         self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])  # (4)
-        self.layout = Layout(tuple(len(chain) for chain in chains))
+        self.layout = DerivativeLayout(tuple(len(chain) for chain in chains))
         self.signals = self.layout.chain_signals(system.constraint_output_signals)
         self.gradient = ca.jacobian(self.expression, system.state)
         self.function = system.trace("manifold", {"residual": self.expression})

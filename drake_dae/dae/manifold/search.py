@@ -37,7 +37,7 @@ ITERATIONS = 10
 """The largest number of steps of such a projection; quadratic convergence takes three."""
 
 
-class Search:
+class ConsistentStateSearch:
     """Newton's method, then least squares; at singular configurations a pseudoinverse.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.kinetic_metric import KineticMetric
 from drake_dae.dae.manifold.residual import Residual
-from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_along
@@ -91,7 +91,7 @@ def _settle_level(
     return converged
 
 
-def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
+def _levels(layout: DerivativeLayout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
     """The rows of each order of derivatives, and the states that are new in them."""
     used = nonzeros(gradient.sparsity())
     known = np.zeros(gradient.shape[1], dtype=bool)

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
@@ -17,7 +17,7 @@ TRANSVERSAL = 0.05
 """Single states complete the chains if the sine of their smallest angle is above this."""
 
 
-Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
+Completion = tuple[ca.SX, tuple[Signal, ...], RankMargin]
 """xi, its signals, and the margin of the Jacobian of Phi."""
 
 

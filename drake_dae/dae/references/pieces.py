@@ -19,7 +19,7 @@ MOST_IN_EXPRESSION = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class PiecewisePolynomials:
     """Piecewise polynomials in time: factors[i] @ (1, x, x^2, ...) in piece i.
 
     Here x = (t - breaks[i]) / (breaks[i + 1] - breaks[i]); before and after, the value is constant.
@@ -80,7 +80,7 @@ class PiecewiseReference(Reference):
     order: int
 
     @abstractmethod
-    def pieces(self, degrees: Sequence[int]) -> Pieces:
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:

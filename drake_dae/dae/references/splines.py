@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive, vector
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
+from drake_dae.dae.references.pieces import PiecewisePolynomials, PiecewiseReference
 from drake_dae.dae.references.travel import PathLimits
 from drake_dae.errors import ReferenceSignalError
 
@@ -65,7 +65,7 @@ class TimeSpline:
             found.append(np.diff(found[-1], axis=0) / self.step)
         return found
 
-    def pieces(self, degrees: Sequence[int]) -> Pieces:
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
         rows = {
             j: sliding_window_view(self.differences[j], self.degree - j + 1, axis=0)
@@ -77,7 +77,7 @@ class TimeSpline:
         for row, (i, j) in enumerate(places):
             factors[:, row, : self.degree - j + 1] = rows[j][:, i]
         breaks = self.start_time + self.step * np.arange(self.spans + 1, dtype=np.float64)
-        return Pieces(breaks, factors)
+        return PiecewisePolynomials(breaks, factors)
 
 
 def basis_pieces(degree: int) -> FloatArray:
@@ -110,7 +110,7 @@ class SplineReference(PiecewiseReference):
     def size(self) -> int:
         return int(self.spline.points.shape[1])
 
-    def pieces(self, degrees: Sequence[int]) -> Pieces:
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         return self.spline.pieces(degrees)
 
 

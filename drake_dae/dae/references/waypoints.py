@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
+from drake_dae.dae.references.pieces import PiecewisePolynomials, PiecewiseReference
 from drake_dae.dae.references.splines import settle_points
 from drake_dae.dae.references.travel import PathLimits
 from drake_dae.errors import ReferenceSignalError
@@ -89,12 +89,14 @@ class WaypointsReference(PiecewiseReference):
         powers = 1.0 / np.arange(1, 4)
         return 1.001 * moments * max((peaks / self.limits.values) ** powers)
 
-    def pieces(self, degrees: Sequence[int]) -> Pieces:
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         moments = self.start_time + self._moments
         return _pieces(moments, np.array(self.points), self.order, degrees)
 
 
-def _pieces(times: FloatArray, points: FloatArray, order: int, degrees: Sequence[int]) -> Pieces:
+def _pieces(
+    times: FloatArray, points: FloatArray, order: int, degrees: Sequence[int]
+) -> PiecewisePolynomials:
     """The spline through points at times, and its derivatives, as polynomials."""
     from scipy.interpolate import make_interp_spline  # It takes long to load.
 
@@ -113,4 +115,4 @@ def _pieces(times: FloatArray, points: FloatArray, order: int, degrees: Sequence
                 grown = factorial(m) / factorial(m - j) / scale**j
                 row[:, m - j] = table[m][:, column] * widths[:, 0] ** (m - j) * grown
             rows.append(row)
-    return Pieces(times, np.stack(rows, axis=1))
+    return PiecewisePolynomials(times, np.stack(rows, axis=1))

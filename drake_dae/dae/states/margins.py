@@ -15,7 +15,7 @@ from drake_dae.trace.round_off import SINGULAR, equilibration, smallest_singular
 
 
 @dataclass(frozen=True)
-class Margin:
+class RankMargin:
     """The distance of a matrix from losing its rank.
 
     Attributes:
@@ -43,7 +43,7 @@ class Margin:
 
 def find_margin(
     samples: Samples, matrix: ca.SX, round_off: Booleans | None = None, search: bool = False
-) -> Margin:
+) -> RankMargin:
     """The smallest singular values of a matrix at sampled states and between them.
 
     If the determinant of a square matrix changes its sign on the way from the first state, it is
@@ -68,7 +68,7 @@ def find_margin(
     state = min(candidates, key=scaled.distance)
     length = np.linalg.norm(scaled(state), axis=1)
     least = samples.system.least_margin
-    return Margin(
+    return RankMargin(
         singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
         relative=scaled.distance(state),
         state=state,

@@ -6,13 +6,13 @@ from enum import Enum
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.states.family import Deciding
-from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.structure.dependence import Combination
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import AssumptionError
 
 
-class Cause(Enum):
+class ViolationKind(Enum):
     """The kind of a violation; the value is the remedy."""
 
     COUNT = "Remove the redundant ones"
@@ -81,7 +81,7 @@ class Violation:
     """
 
     assumption: int
-    cause: Cause
+    cause: ViolationKind
     names: tuple[str, ...]
     order: int | None = None
     state: FloatArray | None = None
@@ -92,11 +92,11 @@ class Violation:
 
     def __str__(self) -> str:
         text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
-        if self.deciding is None or self.cause in (Cause.NUMBERS, Cause.BOUNDS):
+        if self.deciding is None or self.cause in (ViolationKind.NUMBERS, ViolationKind.BOUNDS):
             return text
         acts = {
-            Cause.NO_FORCE: "a constraint input acts",
-            Cause.NO_CONTROL: "the control acts",
+            ViolationKind.NO_FORCE: "a constraint input acts",
+            ViolationKind.NO_CONTROL: "the control acts",
         }
         regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
         return (
@@ -117,34 +117,34 @@ class Violation:
             scaled += f"; below the system's least_margin of {self.least:.0e} it is lost"
         rows = "; ".join(map(str, self.combinations))
         match self.cause:
-            case Cause.COUNT:
+            case ViolationKind.COUNT:
                 return (
                     f"the m = {len(self.names)} constraints are more than the states, so they "
                     "depend on each other"
                 )
-            case Cause.CONSTRAINT_DEGREE:
+            case ViolationKind.CONSTRAINT_DEGREE:
                 return (
                     f"the relative degree of constraint {names} is not defined{where}: the "
                     f"constraint inputs act on its derivative {self.order} around this state, but "
                     "not there"
                 )
-            case Cause.OUTPUT_DEGREE:
+            case ViolationKind.OUTPUT_DEGREE:
                 return (
                     f"the relative degree of output {names} is not defined{where}: the control "
                     f"acts on its derivative {self.order} around this state, but not there"
                 )
-            case Cause.EARLY_CONTROL:
+            case ViolationKind.EARLY_CONTROL:
                 return (
                     f"the control acts on derivative {self.order} of constraint {names}, before "
                     f"any constraint input does{where}"
                 )
-            case Cause.NO_FORCE:
+            case ViolationKind.NO_FORCE:
                 return (
                     f"no constraint input ever acts on constraint {names}: none reaches it, or its "
                     "derivatives repeat each other or fill the state"
                     f"{f'; gradients of constraints: {rows}' if rows else ''}"
                 )
-            case Cause.NO_CONTROL:
+            case ViolationKind.NO_CONTROL:
                 why = (
                     f"it follows from the constraints, {rows}"
                     if rows
@@ -157,33 +157,33 @@ class Violation:
                     "degree and B(x) no row for it"
                 )
             case (
-                Cause.CONSTRAINT_RANK
-                | Cause.REDUNDANT
-                | Cause.SINGULAR_CONFIGURATION
-                | Cause.HIDDEN_DEGREE
+                ViolationKind.CONSTRAINT_RANK
+                | ViolationKind.REDUNDANT
+                | ViolationKind.SINGULAR_CONFIGURATION
+                | ViolationKind.HIDDEN_DEGREE
             ):
                 what = "gradients of constraints"
-                if self.cause in (Cause.CONSTRAINT_RANK, Cause.HIDDEN_DEGREE):
+                if self.cause in (ViolationKind.CONSTRAINT_RANK, ViolationKind.HIDDEN_DEGREE):
                     what = "rows of A(x)"
                 found = [f"{what}: {rows}"] if rows else []
                 if value:
                     found.insert(0, f"smallest singular value {value} ({scaled})")
                 return f"A(x) loses rank{where}: {'; '.join(found)}"
-            case Cause.NUMBERS:
+            case ViolationKind.NUMBERS:
                 kind = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
                 return (
                     f"the relative degree of {kind} {names} depends on numbers: the {inputs} on "
                     f"its derivative {self.order} {self.deciding}"
                 )
-            case Cause.BOUNDS:
+            case ViolationKind.BOUNDS:
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
                 found = [
                     f" of '{name}', between its default {default:.6g} and {bound:.6g}"
                     for name, bound, default in (self.deciding.pairs if self.deciding else ())
                 ]
                 return f"{matrix} loses rank within the bounds{','.join(found)}"
-            case Cause.CONTROL_RANK:
+            case ViolationKind.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
                     f"{', '.join(self.names)} cannot be steered independently; smallest singular "
@@ -193,11 +193,11 @@ class Violation:
 
 
 def rank_violation(
-    margin: Margin | None,
+    margin: RankMargin | None,
     signals: Sequence[Signal],
     degrees: Sequence[int],
-    vanishing: tuple[int, Cause],
-    dependent: tuple[int, Cause],
+    vanishing: tuple[int, ViolationKind],
+    dependent: tuple[int, ViolationKind],
 ) -> Violation | None:
     """The violation by a singular matrix: one assumption if a whole row vanishes, else another.
 

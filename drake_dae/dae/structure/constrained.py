@@ -13,10 +13,10 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.family import Family
-from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
-from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence
 from drake_dae.dae.structure.mass_matrix import check_mass_matrix
 from drake_dae.dae.structure.redundancy import find_redundant
@@ -56,7 +56,7 @@ class ConstraintStructure:
     elimination: Elimination
     states: FloatArray
     scale: FloatArray
-    constraint_margin: Margin | None
+    constraint_margin: RankMargin | None
 
     def __repr__(self) -> str:
         degrees = f"r={self.constraint_degrees}, index={self.index}"
@@ -245,28 +245,32 @@ def check_system(system: DaeSystem) -> None:
     check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
-        raise Violation(2, Cause.COUNT, names).error()
+        raise Violation(2, ViolationKind.COUNT, names).error()
 
 
 def constraint_violation(found: ConstraintStructure) -> Violation | None:
     """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
-    causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
+    causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
     signals, margin = found.system.constraint_output_signals, found.constraint_margin
     violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
     if margin is None:
         return None
     matrix = found.system.frictional_contacts.without_friction(found.elimination.constraint_matrix)
     violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
-    if violation is None or violation.cause is Cause.BOUNDS:
+    if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
-    if violation.cause is not Cause.CONSTRAINT_RANK:
+    if violation.cause is not ViolationKind.CONSTRAINT_RANK:
         return _as_redundant(found.system, violation)
     dependence = find_dependence(found.manifold, found.elimination, found.states, margin.state)
-    cause = Cause.CONSTRAINT_RANK
+    cause = ViolationKind.CONSTRAINT_RANK
     if dependence.in_gradients:
-        cause = Cause.REDUNDANT if dependence.everywhere else Cause.SINGULAR_CONFIGURATION
+        cause = (
+            ViolationKind.REDUNDANT
+            if dependence.everywhere
+            else ViolationKind.SINGULAR_CONFIGURATION
+        )
     elif dependence.everywhere:
-        cause = Cause.HIDDEN_DEGREE
+        cause = ViolationKind.HIDDEN_DEGREE
     found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
     return _as_redundant(found.system, found_cause)
 
@@ -312,7 +316,7 @@ def with_numbers(
     family = Family(manifold, states)
     if violation is None:
         lost = family.lost(determinant)
-        return Violation(assumption, Cause.BOUNDS, (), deciding=lost) if lost else None
+        return Violation(assumption, ViolationKind.BOUNDS, (), deciding=lost) if lost else None
     if any(determinant(state, system.parameter_values) for state in states):
         return violation
     return replace(violation, deciding=family.deciding(lambda x, p: determinant(x, p) != 0.0))
@@ -323,7 +327,10 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
 
     Off N* they are overdetermined, and only singular configurations satisfy them.
     """
-    if violation.cause not in (Cause.CONSTRAINT_DEGREE, Cause.SINGULAR_CONFIGURATION):
+    if violation.cause not in (
+        ViolationKind.CONSTRAINT_DEGREE,
+        ViolationKind.SINGULAR_CONFIGURATION,
+    ):
         return violation
     combinations = find_redundant(system)
     # A gradient that vanishes wherever its constraint holds does not depend on others.
@@ -333,7 +340,7 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     return replace(
         violation,
         assumption=2,
-        cause=Cause.REDUNDANT,
+        cause=ViolationKind.REDUNDANT,
         names=names,
         combinations=combinations,
         order=None,

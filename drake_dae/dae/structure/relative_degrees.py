@@ -18,7 +18,7 @@ from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
-from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.dae.structure.dependence import (
     following_outputs,
     redundant_constraints,
@@ -73,13 +73,15 @@ def constraint_chains(
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
-                raise Violation(1, Cause.CONSTRAINT_DEGREE, (names[i],), order, state).error()
+                raise Violation(
+                    1, ViolationKind.CONSTRAINT_DEGREE, (names[i],), order, state
+                ).error()
             if control_acts[row].any():
                 state = samples.states[int(np.argmax(control_acts[row]))]
-                raise Violation(3, Cause.EARLY_CONTROL, (names[i],), order, state).error()
+                raise Violation(3, ViolationKind.EARLY_CONTROL, (names[i],), order, state).error()
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
-                    violation = Violation(assumption, Cause.NUMBERS, (names[i],), order)
+                    violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
                     along = numbers.along(chains[i][-1], key)
                     elsewhere.look(i, violation, samples, along)
             still.append(i)
@@ -95,7 +97,7 @@ def constraint_chains(
             dependent = redundant_constraints(samples)
             those = tuple(names[i] for i in stuck)
             deciding = elsewhere.deciding(stuck)
-            violation = Violation(2, Cause.NO_FORCE, those, combinations=dependent)
+            violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
             raise replace(violation, deciding=deciding).error()
         for i in still:
             following = lie_derivative(chains[i][-1], f, x)
@@ -156,10 +158,10 @@ def output_chains(
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
                 order = len(chains[i])
-                raise Violation(4, Cause.OUTPUT_DEGREE, (names[i],), order, state).error()
+                raise Violation(4, ViolationKind.OUTPUT_DEGREE, (names[i],), order, state).error()
             else:
                 if not chains[i] and rows[row, :].nnz():
-                    violation = Violation(4, Cause.NUMBERS, (names[i],), 0)
+                    violation = Violation(4, ViolationKind.NUMBERS, (names[i],), 0)
                     elsewhere.look(i, violation, samples, numbers.feedthrough(i))
                 still.append(i)
                 chains[i].append(following[row])
@@ -177,7 +179,7 @@ def output_chains(
             if acts[row].any():
                 continue
             if rows[row, :].nnz():
-                violation = Violation(4, Cause.NUMBERS, (names[i],), len(chains[i]))
+                violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
                 elsewhere.look(i, violation, samples, numbers.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
@@ -191,7 +193,9 @@ def output_chains(
         if stuck:
             those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
             found = tuple(following_outputs(samples, those))
-            violation = Violation(5, Cause.NO_CONTROL, those, combinations=found, deciding=deciding)
+            violation = Violation(
+                5, ViolationKind.NO_CONTROL, those, combinations=found, deciding=deciding
+            )
             raise violation.error()
         undecided = still
     return OutputChains(

@@ -17,7 +17,7 @@ from drake_dae.dae.structure.redundancy import (
     independent_constraints,
     with_constraints,
 )
-from drake_dae.dae.system.sharing import Sharing
+from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -84,7 +84,7 @@ def share_forces(
     weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
     sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
     split = sum_of.solve(ca.densify(weighted.T)).T
-    sharing = Sharing(
+    sharing = ForceSharing(
         split=split,
         gather=gather,
         signals=system.constraint_input_signals,

@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, show
-from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
 from drake_dae.dae.structure.constrained import (
     ConstraintStructure,
     checked_structure,
@@ -21,7 +21,7 @@ from drake_dae.dae.structure.constrained import (
 from drake_dae.dae.structure.dependence import combinations_of
 from drake_dae.dae.structure.mass_matrix import is_positive_definite
 from drake_dae.dae.structure.relative_degrees import output_chains
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
@@ -53,16 +53,16 @@ class Structure(ConstraintStructure):
     control_matrix: ca.SX
     chains_need_force: bool
     round_off: Booleans
-    control_margin: Margin
+    control_margin: RankMargin
 
     def __repr__(self) -> str:
         degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
         return f"Structure({self.system.name!r}, {degrees}, index={self.index})"
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> DerivativeLayout:
         """How references and output chains are stacked."""
-        return Layout(self.output_degrees)
+        return DerivativeLayout(self.output_degrees)
 
     @property
     def output_order(self) -> tuple[int, ...]:
@@ -289,11 +289,11 @@ def _check_metric(samples: Samples) -> None:
 
 def control_violation(structure: Structure) -> Violation | None:
     """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
-    causes = ((4, Cause.OUTPUT_DEGREE), (5, Cause.CONTROL_RANK))
+    causes = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
     margin, degrees = structure.control_margin, structure.output_degrees
     signals = structure.system.output_signals
     violation = rank_violation(margin, signals, degrees, *causes)
-    if violation is not None and violation.cause is Cause.CONTROL_RANK:
+    if violation is not None and violation.cause is ViolationKind.CONTROL_RANK:
         assert margin is not None
         rows = combinations_of([signal.name for signal in signals], [margin.matrix])
         violation = replace(violation, combinations=tuple(rows))

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, brief, numbers, vector
-from drake_dae.dae.system.contacts import Contact
+from drake_dae.dae.system.contacts import UnilateralInput
 from drake_dae.dae.system.expressions import as_functions, as_signals, check_unique
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.signals import Parameter, Signal, is_symbol
@@ -43,7 +43,7 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
             )
     if not (
         isinstance(given["contacts"], (list, tuple))
-        and all(isinstance(contact, Contact) for contact in given["contacts"])
+        and all(isinstance(contact, UnilateralInput) for contact in given["contacts"])
     ):
         raise ModelError(
             f"{name}: contacts must be a list of Contacts, got {brief(given['contacts'])}"

@@ -30,7 +30,7 @@ MOST = 8
 
 
 @dataclass(frozen=True)
-class Contact:
+class UnilateralInput:
     """A constraint input that can only push.
 
     Attributes:
@@ -77,7 +77,7 @@ class Contacts:
     owner: str
     inputs: Sequence[Signal]
     parameters: Sequence[Parameter]
-    contacts: Sequence[Contact]
+    contacts: Sequence[UnilateralInput]
 
     def __post_init__(self) -> None:
         if len(self.rows) > MOST:

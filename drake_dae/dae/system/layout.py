@@ -14,7 +14,7 @@ Indices = np.typing.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Layout:
+class DerivativeLayout:
     """Where the derivatives of p signals stand in the vectors of section 2.
 
     A chain holds mu_i derivatives of each signal, and a reference one more:

@@ -8,7 +8,7 @@ from drake_dae.dae.system.signals import Signal
 
 
 @dataclass(frozen=True, eq=False)
-class Sharing:
+class ForceSharing:
     """All constraint inputs of a system, of whose redundant constraints some were left out.
 
     The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with

@@ -14,11 +14,11 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, vector
 from drake_dae.dae.system.called import called_functions
 from drake_dae.dae.system.checks import checked_fields
-from drake_dae.dae.system.contacts import Contact, Contacts
+from drake_dae.dae.system.contacts import Contacts, UnilateralInput
 from drake_dae.dae.system.exogenous import Exogenous
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.scale import natural_scale, spread_about
-from drake_dae.dae.system.sharing import Sharing
+from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving, valued
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
@@ -118,11 +118,11 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
-    sharing: Sharing | None = None
+    sharing: ForceSharing | None = None
     control_metric: ca.SX = None
     free_control: ca.SX = None
     compiled: Compiled = "auto"
-    contacts: tuple[Contact, ...] = ()
+    contacts: tuple[UnilateralInput, ...] = ()
     least_margin: float = SINGULAR
     negligible: float = NEGLIGIBLE
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.pieces import Pieces
+from drake_dae.dae.references.pieces import PiecewisePolynomials
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.timing.time_table import QUINTIC
 
@@ -16,7 +16,7 @@ CLOSE = 1e-6
 """The largest distance from the path, as a share of the range of an output."""
 
 
-def coarser(table: Pieces, moving: Indices) -> Pieces:
+def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomials:
     """A table with fewer and longer pieces.
 
     A longer piece has r, r' and r'' of the given table at both ends, so that the result has as many
@@ -62,7 +62,7 @@ def coarser(table: Pieces, moving: Indices) -> Pieces:
         rows.append(factors[i] if row is None else row)
         kept.append(place)
         i = place
-    return Pieces(breaks[kept], np.stack(rows))
+    return PiecewisePolynomials(breaks[kept], np.stack(rows))
 
 
 def _furthest(

@@ -19,7 +19,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.pieces import PiecewiseReference
 from drake_dae.dae.references.reference import Reference, with_degrees
-from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.errors import ReferenceSignalError
 
@@ -34,7 +34,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 Times = Callable[[FloatArray], FloatArray]
 
 
-def at_times(references: Sequence[Reference], layout: Layout) -> Times:
+def at_times(references: Sequence[Reference], layout: DerivativeLayout) -> Times:
     """References as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
     parts = [_one_at_times(*each) for each in with_degrees(references, layout.degrees)]
     return lambda times: np.hstack([part(times) for part in parts])
@@ -100,7 +100,7 @@ class Curve:
     def __init__(
         self,
         references: Sequence[Reference],
-        layout: Layout,
+        layout: DerivativeLayout,
         begin: float,
         end: float,
         count: int,

@@ -12,22 +12,22 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, vector
 from drake_dae.dae.references.by_name import references_by_name
-from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
+from drake_dae.dae.references.pieces import PiecewisePolynomials, PiecewiseReference
 from drake_dae.dae.references.reference import Reference
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.timing.along import AlongCurve
 from drake_dae.dae.timing.coarser import coarser
 from drake_dae.dae.timing.curve import Curve, Piece
 from drake_dae.dae.timing.motion_limits import MotionLimits
-from drake_dae.dae.timing.reachable import Fastest, Lines, fastest_motion
-from drake_dae.dae.timing.rows import Row, Rows, rows_along
+from drake_dae.dae.timing.reachable import FastestMotion, LinearLimits, fastest_motion
+from drake_dae.dae.timing.rows import LimitRow, LimitRows, rows_along
 from drake_dae.dae.timing.smoothing import smoothed
 from drake_dae.dae.timing.time_table import at_rest_outside, stacked, time_table
 from drake_dae.dae.timing.tool_limits import tool_limits
 from drake_dae.errors import ModelError, ReferenceSignalError
 
-_PAUSE = Row("pause of the reference", "", "")
+_PAUSE = LimitRow("pause of the reference", "", "")
 
 PASSES = 40
 """The most passes where signals are not linear in (a, b)."""
@@ -79,9 +79,9 @@ class TimeProfile:
     """
 
     pieces: tuple[ProfilePiece, ...]
-    causes: tuple[Row, ...]
+    causes: tuple[LimitRow, ...]
     start_time: float
-    layout: Layout
+    layout: DerivativeLayout
 
     def __repr__(self) -> str:
         count = sum(not one.piece.is_pause for one in self.pieces)
@@ -181,7 +181,7 @@ class PathTiming:
         curve = Curve(references, along.layout, begin, end, points)
         guess = system.nominal_state if start is None else vector("start", start, system.num_states)
         numbers = system.parameter_vector(parameters)
-        found, causes = list[ProfilePiece](), tuple[Row, ...]()
+        found, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
         for piece in _without_last_pause(curve.pieces, along.layout):
             if piece.is_pause:
                 found.append(_pause(piece))
@@ -215,14 +215,14 @@ class TimeOptimalReference(PiecewiseReference):
         return len(self.profile.layout.degrees)
 
     @cached_property
-    def table(self) -> Pieces:
+    def table(self) -> PiecewisePolynomials:
         """The polynomials of r, one row for each output."""
         parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
         layout = self.profile.layout
         table = time_table(parts, layout, self.profile.start_time)
         return at_rest_outside(coarser(table, layout.dynamic))
 
-    def pieces(self, degrees: Sequence[int]) -> Pieces:
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         return stacked(self.table, degrees)
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
@@ -239,7 +239,7 @@ class TimeOptimalReference(PiecewiseReference):
                 )
 
 
-def _without_last_pause(pieces: Sequence[Piece], layout: Layout) -> Sequence[Piece]:
+def _without_last_pause(pieces: Sequence[Piece], layout: DerivativeLayout) -> Sequence[Piece]:
     """The pieces without a pause at the end in which no output changes."""
     values = pieces[-1].values[:, layout.lowest]
     is_still = np.ptp(values, axis=0).max() <= 1e-9 * np.abs(values).max()
@@ -253,7 +253,7 @@ def _pause(piece: Piece) -> ProfilePiece:
     return ProfilePiece(piece, passed, zero, zero, zero, np.full(count - 1, -1, dtype=np.intp))
 
 
-def _fastest(rows: Rows, piece: Piece, largest_rate: float | None) -> ProfilePiece:
+def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> ProfilePiece:
     """The fastest motion along a piece.
 
     Where the acceleration changes from one interval to the next, as where n of a limit passes
@@ -281,16 +281,16 @@ def _fastest(rows: Rows, piece: Piece, largest_rate: float | None) -> ProfilePie
 
 
 def _settled(
-    rows: Rows,
+    rows: LimitRows,
     piece: Piece,
     largest: FloatArray,
     factor: FloatArray,
     before: FloatArray | None,
-) -> tuple[Fastest, FloatArray | None]:
+) -> tuple[FastestMotion, FloatArray | None]:
     """The fastest motion with all limits divided by a factor, and b about which it is exact."""
     for number in range(1 if rows.is_linear else PASSES):
         lines = rows.lines(before)
-        lowered = Lines(lines.alpha * factor[:, None], lines.beta * factor[:, None])
+        lowered = LinearLimits(lines.alpha * factor[:, None], lines.beta * factor[:, None])
         found = fastest_motion(piece.distances, lowered, largest / factor)
         if not np.isfinite(found.b).all():
             raise ReferenceSignalError(

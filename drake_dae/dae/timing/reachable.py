@@ -21,7 +21,7 @@ from drake_dae.dae.system.layout import Indices
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class LinearLimits:
     """alpha a + beta b <= 1, k of them at each of N + 1 points; 0 a + 0 b where there is none.
 
     Attributes:
@@ -33,7 +33,7 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Fastest:
+class FastestMotion:
     """The fastest motion.
 
     Attributes:
@@ -52,7 +52,7 @@ class Fastest:
 
 
 @np.errstate(all="ignore")  # Without any limit b is infinite.
-def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fastest:
+def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray) -> FastestMotion:
     """The fastest motion from rest to rest.
 
     Args:
@@ -93,7 +93,7 @@ def fastest_motion(points: FloatArray, lines: Lines, largest: FloatArray) -> Fas
         else:
             a[i], active[i], brakes[i] = most, brake[i], True
         b[i + 1] = min(max(b[i] + double[i] * a[i], 0.0), highest[i + 1])
-    return Fastest(b, a, highest, active, brakes)
+    return FastestMotion(b, a, highest, active, brakes)
 
 
 def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatArray:

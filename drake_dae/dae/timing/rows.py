@@ -9,7 +9,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.timing.along import AlongCurve
 from drake_dae.dae.timing.curve import Piece
-from drake_dae.dae.timing.reachable import Lines
+from drake_dae.dae.timing.reachable import LinearLimits
 from drake_dae.dae.timing.tool_limits import ToolLimits
 from drake_dae.errors import ReferenceSignalError
 
@@ -24,7 +24,7 @@ CHECKED = 20
 
 
 @dataclass(frozen=True)
-class Row:
+class LimitRow:
     """What a line limits.
 
     Attributes:
@@ -44,7 +44,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class LimitRows:
     """The limited signals along a piece.
 
     Attributes:
@@ -74,20 +74,20 @@ class Rows:
     tools: Sequence[ToolLimits]
 
     @property
-    def names(self) -> tuple[Row, ...]:
+    def names(self) -> tuple[LimitRow, ...]:
         """What may limit: all lines, then what limits b alone."""
         limited = self.along.limited
         pairs = [*zip(limited.signals, limited.low, limited.high, strict=True)]
-        rows = [Row(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
-        rows += [Row(s.name, "least", s.unit) for s, low, _ in pairs if np.isfinite(low)]
-        rows += [Row("acceleration of a path", "largest", "")] * sum(
+        rows = [LimitRow(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
+        rows += [LimitRow(s.name, "least", s.unit) for s, low, _ in pairs if np.isfinite(low)]
+        rows += [LimitRow("acceleration of a path", "largest", "")] * sum(
             tool.of_a.shape[1] for tool in self.tools
         )
-        rows += [Row(s.name, "largest", s.unit) for s in limited.state_signals]
-        rows += [Row("speed of a path", "largest", "")] * len(self.tools)
-        return (*rows, Row("rate of the reference's time", "largest", ""))
+        rows += [LimitRow(s.name, "largest", s.unit) for s in limited.state_signals]
+        rows += [LimitRow("speed of a path", "largest", "")] * len(self.tools)
+        return (*rows, LimitRow("rate of the reference's time", "largest", ""))
 
-    def lines(self, before: FloatArray | None) -> Lines:
+    def lines(self, before: FloatArray | None) -> LinearLimits:
         """The lines; where signals are not linear, those about a profile before.
 
         Args:
@@ -111,7 +111,7 @@ class Rows:
         none = np.zeros((len(still), 1))  # A line that limits nothing, after all others.
         of_a = [by_a[:, up] / above, -by_a[:, down] / below, *(t.of_a for t in tools), none]
         of_b = [by_b[:, up] / above, -by_b[:, down] / below, *(t.of_b for t in tools), none]
-        return Lines(np.hstack(of_a), np.hstack(of_b))
+        return LinearLimits(np.hstack(of_a), np.hstack(of_b))
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
         """The largest b at each point, and what limits it as a place in `names`.
@@ -145,7 +145,7 @@ def rows_along(
     guess: FloatArray,
     parameters: FloatArray,
     tools: Sequence[ToolLimits],
-) -> Rows:
+) -> LimitRows:
     """The limited signals along a piece.
 
     Args:
@@ -179,12 +179,12 @@ def rows_along(
     bounds[~np.isfinite(bounds)] = 0.0
     size = np.maximum(np.abs(twice).max(axis=0, initial=0.0), bounds.max(axis=0, initial=0.0))
     is_linear = bool((off <= LINEAR * size).all())
-    return Rows(
+    return LimitRows(
         along, piece, parameters, at_rest, moving, still, by_a, by_b, speed, is_linear, tools
     )
 
 
-def _check_friction(rows: Rows, above: FloatArray, below: FloatArray) -> None:
+def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> None:
     """Refuses friction that needs more than the limits in slow motion.
 
     Raises:

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.pieces import Pieces
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.references.pieces import PiecewisePolynomials
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.timing.curve import Piece
 
 # A quintic on [0, 1] with given values and first and second derivatives at both ends: the factors
@@ -34,9 +34,9 @@ QUINTIC = np.array(
 
 def time_table(
     parts: Sequence[tuple[Piece, FloatArray, FloatArray, FloatArray]],
-    layout: Layout,
+    layout: DerivativeLayout,
     start_time: float,
-) -> Pieces:
+) -> PiecewisePolynomials:
     """The polynomials of r along the pieces of a curve, a row for each output.
 
     Args:
@@ -49,21 +49,21 @@ def time_table(
     for piece, times, b, a in parts:
         breaks.append(breaks[-1][-1] + times[1:])
         factors.append(_polynomials(piece, np.diff(times), b, a, layout))
-    return Pieces(np.concatenate(breaks), np.concatenate(factors))
+    return PiecewisePolynomials(np.concatenate(breaks), np.concatenate(factors))
 
 
-def at_rest_outside(table: Pieces) -> Pieces:
+def at_rest_outside(table: PiecewisePolynomials) -> PiecewisePolynomials:
     """The table with a second of rest before and after, so that r'' is 0 there."""
     breaks, factors = table.breaks, table.factors
     rests = np.zeros((2, *factors.shape[1:]))
     rests[0, :, 0], rests[1, :, 0] = factors[0, :, 0], factors[-1].sum(axis=-1)
-    return Pieces(
+    return PiecewisePolynomials(
         np.concatenate([breaks[:1] - 1.0, breaks, breaks[-1:] + 1.0]),
         np.concatenate([rests[:1], factors, rests[1:]]),
     )
 
 
-def stacked(table: Pieces, degrees: Sequence[int]) -> Pieces:
+def stacked(table: PiecewisePolynomials, degrees: Sequence[int]) -> PiecewisePolynomials:
     """Polynomials with their derivatives: r_1, ..., r_1^(mu_1), r_2, ..."""
     widths, rows = np.diff(table.breaks)[:, None], []
     for output, degree in enumerate(degrees):
@@ -72,11 +72,11 @@ def stacked(table: Pieces, degrees: Sequence[int]) -> Pieces:
         for k in range(degree + 1):
             rows.append(row / widths**k)
             row = np.pad((row * powers)[:, 1:], ((0, 0), (0, 1)))
-    return Pieces(table.breaks, np.stack(rows, axis=1))
+    return PiecewisePolynomials(table.breaks, np.stack(rows, axis=1))
 
 
 def _polynomials(
-    piece: Piece, widths: FloatArray, b: FloatArray, a: FloatArray, layout: Layout
+    piece: Piece, widths: FloatArray, b: FloatArray, a: FloatArray, layout: DerivativeLayout
 ) -> FloatArray:
     """The factors of (1, x, ..., x^5) in each interval, shape (N, outputs, 6)."""
     count, low = widths.size, layout.lowest

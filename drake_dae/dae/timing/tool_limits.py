@@ -9,7 +9,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.by_name import ReferenceRows
 from drake_dae.dae.references.reference import Reference
 from drake_dae.dae.references.travel import PathLimits
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.timing.curve import Piece
 
 DIRECTIONS = 25
@@ -30,7 +30,9 @@ class ToolLimits:
     of_b: FloatArray
 
 
-def tool_limits(references: Sequence[Reference], piece: Piece, layout: Layout) -> list[ToolLimits]:
+def tool_limits(
+    references: Sequence[Reference], piece: Piece, layout: DerivativeLayout
+) -> list[ToolLimits]:
     """The limits of all paths with any.
 
     |r''| <= A is a circle in the plane of the tangential and the normal part,

@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import eliminate
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.errors import AdviceWarning, GainError, ModelError
 from drake_dae.trace.given import result_of
@@ -51,7 +51,7 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
         GainError: The gains do not fit, or are not Hurwitz.
     """
     system, manifold = structure.system, structure.manifold
-    layout = Layout(structure.constraint_degrees)
+    layout = DerivativeLayout(structure.constraint_degrees)
     residual = manifold.residual_expression
     names = tuple(signal.name for signal in system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import GainError
 
 
@@ -67,9 +67,9 @@ class FeedbackGains:
             )
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> DerivativeLayout:
         """How the error coordinates are stacked."""
-        return Layout(self.degrees)
+        return DerivativeLayout(self.degrees)
 
     @property
     def error_matrix(self) -> FloatArray:
@@ -167,7 +167,7 @@ def gain_coefficients(
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         matrix = np.zeros((len(names), sum(degrees)))
-        starts = dict(zip(names, Layout(tuple(degrees)).starts, strict=True))
+        starts = dict(zip(names, DerivativeLayout(tuple(degrees)).starts, strict=True))
         chosen: list[tuple[str, int, float | Sequence[float]]]
         chosen = _per_output(values, names, degrees)
         for name, degree, row in chosen:
@@ -202,7 +202,7 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
                 f"matrices are needed, got {len(groups)}"
             )
         matrix = np.zeros((len(names), sum(degrees)))
-        starts = Layout(tuple(degrees)).starts
+        starts = DerivativeLayout(tuple(degrees)).starts
         for degree, group in zip(occurring, groups, strict=True):
             members = [i for i, d in enumerate(degrees) if d == degree]
             if len(group) != degree:
@@ -270,7 +270,7 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     return [float(number) for number in np.real(monic)[:0:-1]]
 
 
-def _coupled(layout: Layout, matrix: FloatArray) -> list[list[int]]:
+def _coupled(layout: DerivativeLayout, matrix: FloatArray) -> list[list[int]]:
     """Groups of outputs whose errors are coupled."""
     groups: list[set[int]] = []
     for i in map(int, layout.dynamic):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.measured_force import ForceMeasurement
@@ -84,7 +84,7 @@ class IntegralAction:
             integral: sigma, shape (k, 1); its symbols if None.
         """
         values = self.symbol if integral is None else integral
-        starts, rows = Layout(self.degrees).starts.tolist(), []
+        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), []
         for i, degree in enumerate(self.degrees):
             if i in self.outputs:
                 rows.append(values[self.outputs.index(i)])
@@ -99,7 +99,7 @@ class IntegralAction:
             values: r_1, ..., r_p, shape (p, 1).
             measured: The measurement, if the law uses it.
         """
-        starts, rows = Layout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
+        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
         for i in self.outputs:
             if self.degrees[i]:
                 rows.append(chain[starts[i]] - values[i])

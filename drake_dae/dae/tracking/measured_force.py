@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
 
@@ -27,13 +27,13 @@ class ForceMeasurement:
         symbol: The symbols v of the measurement, shape (m, 1).
     """
 
-    layout: Layout
+    layout: DerivativeLayout
     inputs: dict[int, int]
     gain: FloatArray
     symbol: ca.SX
 
     @classmethod
-    def of(cls, system: DaeSystem, layout: Layout, gain: ArrayLike) -> "ForceMeasurement":
+    def of(cls, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> "ForceMeasurement":
         """The measurement of all constraint inputs of a system.
 
         Args:

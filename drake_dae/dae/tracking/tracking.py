@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.constraint_damping import damped
@@ -87,7 +87,7 @@ class TrackingLaw:
         if constraint_damping is not None:
             self._model = damped(self.structure, constraint_damping)
         self.system = system
-        self.layout = Layout(self.structure.output_degrees)
+        self.layout = DerivativeLayout(self.structure.output_degrees)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
@@ -328,7 +328,7 @@ class TrackingLaw:
 
 
 def _measured_force(
-    system: DaeSystem, layout: Layout, wanted: bool, gain: ArrayLike
+    system: DaeSystem, layout: DerivativeLayout, wanted: bool, gain: ArrayLike
 ) -> ForceMeasurement | None:
     if wanted:
         return ForceMeasurement.of(system, layout, gain)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
+from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow, MotionLost
 from drake_dae.dae.zero_dynamics.long_term import Behavior, behavior_of, carry_in_halves, leave
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause, PinnedMotion
-from drake_dae.dae.zero_dynamics.returns import Return, close, find_multiple
+from drake_dae.dae.zero_dynamics.returns import PeriodicMotion, close, find_multiple
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
@@ -49,7 +49,9 @@ class StabilityAlong:
         return cls(verdict, period, np.zeros(0, dtype=complex), np.zeros(0), None, reason)
 
 
-def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
+def judge_along(
+    flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
+) -> StabilityAlong:
     """Whether disturbances of a motion with pinned outputs grow.
 
     Args:
@@ -83,15 +85,15 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
 
 
 def _closed(
-    flow: Flow, motion: PinnedMotion, first: int, period: float
-) -> tuple[Return, float] | None:
+    flow: DisturbanceFlow, motion: PinnedMotion, first: int, period: float
+) -> tuple[PeriodicMotion, float] | None:
     """The periodic motion near one of the states of a motion, and its start time."""
     begin = float(motion.times[first])
     found = close(flow, motion.states[first], begin, period, patient=True)
     return None if found is None else (found, begin)
 
 
-def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
+def _by_multipliers(flow: DisturbanceFlow, closed: PeriodicMotion, begin: float) -> StabilityAlong:
     values, errors, period = closed.multipliers, closed.errors, closed.period
     sizes = np.abs(values)
     exponents = np.log(np.maximum(sizes, 1e-300)) / period
@@ -118,14 +120,16 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
     return StabilityAlong(verdict, period, values, exponents, closed.state, reason)
 
 
-def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
+def _by_exponents(
+    flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
+) -> StabilityAlong:
     """The growth of disturbances over the second half of the time."""
     middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
     middle = min(middle, motion.times.size - 2)
     begin, end = float(motion.times[middle]), float(motion.times[-1])
     try:
         passage, halves = carry_in_halves(flow, motion.states[middle], begin, end)
-    except Lost as lost:
+    except MotionLost as lost:
         verdict = Verdict.UNSTABLE if lost.cause is EndCause.UNBOUNDED else Verdict.UNDECIDED
         reason = f"from x = {show(motion.states[middle])}: {lost}"
         return StabilityAlong.without_numbers(verdict, reason, period)

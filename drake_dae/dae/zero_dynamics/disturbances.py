@@ -37,7 +37,7 @@ SECTIONS = 16
 renewed."""
 
 
-class Lost(Exception):
+class MotionLost(Exception):
     """A motion cannot be followed to the end of an interval."""
 
     def __init__(self, cause: EndCause) -> None:
@@ -64,7 +64,7 @@ class StateTransition:
     volume: float
 
 
-class Flow:
+class DisturbanceFlow:
     """Carries states on Z(R(t)), and their disturbances, through intervals of time.
 
     Args:
@@ -104,13 +104,13 @@ class Flow:
             lambda time: np.concatenate([self.goal(time), self.parameters(time)]), begin, end
         )
 
-    def repeating(self, begin: float, period: float) -> "Flow":
+    def repeating(self, begin: float, period: float) -> "DisturbanceFlow":
         """The same flow for a reference and parameters that repeat one period."""
 
         def within(time: float) -> float:
             return begin + (time - begin) % period
 
-        return Flow(
+        return DisturbanceFlow(
             self.pinned,
             lambda time: self.goal(within(time)),
             lambda time: self.parameters(within(time)),
@@ -125,7 +125,7 @@ class Flow:
         """
         found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
         if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
-            raise Lost(EndCause.NO_WAY_ON)
+            raise MotionLost(EndCause.NO_WAY_ON)
         return found
 
     def carry(
@@ -165,7 +165,7 @@ class Flow:
             for time, there, _ in self._steps(state, self.basis(state, start)[:, :0], start, stop):
                 steps -= 1
                 if steps < 0:
-                    raise Lost(EndCause.TOO_FAST)
+                    raise MotionLost(EndCause.TOO_FAST)
                 state = there
                 yield time, state
             state = self.onto(state, stop)
@@ -177,7 +177,7 @@ class Flow:
         for _, there, along in self._steps(state, columns, begin, end):
             state, columns, steps = there, along, steps - 1
             if steps < 0:
-                raise Lost(EndCause.TOO_FAST)
+                raise MotionLost(EndCause.TOO_FAST)
         return state, columns, steps
 
     def _steps(
@@ -200,7 +200,7 @@ class Flow:
                 self.pinned.rate(x, goal, p), self.pinned.slopes_along(x, goal, p, along)
             )
             if not np.all(np.isfinite(moved)):
-                raise Lost(EndCause.NO_WAY_ON)
+                raise MotionLost(EndCause.NO_WAY_ON)
             return moved
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
@@ -226,12 +226,12 @@ class Flow:
             quietly(solver.step)
             largest = np.max(np.abs(solver.y[:n]))
             if not largest <= bound:
-                raise Lost(EndCause.UNBOUNDED)
+                raise MotionLost(EndCause.UNBOUNDED)
             marks.append((solver.t, largest))
             if len(marks) > LATE:
                 before, size = marks[-1 - LATE]
                 if solver.t - before < HARDLY * (end - begin) and largest < 2.0 * size:
-                    raise Lost(EndCause.TOO_FAST)
+                    raise MotionLost(EndCause.TOO_FAST)
             if solver.status == "failed":
-                raise Lost(EndCause.TOO_FAST)
+                raise MotionLost(EndCause.TOO_FAST)
             yield solver.t, *split(solver.y)

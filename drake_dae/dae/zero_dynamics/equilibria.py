@@ -32,7 +32,7 @@ APART = 1e-6
 
 
 @dataclass(frozen=True)
-class Unrest:
+class EquilibriumDefect:
     """The reason why a state is not a regular equilibrium.
 
     Attributes:
@@ -140,7 +140,7 @@ class Equilibria:
         z, converged = newton(start / scale, linearize)
         state = scale * z
         point = pinned.point(state, reference, parameters)
-        unrest: Unrest | str | None = self.unrest(point, reference, parameters)
+        unrest: EquilibriumDefect | str | None = self.unrest(point, reference, parameters)
         if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
             unrest = "it grows without bound"
         if converged and not unrest:
@@ -195,14 +195,14 @@ class Equilibria:
 
     def unrest(
         self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray
-    ) -> Unrest | None:
+    ) -> EquilibriumDefect | None:
         """What changes at a point, or that it is singular; None at a regular equilibrium.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
         regularity = self.pinned.regularity(point)
         if regularity is not Regularity.REGULAR:
-            return Unrest(regularity)
+            return EquilibriumDefect(regularity)
         slopes, _ = self.pinned.slopes(point.state, reference, parameters)
         slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)
@@ -210,4 +210,4 @@ class Equilibria:
         if unrest[worst] <= AT_REST:
             return None
         moving = self.pinned.system.state_signals[worst].name
-        return Unrest(regularity, moving, float(point.rate[worst]))
+        return EquilibriumDefect(regularity, moving, float(point.rate[worst]))

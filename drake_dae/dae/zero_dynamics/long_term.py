@@ -6,10 +6,10 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, StateTransition
+from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow, MotionLost, StateTransition
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
-from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
+from drake_dae.dae.zero_dynamics.returns import PeriodicMotion, find_multiple, find_return
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,
     Verdict,
@@ -63,7 +63,7 @@ class LongTerm:
 
     behavior: Behavior
     state: FloatArray | None = None
-    closed: Return | None = None
+    closed: PeriodicMotion | None = None
 
     def __str__(self) -> str:
         return (
@@ -95,7 +95,7 @@ def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
 
 
 def watch(
-    flow: Flow, state: FloatArray, begin: float, end: float, period: float | None = None
+    flow: DisturbanceFlow, state: FloatArray, begin: float, end: float, period: float | None = None
 ) -> LongTerm:
     """The long-term behavior of the motion from a state.
 
@@ -109,7 +109,7 @@ def watch(
     try:
         later = flow.carry(state, begin, middle, disturbed=False).state
         passage, halves = carry_in_halves(flow, later, middle, end)
-    except Lost as lost:
+    except MotionLost as lost:
         return LongTerm(Behavior.GROWS if lost.cause is EndCause.UNBOUNDED else Behavior.UNCLEAR)
     behavior, last = behavior_of(passage, *halves), passage.state
     if behavior is not Behavior.WANDERS:
@@ -126,7 +126,7 @@ def watch(
 
 
 def carry_in_halves(
-    flow: Flow, state: FloatArray, begin: float, end: float
+    flow: DisturbanceFlow, state: FloatArray, begin: float, end: float
 ) -> tuple[StateTransition, tuple[StateTransition, StateTransition]]:
     """The flow over an interval and over its halves.
 
@@ -148,7 +148,7 @@ def carry_in_halves(
     return whole, (first, second)
 
 
-def watch_from(flow: Flow, state: FloatArray) -> LongTerm:
+def watch_from(flow: DisturbanceFlow, state: FloatArray) -> LongTerm:
     """The long-term behavior from a state that is not at rest, for a constant reference.
 
     The duration follows from the rates of its disturbances.
@@ -166,7 +166,7 @@ def watch_from(flow: Flow, state: FloatArray) -> LongTerm:
 
 
 def leave(
-    flow: Flow,
+    flow: DisturbanceFlow,
     state: FloatArray,
     time: float,
     rate: float,
@@ -196,7 +196,7 @@ def leave(
     for side in (aside, -aside):
         try:
             start = flow.onto(state + side, time)
-        except Lost:
+        except MotionLost:
             return LongTerm(Behavior.UNCLEAR)
         courses.append(watch(flow, start, time, time + duration, period))
         if courses[-1].behavior not in (Behavior.CIRCLES, Behavior.SETTLES, Behavior.WANDERS):
@@ -222,7 +222,7 @@ def judge_at_rest(
     found = judge(values, errors, rest, place)
     if found.verdict is not Verdict.UNSTABLE:
         return found
-    flow = Flow(pinned, lambda time: goal, lambda time: parameters, sizes)
+    flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, sizes)
     course = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
     return _after(found, course)
 
@@ -256,7 +256,7 @@ def judge_without_rest(
         reason: Why there is no equilibrium.
     """
     nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
-    flow = Flow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
+    flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         course = watch_from(flow, pinned.state(goal, start, parameters))
         if course.behavior is Behavior.SETTLES and course.state is not None:

@@ -12,7 +12,7 @@ from itertools import islice
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
+from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow, MotionLost
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, eigenvalues_of
 
 CLOSED = 1e-7
@@ -38,7 +38,7 @@ CROSSINGS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Return:
+class PeriodicMotion:
     """A periodic motion.
 
     Attributes:
@@ -75,14 +75,14 @@ class Return:
 
 
 def close(
-    flow: Flow,
+    flow: DisturbanceFlow,
     state: FloatArray,
     begin: float,
     period: float,
     *,
     free: bool = False,
     patient: bool = False,
-) -> Return | None:
+) -> PeriodicMotion | None:
     """The periodic motion near a state for a period; None if none is found.
 
     Newton's method for the distance from the start after a period, along the tangent space.
@@ -100,7 +100,7 @@ def close(
         basis = flow.basis(state, begin)
         try:
             passage = flow.carry(state, begin, begin + period)
-        except Lost:
+        except MotionLost:
             return None
         scaled = (basis / scale[:, None]).T
         with np.errstate(over="ignore"):
@@ -135,14 +135,14 @@ def close(
             return _judged(state, period, monodromy, free)
         try:
             state, period = flow.onto(state + step, begin), period + later
-        except Lost:
+        except MotionLost:
             return None
         if not period > 0.0:
             return None
     return None
 
 
-def find_return(flow: Flow, state: FloatArray, duration: float) -> Return | None:
+def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> PeriodicMotion | None:
     """The periodic motion on or near a motion of an autonomous system.
 
     Candidates are crossings of a section, the plane normal to its rate, near the start.
@@ -157,13 +157,15 @@ def find_return(flow: Flow, state: FloatArray, duration: float) -> Return | None
     return next((one for one in found if one is not None), None)
 
 
-def find_multiple(flow: Flow, state: FloatArray, begin: float, period: float) -> Return | None:
+def find_multiple(
+    flow: DisturbanceFlow, state: FloatArray, begin: float, period: float
+) -> PeriodicMotion | None:
     """The attracting motion near a state whose period is a multiple of the reference's."""
     found = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
     return next((one for one in found if one is not None and one.attracts), None)
 
 
-def _near(flow: Flow, state: FloatArray, duration: float) -> Iterator[float]:
+def _near(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Iterator[float]:
     """The times at which a motion crosses the section at a state in the same direction, near it."""
     rate = flow.pinned.rate(state, flow.goal(0.0), flow.parameters(0.0)) / flow.scale
     if not np.any(rate):
@@ -179,15 +181,15 @@ def _near(flow: Flow, state: FloatArray, duration: float) -> Iterator[float]:
                 if across <= NEAR * extent and extent >= LEAST:
                     yield time + (later - time) * before / (before - ahead)
             time, before = later, ahead
-    except Lost:
+    except MotionLost:
         return
 
 
-def _judged(state: FloatArray, period: float, monodromy: FloatArray, free: bool) -> Return:
+def _judged(state: FloatArray, period: float, monodromy: FloatArray, free: bool) -> PeriodicMotion:
     noise = CARRIED * max(1.0, float(np.linalg.norm(monodromy, 2)))
     values, errors = eigenvalues_of(monodromy, np.full(monodromy.shape, noise))
     if free:
         along = int(np.argmin(np.abs(values - 1.0)))
         values, errors = np.delete(values, along), np.delete(errors, along)
     order = np.argsort(-np.abs(values), kind="stable")
-    return Return(state, period, monodromy, values[order], errors[order])
+    return PeriodicMotion(state, period, monodromy, values[order], errors[order])

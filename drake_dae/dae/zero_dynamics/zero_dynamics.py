@@ -16,7 +16,7 @@ from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong, judge_along
-from drake_dae.dae.zero_dynamics.disturbances import Flow
+from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
 from drake_dae.dae.zero_dynamics.long_term import judge_at_rest, judge_without_rest
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
@@ -275,7 +275,10 @@ class ZeroDynamics:
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
         moving = self._moving(p, exogenous)
-        flow, period = Flow(self._pinned, reference, moving, self._equilibria.sizes), None
+        flow, period = (
+            DisturbanceFlow(self._pinned, reference, moving, self._equilibria.sizes),
+            None,
+        )
         if motion.ending is None and motion.times.size > 1:
             period = flow.period(float(motion.times[0]), float(motion.times[-1]))
         if period == 0.0:

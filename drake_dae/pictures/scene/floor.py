@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.pictures.scene.surroundings import Seen
+from drake_dae.pictures.scene.surroundings import DrawnSurface
 
 _CELLS = 8.0
 """About so many cells a scene is wide."""
@@ -42,7 +42,7 @@ class Floor:
         return np.array(begins), np.array(finishes)
 
 
-def floor_below(points: FloatArray, touched: Sequence[Seen] = ()) -> Floor:
+def floor_below(points: FloatArray, touched: Sequence[DrawnSurface] = ()) -> Floor:
     """The floor of a scene: a little below its points, or on a level surface near these.
 
     Args:

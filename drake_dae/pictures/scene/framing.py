@@ -16,7 +16,7 @@ _FROM, _FROM_ABOVE = np.array([-0.6, -0.85, 0.4]), np.array([-0.6, -0.85, 1.3])
 
 
 @dataclass(frozen=True)
-class View:
+class ViewAngles:
     """The angles that a picture shows around the axis of its camera, as tangents.
 
     Attributes:
@@ -29,7 +29,9 @@ class View:
     down: float
 
     @classmethod
-    def of(cls, angle: float, aspect: float, top: float = 0.0, margin: float = 0.06) -> "View":
+    def of(
+        cls, angle: float, aspect: float, top: float = 0.0, margin: float = 0.06
+    ) -> "ViewAngles":
         """The view of a picture.
 
         Args:
@@ -76,7 +78,9 @@ def direction_of(points: FloatArray, contacts: FloatArray, normals: FloatArray) 
     return best
 
 
-def framed(points: FloatArray, direction: FloatArray, view: View) -> tuple[FloatArray, FloatArray]:
+def framed(
+    points: FloatArray, direction: FloatArray, view: ViewAngles
+) -> tuple[FloatArray, FloatArray]:
     """The nearest camera that shows all points: its eye, and a point that it looks at, m.
 
     With x to the right, y up and z toward the camera from some point, a point is in the picture

@@ -7,13 +7,13 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.pictures.moments import Kind, Moment
+from drake_dae.pictures.moments import RunEvent, RunEventKind
 from drake_dae.pictures.scene.run_motion import RunMotion
 from drake_dae.trace.functions import TracedFunction
 
 
 @dataclass(frozen=True, eq=False)
-class FrictionCone:
+class DrawnFrictionCone:
     """The directions that the force of a contact may have: |F_t| <= mu F_n.
 
     Attributes:
@@ -27,24 +27,24 @@ class FrictionCone:
     normals: FloatArray
 
 
-def friction_cones(course: RunMotion) -> list[FrictionCone]:
+def friction_cones(course: RunMotion) -> list[DrawnFrictionCone]:
     """The cones of all contacts with friction, by what the plant has, not the law."""
     normals, found = course.normals, []
     for row, constraint in enumerate(course.acting.constraints):
         coefficient = course.friction.get(constraint.name, 0.0)
         lengths = np.linalg.norm(normals[:, row], axis=1, keepdims=True)
         if coefficient > 0.0 and sum(constraint.is_unilateral) == 1 and lengths.all():
-            found.append(FrictionCone(row, coefficient, normals[:, row] / lengths))
+            found.append(DrawnFrictionCone(row, coefficient, normals[:, row] / lengths))
     return found
 
 
-def slips(course: RunMotion) -> list[Moment]:
+def slips(course: RunMotion) -> list[RunEvent]:
     """When contacts with friction begin to slide, and when they stick again.
 
     Regularized friction creeps below the speed at which it is counted as sliding here, the
     stiction tolerance of its constraint. A contact without force does not slide.
     """
-    model, found = course.model, list[Moment]()
+    model, found = course.model, list[RunEvent]()
     kinematics = model.links.kinematics()
     for row, constraint in enumerate(course.acting.constraints):
         velocity = constraint.sliding(kinematics)
@@ -71,12 +71,12 @@ def slips(course: RunMotion) -> list[Moment]:
 
 def _changes(
     name: str, course: RunMotion, slides: Sequence[bool], touches: Sequence[bool]
-) -> list[Moment]:
-    found, times = list[Moment](), course.start_time + course.times
+) -> list[RunEvent]:
+    found, times = list[RunEvent](), course.start_time + course.times
     for place in range(len(times)):
         before = slides[place - 1] if place else False
         if slides[place] and not before:
-            found.append(Moment(float(times[place]), Kind.SLIDE, f"{name} slides"))
+            found.append(RunEvent(float(times[place]), RunEventKind.SLIDE, f"{name} slides"))
         elif before and not slides[place] and touches[place]:
-            found.append(Moment(float(times[place]), Kind.STICK, f"{name} sticks"))
+            found.append(RunEvent(float(times[place]), RunEventKind.STICK, f"{name} sticks"))
     return found

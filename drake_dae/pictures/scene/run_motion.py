@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
-from drake_dae.pictures.scene.framing import View, direction_of, framed
+from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
 from drake_dae.pictures.scene.surroundings import scene_points
 from drake_dae.pictures.scene.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
@@ -219,7 +219,7 @@ def run_points(course: RunMotion, scene_graph: SceneGraph | None) -> FloatArray:
 
 
 def run_view(
-    course: RunMotion, scene_graph: SceneGraph | None, view: View, arrow: float
+    course: RunMotion, scene_graph: SceneGraph | None, view: ViewAngles, arrow: float
 ) -> tuple[FloatArray, FloatArray]:
     """The eye of a camera that shows a whole run, and the point that it looks at, m.
 

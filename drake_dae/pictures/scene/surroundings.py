@@ -11,12 +11,12 @@ from drake_dae.arrays import FloatArray
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.trace.functions import TracedFunction
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class DrawnSurface:
     """The drawn surface of one or several constraints.
 
     Attributes:
@@ -27,7 +27,7 @@ class Seen:
 
     constraint: Constraint
     stands: RigidTransform
-    picture: Picture
+    picture: PosedShape
 
     @property
     def level(self) -> float | None:
@@ -44,7 +44,7 @@ def surroundings(
     points: FloatArray,
     parameters: FloatArray,
     size: float,
-) -> list[Seen]:
+) -> list[DrawnSurface]:
     """The surfaces in contact with a robot, each once, since coinciding ones would flicker.
 
     An unbounded surface is drawn around the middle of its contact points, and larger than their
@@ -58,7 +58,7 @@ def surroundings(
         size: The size of the drawn piece of an unbounded surface, m.
     """
 
-    def seen(row: int, touched: FloatArray) -> Seen | None:
+    def seen(row: int, touched: FloatArray) -> DrawnSurface | None:
         constraint = acting.constraints[row]
         own = own_values(constraint, model.dae, parameters)
         low, high = touched.min(axis=0), touched.max(axis=0)
@@ -68,9 +68,9 @@ def surroundings(
         if picture is None:
             return None
         stands = constraint.placement(own)
-        return Seen(constraint, stands, picture.moved(stands.inverse()))
+        return DrawnSurface(constraint, stands, picture.moved(stands.inverse()))
 
-    found: list[tuple[list[int], Seen]] = []
+    found: list[tuple[list[int], DrawnSurface]] = []
     for row, constraint in enumerate(acting.constraints):
         one = seen(row, points[:, row])
         if one is None:
@@ -89,7 +89,7 @@ def surroundings(
     return [one for _, one in found]
 
 
-def _coincide(first: Seen, second: Seen) -> bool:
+def _coincide(first: DrawnSurface, second: DrawnSurface) -> bool:
     """Whether two pictures are equal."""
     poses = [one.stands @ one.picture.pose for one in (first, second)]
     if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):

@@ -21,9 +21,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
 from drake_dae.pictures.scene.floor import Floor, floor_below
-from drake_dae.pictures.scene.framing import View, direction_of, framed
+from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
 from drake_dae.pictures.scene.surroundings import (
-    Seen,
+    DrawnSurface,
     scene_extent,
     scene_points,
     surroundings,
@@ -144,7 +144,7 @@ def draw_scene(
     seen = scene_points(model, wrenches, state[None], scene_graph)
     draw_floor(meshcat, floor_below(seen, touched))
     direction = direction_of(seen, points[0], np.zeros_like(points[0]))
-    look_at(meshcat, *framed(seen, direction, View.of(CAMERA_ANGLE, ASPECT)))
+    look_at(meshcat, *framed(seen, direction, ViewAngles.of(CAMERA_ANGLE, ASPECT)))
     return ForceArrows(meshcat, model, ARROW * size)
 
 
@@ -196,7 +196,7 @@ def view_of_links(
     return diagram
 
 
-def draw_surroundings(meshcat: Meshcat, seen: Sequence[Seen]) -> None:
+def draw_surroundings(meshcat: Meshcat, seen: Sequence[DrawnSurface]) -> None:
     """Draws the surfaces in contact with a robot.
 
     Args:

@@ -15,7 +15,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
 
@@ -245,7 +245,7 @@ class Constraint(ABC):
         """
         return RigidTransform()
 
-    def solid(self, values: FloatArray) -> Picture | None:
+    def solid(self, values: FloatArray) -> PosedShape | None:
         """The geometry for Drake's own contact; None if there is none.
 
         Args:
@@ -253,7 +253,7 @@ class Constraint(ABC):
         """
         return None
 
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         """The visible object in contact, or None.
 
         Args:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.system.contacts import Contact
+from drake_dae.dae.system.contacts import UnilateralInput
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
@@ -209,10 +209,10 @@ class ConstraintSet:
         return total
 
     @property
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
         found = [
-            Contact(signal.name, constraint.friction_parameter)
+            UnilateralInput(signal.name, constraint.friction_parameter)
             for constraint in self.constraints
             for signal, pushes in zip(
                 constraint.force_signals, constraint.is_unilateral, strict=True

@@ -14,7 +14,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
 from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
 from drake_dae.trace.smoothness import length_of
 
@@ -194,13 +194,13 @@ class PointOnSurface(Constraint):
         turn = np.zeros(3) if self.rpy is None else values[3:6]
         return RigidTransform(RollPitchYaw(turn), values[:3])
 
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         stands = self.placement(values)
         surface = self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
         picture = surface.picture(stands.inverse() @ point, size)
         return None if picture is None else picture.moved(stands)
 
-    def solid(self, values: FloatArray) -> Picture | None:
+    def solid(self, values: FloatArray) -> PosedShape | None:
         solid = self.surface.solid()
         return None if solid is None else solid.moved(self.placement(values))
 

@@ -12,7 +12,7 @@ from drake_dae.dae.system.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics
-from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
 from drake_dae.trace.smoothness import length_of
 
@@ -234,7 +234,7 @@ class RollingBall(Constraint):
         axes = ca.horzcat(normal, tangents), ca.SX(3, 3)
         return (Application(point, *axes, self.frame),)
 
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         picture = self.surface.picture(point - values[:3], size)
         return None if picture is None else picture.moved(values[:3])
 

@@ -16,7 +16,7 @@ from pydrake.multibody.tree import Frame, FrameIndex, Joint
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.joints import ElementaryJoints, constant_pose, elementary_joints
-from drake_dae.robots.links.tree import Link, link_poses
+from drake_dae.robots.links.tree import TreeLink, link_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class PlantFrames:
     def __init__(
         self,
         plant: MultibodyPlant,
-        links: Sequence[Link],
+        links: Sequence[TreeLink],
         bodies: dict[int, tuple[int, RigidTransform]],
     ) -> None:
         self._plant = plant

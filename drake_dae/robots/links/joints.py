@@ -20,7 +20,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.tree import ElementaryJoint, Link
+from drake_dae.robots.links.tree import ElementaryJoint, TreeLink
 
 SUPPORTED_JOINTS = (
     RevoluteJoint,
@@ -136,7 +136,7 @@ def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:
 
 def read_links(
     plant: MultibodyPlant, q: ca.SX
-) -> tuple[list[Link], dict[int, tuple[int, RigidTransform]]]:
+) -> tuple[list[TreeLink], dict[int, tuple[int, RigidTransform]]]:
     """Reads the tree of a plant whose joints are supported, outward from the world.
 
     Args:
@@ -147,7 +147,7 @@ def read_links(
         The links, still without inertia, and for every body its index -> its link, and its
         constant pose in that link.
     """
-    links = [Link()]
+    links = [TreeLink()]
     bodies = {int(plant.world_body().index()): (0, RigidTransform())}
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     reached = list(bodies)
@@ -169,7 +169,7 @@ def read_links(
                 X_FA = RigidTransform(RotationMatrix(found.rotation), np.zeros(3))
                 start = X_LF @ X_FA
                 for elementary in found.sequence:
-                    links.append(Link.moved(link, *constant_pose(start), elementary, q))
+                    links.append(TreeLink.moved(link, *constant_pose(start), elementary, q))
                     link, start = len(links) - 1, RigidTransform()
                 X_LM = X_FA.inverse()
             bodies[ends[1]] = (link, X_LM @ frames[1].GetFixedPoseInBodyFrame().inverse())

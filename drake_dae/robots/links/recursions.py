@@ -11,10 +11,10 @@ from types import MappingProxyType
 import casadi as ca
 
 from drake_dae.arrays import FloatArray
-from drake_dae.robots.links.tree import Link, link_poses, symmetric, zeros
+from drake_dae.robots.links.tree import TreeLink, link_poses, symmetric, zeros
 
 
-def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
+def mass_matrix(links: Sequence[TreeLink], reflected_inertia: FloatArray) -> ca.SX:
     """M, shape (nv, nv), by the composite rigid body algorithm.
 
     Args:
@@ -45,7 +45,7 @@ def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
     return ca.sparsify(symmetric(M))
 
 
-def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) -> ca.SX:
+def frame_jacobian(links: Sequence[TreeLink], index: int, origin: ca.SX, size: int) -> ca.SX:
     """The Jacobian of a frame: its motion in the world per unit of each entry of v.
 
     Args:
@@ -91,7 +91,7 @@ class LinkKinematics:
 
 
 def link_kinematics(
-    links: Sequence[Link], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
+    links: Sequence[TreeLink], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
 ) -> list[LinkKinematics]:
     """The motion of every link.
 
@@ -128,7 +128,7 @@ def link_kinematics(
 
 
 def inverse_dynamics(
-    links: Sequence[Link],
+    links: Sequence[TreeLink],
     moving: Sequence[LinkKinematics],
     gravity: FloatArray,
     size: int,

@@ -69,7 +69,7 @@ class Inertia:
 
 
 @dataclass(eq=False)
-class Link:
+class TreeLink:
     """A frame that one elementary joint moves, with the inertia of the bodies fixed to it.
 
     Attributes:
@@ -100,7 +100,7 @@ class Link:
     @classmethod
     def moved(
         cls, parent: int, fixed: FloatArray, offset: FloatArray, joint: ElementaryJoint, q: ca.SX
-    ) -> "Link":
+    ) -> "TreeLink":
         """A link without inertia that `joint` moves, starting at a constant pose in P."""
         if joint.axis is None:
             directions = ca.SX(fixed @ joint.directions)
@@ -150,7 +150,7 @@ class Link:
         return result
 
 
-def link_poses(links: Sequence[Link]) -> list[tuple[ca.SX, ca.SX]]:
+def link_poses(links: Sequence[TreeLink]) -> list[tuple[ca.SX, ca.SX]]:
     """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
     poses = [(ca.SX(np.eye(3)), zeros(3))]
     for link in links[1:]:

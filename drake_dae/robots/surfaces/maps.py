@@ -18,7 +18,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.height_file import height_table, read_heights
 from drake_dae.robots.surfaces.mesh_file import heights_of_mesh, read_mesh
-from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
+from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.relief import CELLS, Relief, fit_relief
 from drake_dae.robots.surfaces.surface import Surface, Vector, tangents, triple, unit_vector
 
@@ -61,13 +61,13 @@ class _Map(Surface):
     def remark(self) -> str:
         """The deviation from its data, as text."""
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
         sides = self.relief.x, self.relief.y
         x, y = (np.linspace(side[0], side[1], 3 * CELLS + 1) for side in sides)
         along, across = tangents(self.normal)
         places = x[:, None] * along + y[:, None, None] * across
         points = places + self.relief.heights(x, y)[..., None] * np.array(self.normal)
-        return Picture(mesh_of_grid(points), RigidTransform())
+        return PosedShape(mesh_of_grid(points), RigidTransform())
 
     def _remark_of(self, source: str) -> str:
         width = max(bells.width for bells in self.relief.bells)

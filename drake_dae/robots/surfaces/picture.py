@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PosedShape:
     """A form with a pose in the world.
 
     Attributes:
@@ -21,9 +21,9 @@ class Picture:
     form: Shape | TriangleSurfaceMesh
     pose: RigidTransform
 
-    def moved(self, pose: RigidTransform) -> "Picture":
+    def moved(self, pose: RigidTransform) -> "PosedShape":
         """The same form with its world frame moved to a pose."""
-        return Picture(self.form, pose @ self.pose)
+        return PosedShape(self.form, pose @ self.pose)
 
 
 def mesh_of_grid(points: FloatArray) -> TriangleSurfaceMesh:

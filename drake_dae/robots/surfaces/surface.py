@@ -15,7 +15,7 @@ from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
+from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 from drake_dae.trace.smoothness import length_of
@@ -101,7 +101,7 @@ class Surface(ABC):
         p = ca.SX.sym("p", 3)
         return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
 
-    def picture(self, center: ArrayLike, size: float) -> Picture | None:
+    def picture(self, center: ArrayLike, size: float) -> PosedShape | None:
         """The visible form of the surface, with its reference point at the origin.
 
         Warns if Newton's method finds no point of it near the center; then it is not drawn.
@@ -118,9 +118,9 @@ class Surface(ABC):
                 stacklevel=2,
             )
             return None
-        return Picture(mesh_of_grid(grid), RigidTransform())
+        return PosedShape(mesh_of_grid(grid), RigidTransform())
 
-    def solid(self) -> Picture | None:
+    def solid(self) -> PosedShape | None:
         """The solid below the surface, with its reference point at the origin."""
         return None
 

@@ -13,7 +13,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
+from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import (
     Surface,
     Vector,
@@ -55,16 +55,16 @@ class Plane(Surface):
     def coordinates(self, offset: ca.SX) -> ca.SX:
         return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
         normal, thickness = np.array(self.normal), 0.01 * size
         foot = center - np.dot(center, normal) * normal
         # The upper side of a thin box.
         pose = RigidTransform(RotationMatrix(axes_along(normal)), foot - thickness / 2 * normal)
-        return Picture(geometry.Box(size, size, thickness), pose)
+        return PosedShape(geometry.Box(size, size, thickness), pose)
 
-    def solid(self) -> Picture:
+    def solid(self) -> PosedShape:
         pose = RigidTransform(RotationMatrix(axes_along(self.normal)), np.zeros(3))
-        return Picture(geometry.HalfSpace(), pose)
+        return PosedShape(geometry.HalfSpace(), pose)
 
 
 @checked(ModelError)
@@ -104,11 +104,11 @@ class Sphere(Surface):
         x, y, z = _components(self.axis, offset)
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
-        return Picture(geometry.Sphere(self.radius), RigidTransform())
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
+        return PosedShape(geometry.Sphere(self.radius), RigidTransform())
 
-    def solid(self) -> Picture | None:
-        return None if self.inside else Picture(geometry.Sphere(self.radius), RigidTransform())
+    def solid(self) -> PosedShape | None:
+        return None if self.inside else PosedShape(geometry.Sphere(self.radius), RigidTransform())
 
 
 @checked(ModelError)
@@ -156,10 +156,10 @@ class Cylinder(Surface):
         x, y, z = _components(self.axis, offset, self.zero)
         return ca.vertcat(ca.atan2(y, x), z)
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
         axis = np.array(self.axis)
         pose = RigidTransform(RotationMatrix(axes_along(axis)), np.dot(center, axis) * axis)
-        return Picture(geometry.Cylinder(self.radius, size), pose)
+        return PosedShape(geometry.Cylinder(self.radius, size), pose)
 
 
 @checked(ModelError)
@@ -200,8 +200,8 @@ class Ellipsoid(Surface):
         x, y, z = ca.vertsplit(offset / ca.DM(self.semi_axes))
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
-        return Picture(geometry.Ellipsoid(*self.semi_axes), RigidTransform())
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
+        return PosedShape(geometry.Ellipsoid(*self.semi_axes), RigidTransform())
 
 
 @checked(ModelError)
@@ -250,13 +250,13 @@ class Torus(Surface):
         x, y, z = _components(self.axis, offset)
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2) - self.major_radius))
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
         ring, tube = np.meshgrid(np.linspace(0, 2 * np.pi, 61), np.linspace(0, 2 * np.pi, 31))
         radial = self.major_radius + self.minor_radius * np.cos(tube)
         height = self.minor_radius * np.sin(tube)
         points = np.stack([radial * np.cos(ring), radial * np.sin(ring), height], axis=-1)
         pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
-        return Picture(mesh_of_grid(points), pose)
+        return PosedShape(mesh_of_grid(points), pose)
 
 
 def _components(

@@ -15,7 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.bench.description import Bench, as_script, bench_of, shown_function
-from drake_dae.running.export.steps.boundary import Part, loop_part
+from drake_dae.running.export.steps.boundary import ExportedPart, loop_part
 from drake_dae.running.export.steps.integrated import write_integrated
 from drake_dae.running.export.steps.parts import LOOP
 from drake_dae.running.export.wasm.wasm import write_module
@@ -133,7 +133,7 @@ def _with_shared_bundle(page: str, target: Path, bundle: Path) -> str:
     return f'{before}<script src="{address}">{_END}{after}'
 
 
-def _shown(bench: Bench, part: Part) -> ca.Function:
+def _shown(bench: Bench, part: ExportedPart) -> ca.Function:
     """(all outputs, all parameters) of the exported loop -> what the bench shows."""
     sizes = {name: len(signals) for name, signals in part.outputs.items()}
     row = ca.SX.sym("row", sum(sizes.values()))
@@ -146,7 +146,7 @@ def _shown(bench: Bench, part: Part) -> ca.Function:
     return ca.Function("shown", [row, parameters], value)
 
 
-def _places(bench: Bench, part: Part) -> list[int]:
+def _places(bench: Bench, part: ExportedPart) -> list[int]:
     """Where each of the inputs stands among the parameters of the exported loop."""
     starts = {system: place.start for system, place in part.compiled.parameters}
     inputs, found = bench.controls.inputs, list[int]()

@@ -16,7 +16,15 @@ from drake_dae.errors import ModelError
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.samples import samples, tests
 from drake_dae.running.export.steps.words import file_of, parameter_names, prefix_of
-from drake_dae.running.export.text import Call, Vector, braced, comment, generated, string, written
+from drake_dae.running.export.text import (
+    CFunction,
+    Vector,
+    braced,
+    comment,
+    generated,
+    string,
+    written,
+)
 from drake_dae.running.export.whole import whole_calls, whole_vectors
 from drake_dae.trace.functions import TracedFunction
 
@@ -133,7 +141,7 @@ def _vectors(
     return vectors
 
 
-def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
+def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, CFunction]:
     """The functions of the C code, by their names there."""
     system, derivatives = structure.system, structure.derivatives
     force = derivatives.expand(derivatives.constraint_input)
@@ -162,10 +170,10 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
         for names in (law.function.input_names, law.function.output_names)
     )
     return {
-        "law": Call(law.function, read, shown),
-        "plant": Call(plant, plant.input_names, plant.output_names),
-        "residual": Call(residual, residual.input_names, residual.output_names),
-        "newton_step": Call(step, step.input_names, step.output_names),
+        "law": CFunction(law.function, read, shown),
+        "plant": CFunction(plant, plant.input_names, plant.output_names),
+        "residual": CFunction(residual, residual.input_names, residual.output_names),
+        "newton_step": CFunction(step, step.input_names, step.output_names),
     }
 
 
@@ -203,7 +211,7 @@ def _defined(prefix: str, name: str, vector: Vector) -> str:
     return "\n".join([*lines, ""])
 
 
-def _called(prefix: str, name: str, call: Call) -> str:
+def _called(prefix: str, name: str, call: CFunction) -> str:
     """The C function that calls what CasADi generated."""
     traced = f"{prefix}_traced_{name}"
     function = call.function.function

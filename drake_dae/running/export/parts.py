@@ -16,7 +16,7 @@ from drake_dae.running.rollout.program import program_of
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class LoopParts:
     """A diagram with one plant and one law.
 
     Attributes:
@@ -49,7 +49,7 @@ class Parts:
         return reference
 
 
-def parts_of(loop: ClosedLoop | Diagram) -> Parts:
+def parts_of(loop: ClosedLoop | Diagram) -> LoopParts:
     """The parts of a closed loop or of a diagram.
 
     Raises:
@@ -62,7 +62,7 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
             compiled = None
         if compiled is not None and (compiled.changes or compiled.has_stepped):
             compiled = None
-        return Parts(loop.plant, loop.controller, loop.diagram, compiled)
+        return LoopParts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)
     if compiled.changes:
         names = ", ".join(system.get_name() for system, _ in (*compiled.guards, *compiled.watched))
@@ -84,4 +84,4 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
             f"{len(laws)} laws that lead to its output ports. Export the output ports of what it "
             "should compute"
         )
-    return Parts(plants[0], laws[0], loop, compiled)
+    return LoopParts(plants[0], laws[0], loop, compiled)

@@ -8,8 +8,8 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.running.export.parts import Parts
-from drake_dae.running.export.text import Call, braced
+from drake_dae.running.export.parts import LoopParts
+from drake_dae.running.export.text import CFunction, braced
 from drake_dae.running.export.whole import whole_values
 
 SAMPLES = 10
@@ -17,7 +17,7 @@ SAMPLES = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class FunctionSample:
     """Inputs and outputs of a function, by the names of its arguments.
 
     Attributes:
@@ -32,7 +32,9 @@ class Sample:
     scales: Mapping[str, float]
 
 
-def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[str, list[Sample]]:
+def samples(
+    parts: LoopParts, context: Context, calls: Mapping[str, CFunction]
+) -> dict[str, list[FunctionSample]]:
     """Inputs and outputs of all functions: at the start, and at states near and on N*.
 
     Raises:
@@ -45,7 +47,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
     start, given = plant.state(own), plant.current_parameters(own)
     model = controller.all_parameters(controller.GetMyContextFromRoot(context))
     states = [start, *plant.structure.states][:SAMPLES]
-    found: dict[str, list[Sample]] = {name: [] for name in (*calls, "project")}
+    found: dict[str, list[FunctionSample]] = {name: [] for name in (*calls, "project")}
     for index, state in enumerate(states):
         near = state + 1e-4 * random.normal(size=state.size) * np.maximum(1.0, np.abs(state))
         time = context.get_time() + 0.1 * index
@@ -74,7 +76,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
                 continue
             outputs = dict(zip(call.outputs, results, strict=True))
             inputs = {source: values[source] for source in call.inputs}
-            found[name].append(Sample(inputs, outputs, _scales(call, inputs, outputs)))
+            found[name].append(FunctionSample(inputs, outputs, _scales(call, inputs, outputs)))
             if name == "law" and "control" in outputs:
                 values["control"] = outputs["control"]
         try:
@@ -82,7 +84,9 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
         except InconsistentStateError:
             continue
         inputs, size = {"state": near, "parameters": given}, np.max(np.abs(projected), initial=0.0)
-        found["project"].append(Sample(inputs, {"projected": projected}, {"projected": size}))
+        found["project"].append(
+            FunctionSample(inputs, {"projected": projected}, {"projected": size})
+        )
     empty = [name for name, samples in found.items() if not samples]
     if empty:
         raise ModelError(
@@ -93,7 +97,7 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
 
 
 def _scales(
-    call: Call, inputs: Mapping[str, FloatArray], outputs: Mapping[str, FloatArray]
+    call: CFunction, inputs: Mapping[str, FloatArray], outputs: Mapping[str, FloatArray]
 ) -> dict[str, float]:
     """The scales of a sample."""
     random, share = np.random.default_rng(0), 1e-7
@@ -113,7 +117,7 @@ def _scales(
 
 
 def tests(
-    prefix: str, calls: Mapping[str, Call], samples: Mapping[str, Sequence[Sample]]
+    prefix: str, calls: Mapping[str, CFunction], samples: Mapping[str, Sequence[FunctionSample]]
 ) -> dict[str, str]:
     """The data of the test program, and its comparisons."""
     data, checks = [], []
@@ -124,7 +128,9 @@ def tests(
         data.append(f"static const double {name}[{len(rows)}][{width}] = {{\n{lines}}};\n")
         return f"{name}[k]"
 
-    def compare(what: str, wanted: str, rows: Sequence[FloatArray], own: Sequence[Sample]) -> str:
+    def compare(
+        what: str, wanted: str, rows: Sequence[FloatArray], own: Sequence[FunctionSample]
+    ) -> str:
         scale = float(max(sample.scales[what] for sample in own))
         place = f"k, {rows[0].size}, found_{what}, {wanted}, {scale!r}"
         return f'      failures += differs("{what}", {place});'

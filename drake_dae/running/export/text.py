@@ -30,7 +30,7 @@ class Vector:
 
 
 @dataclass(frozen=True, eq=False)
-class Call:
+class CFunction:
     """A function of the C code.
 
     Attributes:

@@ -7,9 +7,9 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
-from drake_dae.compiler.rates import Place
+from drake_dae.compiler.rates import ColumnPlace
 from drake_dae.dae.system.signals import Signal
-from drake_dae.running.export.text import Call, Vector
+from drake_dae.running.export.text import CFunction, Vector
 from drake_dae.trace.functions import TracedFunction
 
 ARGUMENTS = ("time", "loop_state", "loop_held", "loop_parameters")
@@ -53,7 +53,7 @@ def whole_vectors(compiled: CompiledDiagram, parameters: FloatArray) -> dict[str
     return found
 
 
-def whole_calls(compiled: CompiledDiagram) -> dict[str, Call]:
+def whole_calls(compiled: CompiledDiagram) -> dict[str, CFunction]:
     """The functions of the diagram, by their names in C."""
     calls = {
         "loop_rate": _call("loop_rate", compiled.rate, ARGUMENTS),
@@ -84,7 +84,7 @@ def whole_values(
     return {"loop_state": found, "loop_held": held, "loop_noise": noise}
 
 
-def _call(name: str, function: ca.Function, inputs: Sequence[str]) -> Call:
+def _call(name: str, function: ca.Function, inputs: Sequence[str]) -> CFunction:
     """A function of the diagram, whose pivot is 0 where its values are of no use."""
     symbols = {key: ca.SX.sym(key, function.numel_in(i)) for i, key in enumerate(inputs)}
     given = list(symbols.values())
@@ -93,11 +93,11 @@ def _call(name: str, function: ca.Function, inputs: Sequence[str]) -> Call:
     value, valid = function.call(given)
     regular = ca.if_else(ca.fabs(valid) < np.inf, 1.0, 0.0)
     traced = TracedFunction(name, symbols, {name: value}, regular, often=False)
-    return Call(traced, list(inputs), [name])
+    return CFunction(traced, list(inputs), [name])
 
 
 def signals_of(
-    compiled: CompiledDiagram, places: Sequence[Place], size: int, what: str
+    compiled: CompiledDiagram, places: Sequence[ColumnPlace], size: int, what: str
 ) -> list[Signal]:
     """Names and units of the entries of a column of a diagram.
 

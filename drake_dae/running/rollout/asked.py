@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.rollout.lanes import library as lanes
 from drake_dae.running.rollout.problems import checked_times
-from drake_dae.running.rollout.program import Program, program_of
+from drake_dae.running.rollout.program import RolloutProgram, program_of
 from drake_dae.running.rollout.run import Settings
 from drake_dae.running.rollout.stepping import machine
 from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
@@ -28,7 +28,7 @@ FASTER = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class RolloutRequest:
     """How runs are made, as `run_loop` is asked.
 
     Attributes:
@@ -39,7 +39,7 @@ class Asked:
         lasting: As of `run_loop`.
     """
 
-    program: Program
+    program: RolloutProgram
     times: FloatArray
     choice: Compiled
     settings: Settings
@@ -71,7 +71,7 @@ class Asked:
         settings = Settings.of(config, program.compiled.scale, looked)
         return cls(program, moments, choice, settings, lasting)
 
-    def machine_code(self, program: Program, count: int) -> machine.Library | None:
+    def machine_code(self, program: RolloutProgram, count: int) -> machine.Library | None:
         """A diagram as machine code, by the choice and by what its runs take without.
 
         Where it does not pay to make it, the cache is looked into if these runs are all.
@@ -82,7 +82,7 @@ class Asked:
             program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
         return program.library
 
-    def lanes(self, program: Program, count: int) -> machine.Library | None:
+    def lanes(self, program: RolloutProgram, count: int) -> machine.Library | None:
         """The same for runs side by side."""
         can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
         if not can_run or not self._is_sought(program, count, FASTER):
@@ -90,10 +90,10 @@ class Asked:
         make = self._pays(program, count, FASTER)
         return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
 
-    def _is_sought(self, program: Program, count: int, saved: float) -> bool:
+    def _is_sought(self, program: RolloutProgram, count: int, saved: float) -> bool:
         return self.lasting is None or self._pays(program, count, saved)
 
-    def _pays(self, program: Program, count: int, saved: float) -> bool:
+    def _pays(self, program: RolloutProgram, count: int, saved: float) -> bool:
         """Whether to make machine code that saves a part of each interpreted evaluation."""
         if self.choice is True:
             return True
@@ -107,7 +107,7 @@ class Asked:
 
 
 def record_of(
-    program: Program,
+    program: RolloutProgram,
     times: FloatArray,
     rows: FloatArray,
     after: float | None = None,

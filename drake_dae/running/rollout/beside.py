@@ -9,9 +9,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
-from drake_dae.running.rollout.stepping.called import Called
-from drake_dae.running.rollout.stepping.fused import Fused
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.stepping.called import BufferedFunction
+from drake_dae.running.rollout.stepping.fused import DiagramFunctions
 from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
 
@@ -19,7 +19,9 @@ LOOKED = 64
 """The number of samples after which a run checks for Ctrl-C and divergence."""
 
 
-def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: Settings) -> Run:
+def run_beside(
+    fused: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
+) -> Run:
     """Runs a diagram in which Drake steps one block, and no block has a continuous state.
 
     At each sample, the input of that block and the unrestricted updates are computed from the
@@ -32,11 +34,11 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
         problem: What to run.
         settings: Its `look` says whether to stop.
     """
-    plant = _Steps(fused, problem)
+    plant = _DrakeSteps(fused, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
     kept = np.empty((times.size, held.size))
     rows = count = 0
-    ending, error, moment = Ending.DONE, None, float(times[0])
+    ending, error, moment = RunEnding.DONE, None, float(times[0])
     take = _sampler(fused, code, problem, held)
 
     def written() -> FloatArray:
@@ -51,7 +53,7 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
         if rows == times.size:
             break
         if count % LOOKED == 0 and settings.look(written, problem.context):
-            ending = Ending.PAUSED
+            ending = RunEnding.PAUSED
             break
         moment, due = float(at), int(problem.due[count])
         try:
@@ -60,24 +62,24 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
                 held[plant.places] = plant.after(moment)
             good = good and take(moment, count, due, False, plant.input)
         except SimulationError as found:
-            ending, error = Ending.STUCK, found
+            ending, error = RunEnding.STUCK, found
             break
         except RuntimeError as found:  # Of Drake, as where its contact solver finds no step.
             state = held[plant.places]
-            ending, error = Ending.STUCK, cannot_go_on(moment, state, str(found))
+            ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(found))
             break
         if not good:
-            ending = Ending.INVALID
+            ending = RunEnding.INVALID
             break
         count += 1
     given = moment, none, held, count, count, moment, np.inf, 0.0, none
     return Run(written(), ending, *given, error=error)
 
 
-class _Steps:
+class _DrakeSteps:
     """The block that Drake steps, in a context of its own."""
 
-    def __init__(self, fused: Fused, problem: Problem) -> None:
+    def __init__(self, fused: DiagramFunctions, problem: RunProblem) -> None:
         compiled = fused.program.compiled
         rate, block = compiled.stepped
         assert block.stepped is not None
@@ -104,7 +106,7 @@ class _Steps:
 
 
 def _sampler(
-    fused: Fused, code: Library | None, problem: Problem, held: FloatArray
+    fused: DiagramFunctions, code: Library | None, problem: RunProblem, held: FloatArray
 ) -> Callable[[float, int, int, bool, FloatArray], bool]:
     """A function that makes the updates in `held` and returns whether all values are valid.
 
@@ -132,7 +134,7 @@ def _sampler(
             return not call(time, own, of_diagram, drawn, due, first, into.ctypes.data)
 
         return sample
-    read = Called(compiled.stepped[0].function)
+    read = BufferedFunction(compiled.stepped[0].function)
 
     def sample_slowly(time: float, index: int, due: int, first: bool, into: FloatArray) -> bool:
         valid, noise = np.zeros(1), problem.noise[index]

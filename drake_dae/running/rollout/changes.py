@@ -10,8 +10,8 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.run import Ending, Problem, Run, Tableau
-from drake_dae.running.rollout.stepping.fused import Fused, Seen
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
+from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
 from drake_dae.systems.blocks.trials import SLOWEST
 
 WINDOW = 1e-13
@@ -33,14 +33,14 @@ _CONTROLLED = Tableau(DOP853.A[:12, :12], DOP853.B, DOP853.C[:12])
 class _Changes:
     """A run in pieces, from change to change; see `run_with_changes`."""
 
-    fused: Fused
-    problem: Problem
+    fused: DiagramFunctions
+    problem: RunProblem
     tableau: Tableau
     is_controlled: bool
     repeated: int = 0
     context: Context = field(init=False)
 
-    def begin(self) -> tuple[Run, Problem | None]:
+    def begin(self) -> tuple[Run, RunProblem | None]:
         """A run without steps, and how it goes on after what blocks do when it begins, if it does.
 
         Raises:
@@ -57,15 +57,15 @@ class _Changes:
             (0, 0, start, start, np.inf, nowhere),
             np.zeros((0, self.fused.program.width)),
         )
-        begun = Run(none, Ending.DONE, start, problem.state, problem.held, *counts)
+        begun = Run(none, RunEnding.DONE, start, problem.state, problem.held, *counts)
         try:
             compiled.diagram.ExecuteInitializationEvents(self.context)
         except SimulationError as error:
-            return replace(begun, ending=Ending.STUCK, error=error), None
+            return replace(begun, ending=RunEnding.STUCK, error=error), None
         state, held = compiled.start(self.context)
         return begun, replace(problem, state=state, held=held, context=self.context)
 
-    def make(self, run: Run, piece: Problem) -> tuple[Run, Problem | None]:
+    def make(self, run: Run, piece: RunProblem) -> tuple[Run, RunProblem | None]:
         """What a run comes to with the change that ended it, and how it goes on, if it does.
 
         The rows are those between the last step and the change.
@@ -85,9 +85,9 @@ class _Changes:
             else:
                 state, held, goes_on = self.react(moment, state, held)
         except SimulationError as error:
-            failed = replace(run, rows=rows, ending=Ending.STUCK, time=moment, state=state)
+            failed = replace(run, rows=rows, ending=RunEnding.STUCK, time=moment, state=state)
             return replace(failed, error=error), None
-        ending = Ending.DONE if goes_on else Ending.STOPPED
+        ending = RunEnding.DONE if goes_on else RunEnding.STOPPED
         after = replace(run, rows=rows, ending=ending, time=moment, state=state, held=held)
         if is_sample and not left.size:  # The last row comes after what happens then.
             given = np.array([moment]), state[None], held[None], self.problem.parameters
@@ -115,7 +115,7 @@ class _Changes:
         is_same = np.allclose(state, run.state, 1e-12, 1e-12) and np.array_equal(held, run.held)
         return self.repeated >= MOST_REPEATED or (time == run.time and is_same)
 
-    def sample(self, run: Run, piece: Problem) -> tuple[FloatArray, FloatArray, bool]:
+    def sample(self, run: Run, piece: RunProblem) -> tuple[FloatArray, FloatArray, bool]:
         """What `react` returns, where blocks react that look at their guards in samples.
 
         All unrestricted updates of the instant see what was before it.
@@ -216,13 +216,16 @@ class _Changes:
         return last, state
 
 
-def _least(seen: Seen, due: Booleans) -> float:
+def _least(seen: GuardInputs, due: Booleans) -> float:
     """The least of the margins that fall through zero; 0 where none does at both ends."""
     return float(np.min(seen.margins[due], initial=np.inf)) if due.any() else 0.0
 
 
 def run_with_changes(
-    fused: Fused, take: Callable[[Problem], Run], tableau: Tableau | None, problem: Problem
+    fused: DiagramFunctions,
+    take: Callable[[RunProblem], Run],
+    tableau: Tableau | None,
+    problem: RunProblem,
 ) -> Run:
     """A run in which blocks react, as Drake's Simulator lets them.
 
@@ -247,7 +250,7 @@ def run_with_changes(
         steps += run.steps
         # A piece begins with a row; after a change that is none of the record's.
         rows.append(run.rows[min(count, 1) :])
-        if run.ending is not Ending.CHANGE:
+        if run.ending is not RunEnding.CHANGE:
             break
         with _LOCK:
             run, piece = changes.make(run, piece)
@@ -255,7 +258,7 @@ def run_with_changes(
         count += 1
         if count % MOST == 0 and piece is not None:
             if run.time - mark < SLOWEST * (run.time - problem.times[0]):
-                run = replace(run, ending=Ending.SLOW, mark=mark)
+                run = replace(run, ending=RunEnding.SLOW, mark=mark)
                 break
             mark = run.time
     with _LOCK:

@@ -6,8 +6,8 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
-from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.run import Ending, Problem, Run
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
 from drake_dae.systems.blocks.failures import (
     cannot_go_on,
     endless_steps,
@@ -24,7 +24,7 @@ STATES = (STATE, "estimated_state")
 """Where the argument of a computation comes from that says where the system is."""
 
 
-def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
+def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> SimulationError:
     """The exception that the same run of Drake's raises.
 
     Args:
@@ -38,18 +38,18 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
     given = run.held, problem.parameters
     trial = _reason(program, run.trial_time, run.trial, *given) if run.trial_time else None
     match run.ending:
-        case Ending.OFF_MANIFOLD:
+        case RunEnding.OFF_MANIFOLD:
             try:
                 problem.project(run.time, run.state, run.held)
             except InconsistentStateError as error:
                 return off_manifold(run.time, state, error)
-        case Ending.SLOW:
+        case RunEnding.SLOW:
             return endless_steps(name, STEPS, run.mark, run.time, state)
-        case Ending.SPOILT:
+        case RunEnding.SPOILT:
             return spoilt_step(name, run.time, run.next, state, str(trial or ""))
-        case Ending.STUCK if trial is not None:
+        case RunEnding.STUCK if trial is not None:
             return no_step_leads_on(name, run.time, state, trial, str(trial))
-        case Ending.STUCK:
+        case RunEnding.STUCK:
             reason = "no step, however short, is as accurate as it should be"
             return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
     found = _reason(program, run.time, run.state, *given) or trial
@@ -59,7 +59,11 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
 
 
 def _reason(
-    program: Program, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    program: RolloutProgram,
+    time: float,
+    state: FloatArray,
+    held: FloatArray,
+    parameters: FloatArray,
 ) -> SimulationError | None:
     """What is wrong at a time and state; None if nothing is."""
     if not np.isfinite(state).all():

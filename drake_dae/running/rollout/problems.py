@@ -16,8 +16,8 @@ from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.events import Events, Seed, events_of, noise_of
-from drake_dae.running.rollout.program import Program, program_of
-from drake_dae.running.rollout.run import Problem
+from drake_dae.running.rollout.program import RolloutProgram, program_of
+from drake_dae.running.rollout.run import RunProblem
 from drake_dae.systems.blocks.traced import Block
 
 
@@ -102,9 +102,9 @@ class Problems:
     def __len__(self) -> int:
         return len(self.states)
 
-    def __getitem__(self, index: int) -> Problem:
+    def __getitem__(self, index: int) -> RunProblem:
         row = self._row(self.parameters, index)
-        return Problem(
+        return RunProblem(
             self.times,
             self.states[index],
             self.held[index],
@@ -150,7 +150,7 @@ class Problems:
 
 
 def problems_of(
-    program: Program,
+    program: RolloutProgram,
     starts: ArrayLike,
     parameters: ArrayLike | None,
     times: FloatArray,

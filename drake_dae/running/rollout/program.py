@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class Program:
+class RolloutProgram:
     """A diagram as a rollout steps it.
 
     Attributes:
@@ -54,10 +54,10 @@ class Program:
         return found
 
     @property
-    def twins(self) -> "Program":
+    def twins(self) -> "RolloutProgram":
         """The same where plants and laws of one model have the same numbers."""
 
-        def make() -> Program:
+        def make() -> RolloutProgram:
             found = with_twins(self.compiled)
             if found is self.compiled:
                 return self
@@ -101,7 +101,7 @@ class Program:
         return sum(int(function.n_instructions()) for function in self.functions.values())
 
 
-def program_of(loop: ClosedLoop | Diagram) -> Program:
+def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
     """The program of a closed loop or of any diagram, made once.
 
     Raises:
@@ -115,15 +115,15 @@ def program_of(loop: ClosedLoop | Diagram) -> Program:
                 "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
             )
         name = loop.get_name() or "the diagram"
-        return Program(compiled, compiled.signals, lambda record, context: record, name)
+        return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
     if "program" not in loop.memory:
         compiled = compile_diagram(loop.diagram, list(loop.signals))
         name, choice = loop.plant.get_name(), loop.plant.dae.compiled
         complete = partial(_completed, loop)
         ends_updated = not loop.plant.time_step
         given = compiled, loop.signals, complete, name, choice, ends_updated
-        loop.memory["program"] = Program(*given)
-    found: Program = loop.memory["program"]
+        loop.memory["program"] = RolloutProgram(*given)
+    found: RolloutProgram = loop.memory["program"]
     return found
 
 

@@ -15,7 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.rollout.asked import Asked, record_of
+from drake_dae.running.rollout.asked import RolloutRequest, record_of
 from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
@@ -23,10 +23,10 @@ from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
 from drake_dae.running.rollout.lanes.device import find_device, run_on_device
 from drake_dae.running.rollout.problems import Problems, problems_of
-from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
-from drake_dae.running.rollout.stepping.fused import Fused
+from drake_dae.running.rollout.stepping.fused import DiagramFunctions
 from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.trace.compiled import Compiled
 
@@ -50,7 +50,7 @@ class Rollout:
 
     steps: int
     failure: SimulationError | None
-    _program: Program = field(repr=False)
+    _program: RolloutProgram = field(repr=False)
     _times: FloatArray = field(repr=False)
     _rows: FloatArray = field(repr=False)
     context: Context | None = field(default=None, repr=False)
@@ -148,7 +148,7 @@ def run_loop(
     """
     if on_device:
         find_device()
-    asked = Asked.of(loop, times, config, compiled, lasting, look)
+    asked = RolloutRequest.of(loop, times, config, compiled, lasting, look)
     program = asked.program
     problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: dict[int, Rollout] = {}
@@ -189,7 +189,7 @@ def run_together(
     Raises:
         InconsistentStateError: A start is not on N*.
     """
-    asked = Asked.of(loop, times, config, None, lasting)
+    asked = RolloutRequest.of(loop, times, config, None, lasting)
     program = asked.program
     problems = problems_of(program, starts, parameters, asked.times, seeds)
     found: list[Rollout | None] = [None] * len(problems)
@@ -203,7 +203,7 @@ def run_together(
     return found
 
 
-def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarray]]:
+def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutProgram, np.ndarray]]:
     """The runs in which plant and law have the same numbers, and the others; each its program."""
     has_twins = problems.with_twins()
     found = []
@@ -214,14 +214,14 @@ def _kinds(program: Program, problems: Problems) -> list[tuple[Program, np.ndarr
     return found
 
 
-def _interpreted(program: Program, settings: Settings) -> Callable[..., Run]:
+def _interpreted(program: RolloutProgram, settings: Settings) -> Callable[..., Run]:
     """What runs a problem from its start, whatever it came to elsewhere."""
-    run = interpreted.runner(program.kept("fused", lambda: Fused(program)), settings)
+    run = interpreted.runner(program.kept("fused", lambda: DiagramFunctions(program)), settings)
     return lambda problem, *given: run(problem)
 
 
 def _runs(
-    program: Program,
+    program: RolloutProgram,
     problems: Problems,
     settings: Settings,
     code: machine.Library | None,
@@ -231,7 +231,7 @@ def _runs(
     if code is not None and side_by_side is not None:
         return run_many(side_by_side, code, program, problems, settings)
     if code is None or program.compiled.changes or program.compiled.has_stepped:
-        fused = program.kept("fused", lambda: Fused(program))
+        fused = program.kept("fused", lambda: DiagramFunctions(program))
         run = interpreted.runner(fused, settings)
     if code is not None:
         run = partial(machine.run, code, program, settings=settings)
@@ -246,8 +246,8 @@ def _runs(
         return list(pool.map(lambda index: run(problems[index]), range(len(problems))))
 
 
-def _result(program: Program, problems: Problems, index: int, run: Run) -> Rollout:
+def _result(program: RolloutProgram, problems: Problems, index: int, run: Run) -> Rollout:
     failure = None
-    if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
+    if run.ending not in (RunEnding.DONE, RunEnding.PAUSED, RunEnding.STOPPED):
         failure = failure_of(program, problems[index], run)
     return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)

@@ -54,7 +54,7 @@ FIXED = {
 """Drake's explicit schemes."""
 
 
-class Ending(IntEnum):
+class RunEnding(IntEnum):
     """How the stepping ended; stepper.c has the same list.
 
     At a CHANGE a block has to react before it goes on; a run is STOPPED by a block.
@@ -81,7 +81,7 @@ class Settings:
         absolute: The error that a step may make, for each state, shape (n,).
         relative: The same relative to the state.
         look: Called now and then with what returns the rows written up to then, and with the
-            context of `Problem`; whether to stop where the run is.
+            context of `RunProblem`; whether to stop where the run is.
     """
 
     longest: float
@@ -117,7 +117,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class RunProblem:
     """One run.
 
     Attributes:
@@ -172,7 +172,7 @@ class Run:
     """
 
     rows: FloatArray
-    ending: Ending
+    ending: RunEnding
     time: float
     state: FloatArray
     held: FloatArray

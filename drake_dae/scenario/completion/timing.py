@@ -18,7 +18,7 @@ from drake_dae.scenario.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedScenario:
     """The time-optimal motion of a scenario.
 
     Attributes:
@@ -39,7 +39,7 @@ MOST_CAUSES = 3
 
 def timed(
     scenario: Scenario, model: RobotModel, structure: Structure
-) -> tuple[Completed, Timed | None]:
+) -> tuple[Completed, TimedScenario | None]:
     """A scenario with the duration of its time-optimal motion, and this.
 
     Args:
@@ -97,7 +97,7 @@ def timed(
     if why_not and wanted.governor is None:
         notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
     governed = robot_motion_limits(model, **contacts) if is_governed else None
-    return Completed(scenario, tuple(notes)), Timed(reference, governed)
+    return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)
 
 
 def _why_not_governed(scenario: Scenario, reference: TimeOptimalReference) -> str:

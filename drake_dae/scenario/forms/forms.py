@@ -26,7 +26,7 @@ MOST_KNOWN = 1000
 """So many parts are kept while scenarios are read that have parts in common."""
 
 
-class Reading(NamedTuple):
+class ReadingContext(NamedTuple):
     """What reading depends on besides the data.
 
     Attributes:

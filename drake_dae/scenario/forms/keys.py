@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.errors import AssumptionError, DrakeDaeError, ScenarioError
 
 T = TypeVar("T")
@@ -32,26 +32,26 @@ def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
 
 
 _REMEDIES = {
-    Cause.CONSTRAINT_DEGREE: (
+    ViolationKind.CONSTRAINT_DEGREE: (
         "Start elsewhere, by start.positions, or write the constraint so that its gradient does "
         "not vanish"
     ),
-    Cause.OUTPUT_DEGREE: "Choose another output, or start elsewhere, by start.positions",
-    Cause.EARLY_CONTROL: (
+    ViolationKind.OUTPUT_DEGREE: "Choose another output, or start elsewhere, by start.positions",
+    ViolationKind.EARLY_CONTROL: (
         "The constraint then binds the control instead of the state. Take that one out of "
         "robot.actuators, or add a stage under actuation"
     ),
-    Cause.REDUNDANT: (
+    ViolationKind.REDUNDANT: (
         "The constraints are redundant at every state: the distribution of the forces among them "
         "is not determined. Take a redundant one out, or write compliances: {}, which has the "
         "forces shared by least squares"
     ),
-    Cause.NUMBERS: (
+    ViolationKind.NUMBERS: (
         "The structure must be the same for all parameter values of the robot. Give such a "
         "number another value where it is written, away from the one at which it changes, or "
         "give its range under bounds; or choose another output or constraint"
     ),
-    Cause.CONTROL_RANK: (
+    ViolationKind.CONTROL_RANK: (
         "An output may repeat a constraint or another output; choose others. Or the robot is in "
         "a singular configuration, such as a stretched arm: give start.positions of another "
         "configuration"

@@ -8,7 +8,7 @@ import pydantic
 
 from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.forms import Form, Reading
+from drake_dae.scenario.forms.forms import Form, ReadingContext
 from drake_dae.scenario.forms.problems import problem, with_parts
 
 T = TypeVar("T")
@@ -30,7 +30,7 @@ class Reader(Generic[T]):
         Args:
             data: The plain data.
             folder: The folder of relative file names; None for the working directory.
-            known: As of `Reading`.
+            known: As of `ReadingContext`.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
@@ -43,7 +43,7 @@ class Reader(Generic[T]):
             text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
             raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
-            return self._adapter.validate_python(data, context=Reading(folder, known))
+            return self._adapter.validate_python(data, context=ReadingContext(folder, known))
         except pydantic.ValidationError as error:
             # Each member of a Union reports the same.
             problems = dict.fromkeys(

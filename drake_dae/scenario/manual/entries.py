@@ -30,7 +30,7 @@ _UNIT = re.compile(
 
 
 @dataclass(frozen=True)
-class Key:
+class ManualKey:
     """A key of a form.
 
     Attributes:
@@ -51,7 +51,7 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ManualEntry:
     """A form of a scenario: a mapping with keys of its own.
 
     Attributes:
@@ -67,7 +67,7 @@ class Entry:
     title: str
     where: str
     text: str
-    keys: tuple[Key, ...]
+    keys: tuple[ManualKey, ...]
     examples: tuple[Mapping[str, Any], ...]
     data: Any
     path: tuple[str | int, ...]
@@ -78,7 +78,7 @@ class Entry:
 
 
 @cache
-def entries() -> tuple[Entry, ...]:
+def entries() -> tuple[ManualEntry, ...]:
     """Each form of a scenario once, in the order in which they stand."""
     examples = load_yaml(EXAMPLES.read_text("utf-8"), EXAMPLES.name)
     return tuple(_entries(scenario_schema(), None, (), examples, set()))
@@ -90,7 +90,7 @@ def _entries(
     path: tuple[str | int, ...],
     examples: Mapping[str, Any],
     seen: set[str],
-) -> Iterator[Entry]:
+) -> Iterator[ManualEntry]:
     """The forms within a schema, whose value stands in data at a path, but those seen before."""
     for one in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
         yield from _entries(one, data, path, examples, seen)
@@ -111,7 +111,7 @@ def _entries(
     given = tuple({**tag, **example} for example in (given if isinstance(given, list) else [given]))
     required = [name for name in schema.get("required", ()) if name != TAG]
     keys = tuple(
-        Key(
+        ManualKey(
             name,
             inner.get("description", ""),
             _takes(inner),
@@ -123,7 +123,7 @@ def _entries(
         if name != TAG
     )
     where = ".".join("*" if part in (0, "any") else str(part) for part in path)
-    yield Entry(title, where, schema["description"], keys, given, data, path)
+    yield ManualEntry(title, where, schema["description"], keys, given, data, path)
     for name, inner in properties.items():
         if name != TAG:
             inside = _with(data, path, {**given[0], name: None})

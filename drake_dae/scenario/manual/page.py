@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from drake_dae.scenario.forms.typed_yaml import dump_yaml
-from drake_dae.scenario.manual.entries import NOTHING, OWN, Entry, Key, entries
+from drake_dae.scenario.manual.entries import NOTHING, OWN, ManualEntry, ManualKey, entries
 from drake_dae.scenario.manual.schema import custom_tags
 
 _HEAD = """# The keys of a scenario
@@ -29,7 +29,7 @@ def keys_page() -> str:
     return "\n".join([_HEAD.replace("{tags}", tags), *map(_section, entries())])
 
 
-def _section(entry: Entry) -> str:
+def _section(entry: ManualEntry) -> str:
     where = f"At `{entry.where}`. " if entry.where else ""
     paragraphs = entry.text.split("\n\n")
     # Formulas are for readers of the code.
@@ -44,7 +44,7 @@ def _section(entry: Entry) -> str:
     return "\n".join([f"## {entry.title}\n\n{where}{text}\n", *rows, f"\n```yaml\n{shown}```\n"])
 
 
-def _row(key: Key) -> str:
+def _row(key: ManualKey) -> str:
     text = _one_line(key.text.split("\n\n")[0])
     cells = f"`{key.name}`", key.takes, key.unit, _default(key.default), text
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

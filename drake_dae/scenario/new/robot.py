@@ -29,7 +29,7 @@ from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.loops import closing_joints
 from drake_dae.scenario.robot_file.packages import find_packages
 from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import Base, LeftOut, Robot
+from drake_dae.scenario.robot_file.robot import LeftOut, Robot, RobotPlacement
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
 """Names of grippers and wheels: such joints are locked, if others are left."""
@@ -226,7 +226,7 @@ def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
             )
     if roots:
         remarks["base"] = "nothing in the file holds it"
-        robot = replace(robot, base=Base(roots[0]))
+        robot = replace(robot, base=RobotPlacement(roots[0]))
     return robot, remarks
 
 

@@ -17,7 +17,7 @@ from drake_dae.scenario.robot_file.robot import Pose
 T = TypeVar("T")
 
 
-class Written(ABC, Generic[T]):
+class WrittenForm(ABC, Generic[T]):
     """What a scenario writes in another way than the library holds it."""
 
     @abstractmethod
@@ -32,13 +32,13 @@ class Written(ABC, Generic[T]):
         """
 
 
-def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
+def made(form: T | WrittenForm[T], constraints: Sequence[contact.Constraint]) -> T:
     """The library's object of a form; the library's own classes are their own forms."""
-    return form.made(constraints) if isinstance(form, Written) else form
+    return form.made(constraints) if isinstance(form, WrittenForm) else form
 
 
 @dataclass(frozen=True)
-class WeldedFrames(Written[contact.Constraint]):
+class WeldedFrames(WrittenForm[contact.Constraint]):
     """Frame B has a fixed pose in frame A, given by angles.
 
     Attributes:
@@ -60,7 +60,7 @@ class WeldedFrames(Written[contact.Constraint]):
 
 
 @dataclass(frozen=True)
-class SurfaceCoordinates(Written[outputs.PositionOutput]):
+class SurfaceCoordinates(WrittenForm[outputs.PositionOutput]):
     """The coordinates along a constraint.
 
     Attributes:
@@ -74,7 +74,7 @@ class SurfaceCoordinates(Written[outputs.PositionOutput]):
 
 
 @dataclass(frozen=True)
-class TiltFromNormal(Written[outputs.PositionOutput]):
+class TiltFromNormal(WrittenForm[outputs.PositionOutput]):
     """The tilt of a tool's axis from the surface normal at its contact.
 
     Attributes:

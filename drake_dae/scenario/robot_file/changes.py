@@ -27,7 +27,7 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
 from drake_dae.scenario.robot_file.payloads import add_payloads
 from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import Base, Robot
+from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 
 
 def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
@@ -84,7 +84,7 @@ def _read_couplings(robot: Robot) -> Sequence[Coupling]:
 
 
 @at("robot.base.weld")
-def weld_base(base: Base, plant: MultibodyPlant) -> None:
+def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
     """Welds a frame of a body without a joint to the world.
 
     Raises:

@@ -20,7 +20,7 @@ from drake_dae.scenario.robot_file.descriptions import find_description
 from drake_dae.scenario.robot_file.efforts import Efforts, limit_joints, read_efforts
 from drake_dae.scenario.robot_file.includes import check_includes
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
-from drake_dae.scenario.robot_file.readable.meshes import DRAWN, Copies, add_models
+from drake_dae.scenario.robot_file.readable.meshes import DRAWN, ReadableCopies, add_models
 from drake_dae.scenario.robot_file.readable.placing import add_floating_joints
 from drake_dae.scenario.robot_file.resources import check_resources, package_folder
 from drake_dae.scenario.robot_file.robot import Robot
@@ -82,7 +82,7 @@ def read_into(
     parser = Parser(plant)
     missing: dict[str, str] = {}
     placed = [robot.base.weld] if robot.base is not None else []
-    copies = Copies(robot.leave_out, [*placed, *robot.free])
+    copies = ReadableCopies(robot.leave_out, [*placed, *robot.free])
     with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
@@ -150,7 +150,7 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
-def _warn_of_repairs(copies: Copies, robot: Robot) -> None:
+def _warn_of_repairs(copies: ReadableCopies, robot: Robot) -> None:
     """Warns of impossible inertias, with their replacements."""
     if not copies.repaired:
         return
@@ -212,7 +212,7 @@ def _listed(files: list[Path]) -> str:
 
 
 @contextmanager
-def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
+def _drake_log(copies: ReadableCopies) -> Iterator["_Dropped"]:
     """Collects the messages of Drake's parser."""
     log = logging.getLogger("drake")
     level, dropped = log.level, _Dropped(log.getEffectiveLevel(), copies)
@@ -230,7 +230,7 @@ class _Dropped(logging.Filter):
 
     KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
 
-    def __init__(self, level: int, copies: Copies) -> None:
+    def __init__(self, level: int, copies: ReadableCopies) -> None:
         super().__init__()
         self._level = level
         self._copies = copies

@@ -29,7 +29,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Base:
+class RobotPlacement:
     """The placement of a robot whose file does not fix it to the world.
 
     Attributes:
@@ -127,7 +127,7 @@ class Robot:
     file: str = ""
     packages: dict[str, str] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
-    base: Annotated[Base, Form()] | None = None
+    base: Annotated[RobotPlacement, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
     leave_out: list[LeftOut] = field(default_factory=list)

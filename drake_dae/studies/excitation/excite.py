@@ -18,7 +18,7 @@ from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 from drake_dae.studies.excitation.excitation import Excitation
-from drake_dae.studies.excitation.promised import Criterion, Trial, Trials
+from drake_dae.studies.excitation.promised import Criterion, ScenarioRun, ScenarioRuns
 
 SPREAD = 0.4
 """This part of the runs is spread over the ranges; the others go on from the best of them."""
@@ -36,7 +36,7 @@ NOISY = ("position", "force")
 """What a noise may be given for."""
 
 
-class _Enough(Exception):
+class _SearchEnded(Exception):
     """The runs are spent, or a signal asks for the end."""
 
 
@@ -93,7 +93,7 @@ def excite(
     check_whole_number("seed", seed, 0)
     low, high = _ends(ranges)
     completed = complete_scenario(scenario).scenario
-    trials = Trials(completed, free, _noise(noise or {}))
+    trials = ScenarioRuns(completed, free, _noise(noise or {}))
     keys = list(ranges)
     for ends in (low, high):
         trials.check(dict(zip(keys, ends.tolist(), strict=True)))
@@ -101,9 +101,9 @@ def excite(
     if before.promised is None:
         (kind, text), *_ = before.problems.items()
         raise ModelError(f"the scenario itself {kind}: {text}")
-    best = _Best(trials, criterion, keys, (low, high), runs, before)
+    best = _BestRuns(trials, criterion, keys, (low, high), runs, before)
     bar = tqdm(total=runs, unit="run", disable=not (progress and sys.stderr.isatty()))
-    with bar, ending_signals(best.interruption), suppress(_Enough):
+    with bar, ending_signals(best.interruption), suppress(_SearchEnded):
         _search(lambda place: best.cost(place, bar), len(keys), runs, seed)
     if best.trial.problems or best.trial.promised is None:
         raise ModelError(
@@ -123,7 +123,7 @@ def excite(
     )
 
 
-class _Best:
+class _BestRuns:
     """The best of some runs.
 
     Attributes:
@@ -144,12 +144,12 @@ class _Best:
 
     def __init__(
         self,
-        trials: Trials,
+        trials: ScenarioRuns,
         criterion: Criterion,
         keys: Sequence[str],
         ends: tuple[FloatArray, FloatArray],
         runs: int,
-        before: Trial,
+        before: ScenarioRun,
     ) -> None:
         self._trials, self._criterion, self._keys = trials, criterion, keys
         self._ends, self._runs = ends, runs
@@ -164,7 +164,7 @@ class _Best:
             _Enough: The runs are spent, or a signal asks for the end.
         """
         if self.made >= self._runs or self.interruption.signal is not None:
-            raise _Enough
+            raise _SearchEnded
         low, high = self._ends
         values = np.clip(low + place * (high - low), low, high)
         changes = dict(zip(self._keys, values.tolist(), strict=True))
@@ -196,7 +196,7 @@ def _search(cost: Callable[[FloatArray], float], count: int, runs: int, seed: in
         place, step = found.x, FIRST_STEP * random.uniform(0.2, 1.0)
 
 
-def _cost(trial: Trial, criterion: Criterion) -> float:
+def _cost(trial: ScenarioRun, criterion: Criterion) -> float:
     """What is to be small: the logarithm of the criterion, and more with problems."""
     if trial.problems or trial.promised is None:
         return REFUSED * (1 + len(trial.problems))

@@ -20,8 +20,8 @@ from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits, shortfalls
 from drake_dae.studies.identification.channels import Channel
-from drake_dae.studies.identification.driven import Driven
-from drake_dae.studies.identification.fit import Fit
+from drake_dae.studies.identification.driven import DrivenPlant
+from drake_dae.studies.identification.fit import ParameterFit
 from drake_dae.studies.identification.identified import (
     NORMAL,
     known_covariance,
@@ -103,7 +103,7 @@ class Promised:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class ScenarioRun:
     """A run of a scenario with some values.
 
     Attributes:
@@ -116,7 +116,7 @@ class Trial:
     promised: Promised | None = None
 
 
-class Trials:
+class ScenarioRuns:
     """Runs of a scenario with other values at some keys, by rollout.
 
     Args:
@@ -128,7 +128,7 @@ class Trials:
     def __init__(self, scenario: Scenario, free: Sequence[str], noise: Mapping[str, float]) -> None:
         self._base, self._free, self._noise = scenario_data(scenario), free, noise
         self._runner = Runner(self._base, scenario.duration)
-        self._key, self._known = "", dict[str, tuple[Driven, Unknowns]]()
+        self._key, self._known = "", dict[str, tuple[DrivenPlant, Unknowns]]()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Reads the scenario with some values.
@@ -138,7 +138,7 @@ class Trials:
         """
         read_scenario(study_data(self._base, dict(changes), True))
 
-    def run(self, changes: Mapping[str, Any], judge_all: bool = False) -> Trial:
+    def run(self, changes: Mapping[str, Any], judge_all: bool = False) -> ScenarioRun:
         """Runs the scenario with some values.
 
         Args:
@@ -157,18 +157,18 @@ class Trials:
                 context = start_scenario(scenario, loop)
                 found = roll_scenario(scenario, loop, context)
         except DrakeDaeError as error:
-            return Trial({"does not start": str(error)})
+            return ScenarioRun({"does not start": str(error)})
         if found.failure is not None:
-            return Trial({"ends early": str(found.failure)})
+            return ScenarioRun({"ends early": str(found.failure)})
         problems = _problems(loop, found.record, context)
         if problems and not judge_all:
-            return Trial(problems)
+            return ScenarioRun(problems)
         try:
-            return Trial(problems, self._promised(data, loop, context, found.record))
+            return ScenarioRun(problems, self._promised(data, loop, context, found.record))
         except (ModelError, np.linalg.LinAlgError) as error:
             if judge_all and isinstance(error, ModelError):
                 raise
-            return Trial({"has no finite information": str(error)})
+            return ScenarioRun({"has no finite information": str(error)})
 
     def _promised(
         self, data: Mapping[str, Any], loop: ClosedLoop, context: Context, record: Record
@@ -179,7 +179,9 @@ class Trials:
         values = unknowns.start(driven.nominal, channels)
         sizes, p = np.where(values != 0.0, np.abs(values), 1.0), values.size
         noise = np.array([self._deviation(loop, channel) for channel in channels])
-        fitted = Fit([pieces], values, sizes, np.full(p, -np.inf), np.zeros(p, bool)).known([noise])
+        fitted = ParameterFit(
+            [pieces], values, sizes, np.full(p, -np.inf), np.zeros(p, bool)
+        ).known([noise])
         information = fitted.information[:, :, :p].sum(axis=0)
         parts = fitted.determined, fitted.undetermined
         strengths = np.linalg.eigvalsh(sizes[:, None] * information * sizes)
@@ -193,13 +195,13 @@ class Trials:
 
     def _driven(
         self, data: Mapping[str, Any], loop: ClosedLoop, context: Context
-    ) -> tuple[Driven, Unknowns]:
+    ) -> tuple[DrivenPlant, Unknowns]:
         """The plant alone, which is traced again only where it is another one."""
         own = {key: value for key, value in data.items() if key not in _FREE_OF_PLANT}
         key = json.dumps(own, sort_keys=True)
         if key not in self._known:
             unknowns = Unknowns.of(loop, self._free)
-            driven = Driven(loop, context, measured_ports(loop), unknowns.places)
+            driven = DrivenPlant(loop, context, measured_ports(loop), unknowns.places)
             self._known = {key: (driven, unknowns)}
         return self._known[key]
 

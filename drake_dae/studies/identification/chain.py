@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class StateChain:
     """The information that a chain of states has about common unknowns, and about its states.
 
     The unknowns are changes of the states z_0, ..., z_J, each of shape (n,), and of theta, shape

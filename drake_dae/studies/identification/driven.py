@@ -15,7 +15,7 @@ from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.stepping.many import Many
+from drake_dae.running.rollout.stepping.many import VectorizedFunction
 from drake_dae.systems.plants.contract import Plant
 
 HALVES = (0.0, 0.5, 0.5, 1.0)
@@ -24,7 +24,7 @@ HALVES = (0.0, 0.5, 0.5, 1.0)
 WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 
 
-class Moved(NamedTuple):
+class MovedPieces(NamedTuple):
     """Values at one moment of many pieces, and how they depend on where these begin.
 
     Attributes:
@@ -38,7 +38,7 @@ class Moved(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class DrivenPlant:
     """The plant of a loop as functions of its state, its control and some of its parameters.
 
     A continuous plant takes steps of the classical Runge-Kutta method of fourth order, a discrete
@@ -182,19 +182,21 @@ class Driven:
         size = self.felt.stop - self.felt.start
         return self._compiled.row.call(list(given))[0][first : first + size]
 
-    def _functions(self, value: ca.SX, valid: ca.SX) -> tuple[Many, Many]:
+    def _functions(
+        self, value: ca.SX, valid: ca.SX
+    ) -> tuple[VectorizedFunction, VectorizedFunction]:
         """A function, and one with its derivatives with respect to state and unknown parameters."""
         by = ca.vertcat(self._symbols[1], self._symbols[2])
         shown = ca.densify(value) + 0.0 * valid
         slopes = ca.densify(ca.vec(ca.jacobian(value, by).T))
         plain, full = (
-            Many(ca.Function("driven", self._symbols, ca.cse(values), {"cse": False}))
+            VectorizedFunction(ca.Function("driven", self._symbols, ca.cse(values), {"cse": False}))
             for values in ([shown], [shown, slopes])
         )
         return plain, full
 
     @cached_property
-    def _moves(self) -> tuple[Many, Many]:
+    def _moves(self) -> tuple[VectorizedFunction, VectorizedFunction]:
         """The derivative of the state, or the next state of a discrete plant."""
         compiled, given = self._compiled, self._arguments()
         felt = self._symbols[1][self.felt]
@@ -216,40 +218,40 @@ class Driven:
         return self._functions(state, valid)
 
     @cached_property
-    def _shows(self) -> tuple[Many, Many]:
+    def _shows(self) -> tuple[VectorizedFunction, VectorizedFunction]:
         row, valid = self._compiled.row.call(self._arguments())
         return self._functions(ca.vertcat(row, self._symbols[1][self.felt]), valid)
 
     def _called(
         self,
-        functions: tuple[Many, Many],
+        functions: tuple[VectorizedFunction, VectorizedFunction],
         time: FloatArray,
-        moved: Moved,
+        moved: MovedPieces,
         unknown: FloatArray,
         control: FloatArray,
-    ) -> Moved:
+    ) -> MovedPieces:
         """A function at many moments, with derivatives along those of the state."""
         plain, full = functions
         given = time[:, None], moved.values, unknown, control, self.base
         if moved.slopes is None:
-            return Moved(plain(*given)[0])
+            return MovedPieces(plain(*given)[0])
         (count, n), (values, flat) = moved.values.shape, full(*given)
         local = flat.reshape(count, -1, n + unknown.size)
         with np.errstate(all="ignore"):  # The caller sees what is not finite.
             slopes = np.matmul(local[:, :, :n], moved.slopes)
         slopes[:, :, n:] += local[:, :, n:]
-        return Moved(values, slopes)
+        return MovedPieces(values, slopes)
 
-    def begun(self, states: FloatArray) -> Moved:
+    def begun(self, states: FloatArray) -> MovedPieces:
         """The states at the beginning of pieces, shape (j, n), as values of themselves."""
         count, n = states.shape
         slopes = np.zeros((count, n, n + len(self.places)))
         slopes[:] = np.eye(n, n + len(self.places))
-        return Moved(states, slopes)
+        return MovedPieces(states, slopes)
 
     def seen(
-        self, time: FloatArray, moved: Moved, unknown: FloatArray, control: FloatArray
-    ) -> Moved:
+        self, time: FloatArray, moved: MovedPieces, unknown: FloatArray, control: FloatArray
+    ) -> MovedPieces:
         """The outputs at times in s, shape (j,), below each other.
 
         Args:
@@ -264,10 +266,10 @@ class Driven:
         self,
         time: FloatArray,
         after: FloatArray,
-        moved: Moved,
+        moved: MovedPieces,
         unknown: FloatArray,
         controls: Sequence[FloatArray],
-    ) -> Moved:
+    ) -> MovedPieces:
         """The states at later times.
 
         Args:
@@ -295,11 +297,11 @@ class Driven:
         self,
         time: FloatArray,
         h: FloatArray,
-        moved: Moved,
+        moved: MovedPieces,
         unknown: FloatArray,
         controls: Sequence[FloatArray],
-    ) -> Moved:
-        stage, rates = moved, list[Moved]()
+    ) -> MovedPieces:
+        stage, rates = moved, list[MovedPieces]()
         for half in HALVES:
             if half:
                 stage = _ahead(moved, half * h, rates[-1:], (1.0,))
@@ -308,14 +310,16 @@ class Driven:
         return _ahead(moved, h, rates, WEIGHTS)
 
 
-def _ahead(moved: Moved, h: FloatArray, rates: Sequence[Moved], weights: Sequence[float]) -> Moved:
+def _ahead(
+    moved: MovedPieces, h: FloatArray, rates: Sequence[MovedPieces], weights: Sequence[float]
+) -> MovedPieces:
     """What a step along the weighted sum of rates leads to."""
     values, slopes = moved
     for weight, rate in zip(weights, rates, strict=True):
         values = values + (weight * h)[:, None] * rate.values
         if slopes is not None and rate.slopes is not None:
             slopes = slopes + (weight * h)[:, None, None] * rate.slopes
-    return Moved(values, slopes)
+    return MovedPieces(values, slopes)
 
 
 def control_hold(plant: Plant, wires: Wires) -> System | None:

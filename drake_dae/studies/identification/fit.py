@@ -9,8 +9,8 @@ from scipy.optimize import lsq_linear
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.studies.identification.chain import Chain, alone, triangle
-from drake_dae.studies.identification.pieces import Pieces, Slopes
+from drake_dae.studies.identification.chain import StateChain, alone, triangle
+from drake_dae.studies.identification.pieces import PieceDerivatives, RecordPieces
 
 COUPLINGS = (1e-1, 1e-3, 1e-6)
 """How tightly pieces are joined, one after the other, in deviations of what a piece says of its
@@ -62,7 +62,7 @@ TINY = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitResult:
     """The result of a fit.
 
     Attributes:
@@ -89,7 +89,7 @@ class Fitted:
     left_out: tuple[int, int]
 
 
-class Fit:
+class ParameterFit:
     """Gauss-Newton for the unknowns of some records.
 
     The squares of measured minus computed columns over their noise are minimized, with the states
@@ -108,7 +108,7 @@ class Fit:
 
     def __init__(
         self,
-        pieces: Sequence[Pieces],
+        pieces: Sequence[RecordPieces],
         start: FloatArray,
         sizes: FloatArray,
         lowest: FloatArray,
@@ -127,7 +127,7 @@ class Fit:
         self._before, self._least_left = (self._values, list(self._states)), np.inf
         self._last = 0.0
 
-    def run(self, couplings: Sequence[float] = COUPLINGS) -> Fitted:
+    def run(self, couplings: Sequence[float] = COUPLINGS) -> FitResult:
         """Fits.
 
         Derivatives are computed anew only where steps with old ones do not become shorter, and at
@@ -140,7 +140,7 @@ class Fit:
             ModelError: The computed motion leaves the recorded one, or the steps do not come to an
                 end.
         """
-        known: list[Slopes] | None = None
+        known: list[PieceDerivatives] | None = None
         for coupling in couplings:
             is_last = coupling == COUPLINGS[-1]
             # Loose pieces follow noise, so that what is left says nothing of it.
@@ -177,7 +177,7 @@ class Fit:
                     )
         return self._fitted(*self._chained(couplings[-1], slopes))
 
-    def _is_expected(self, slopes: Sequence[Slopes]) -> bool:
+    def _is_expected(self, slopes: Sequence[PieceDerivatives]) -> bool:
         """Whether a step has left the errors that were expected, also in the states alone."""
         pairs = zip(slopes, self._noise, strict=True)
         sizes = [
@@ -185,7 +185,7 @@ class Fit:
         ]
         return bool(np.nanmax(sizes) < EXPECTED)
 
-    def known(self, noise: Sequence[FloatArray]) -> Fitted:
+    def known(self, noise: Sequence[FloatArray]) -> FitResult:
         """The information about the unknowns at the values and states to begin with.
 
         Args:
@@ -200,8 +200,8 @@ class Fit:
         return self._fitted(slopes, chains)
 
     def _shortened(
-        self, coupling: float, known: Sequence[Slopes] | None
-    ) -> tuple[list[Slopes], list[Chain]]:
+        self, coupling: float, known: Sequence[PieceDerivatives] | None
+    ) -> tuple[list[PieceDerivatives], list[StateChain]]:
         """`_chained` after the last step, or after a shorter one if it leads too far.
 
         Raises:
@@ -224,8 +224,8 @@ class Fit:
         return max(float(np.sqrt(np.nanmean(np.square(e / spread)))) for e, spread in pairs)
 
     def _chained(
-        self, coupling: float, known: Sequence[Slopes] | None
-    ) -> tuple[list[Slopes], list[Chain]]:
+        self, coupling: float, known: Sequence[PieceDerivatives] | None
+    ) -> tuple[list[PieceDerivatives], list[StateChain]]:
         slopes, chains = [], []
         for index, pieces in enumerate(self._pieces):
             old = None if known is None else known[index]
@@ -240,7 +240,7 @@ class Fit:
             chains.append(self._chain(index, found, coupling))
         return slopes, chains
 
-    def _chain(self, index: int, slopes: Slopes, coupling: float) -> Chain:
+    def _chain(self, index: int, slopes: PieceDerivatives, coupling: float) -> StateChain:
         """The least squares of a record around the present states."""
         scale, noise = self._pieces[index].driven.scale, self._noise[index]
         count = len(slopes.ends)
@@ -254,9 +254,9 @@ class Fit:
         # Across an event of a contact nothing is known of the next state.
         is_joined = self._pieces[index].is_joined[:, None]
         loose = np.where(is_joined, coupling * alone(own, scale, WEAK), WEAK * scale)
-        return Chain.of(own, np.where(is_joined[..., None], moves, 0.0), loose, WEAK * scale)
+        return StateChain.of(own, np.where(is_joined[..., None], moves, 0.0), loose, WEAK * scale)
 
-    def _step(self, chains: Sequence[Chain]) -> tuple[FloatArray, float]:
+    def _step(self, chains: Sequence[StateChain]) -> tuple[FloatArray, float]:
         """A step of the unknowns, and its length in their deviations."""
         scaled, rest = self._split(chains)
         step = self._over_sizes(scaled, rest)
@@ -264,7 +264,7 @@ class Fit:
         return self._sizes * step, length / max(1.0, np.sqrt(step.size))
 
     def _move(
-        self, step: FloatArray, slopes: Sequence[Slopes], chains: Sequence[Chain]
+        self, step: FloatArray, slopes: Sequence[PieceDerivatives], chains: Sequence[StateChain]
     ) -> list[FloatArray]:
         """Makes a step; returns the errors that are expected after it."""
         self._before, expected = (self._values, list(self._states)), []
@@ -297,7 +297,7 @@ class Fit:
         bounded = lsq_linear(rows, right, (np.minimum(least, -TINY), np.inf), method="bvls")
         return np.clip(bounded.x, least, LONGEST)
 
-    def _split(self, chains: Sequence[Chain]) -> tuple[FloatArray, FloatArray]:
+    def _split(self, chains: Sequence[StateChain]) -> tuple[FloatArray, FloatArray]:
         """Finds what is determined; returns the factor of the information over sizes, and rest."""
         common = triangle(np.vstack([chain.common for chain in chains]))
         p = self._values.size
@@ -316,7 +316,9 @@ class Fit:
             found = float(np.sqrt(np.nanmean(np.square(errors[:, :, own]))))
             self._noise[index][own] = np.maximum(found, self._floor * float(np.max(spread[own])))
 
-    def _fitted(self, slopes: Sequence[Slopes], chains: Sequence[Chain]) -> Fitted:
+    def _fitted(
+        self, slopes: Sequence[PieceDerivatives], chains: Sequence[StateChain]
+    ) -> FitResult:
         p, information, errors = self._values.size, [], []
         for index, chain in enumerate(chains):
             found, along = slopes[index], chain.states(np.zeros(p))[1]
@@ -333,7 +335,7 @@ class Fit:
             left[pieces.rows[:, :-1][pieces.is_own]] = found.errors[pieces.is_own]
             errors.append(left)
         cuts = [pieces.data.cut for pieces in self._pieces]
-        return Fitted(
+        return FitResult(
             self._values,
             np.concatenate(information),
             *self._parts,

@@ -12,8 +12,8 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.identification.channels import SAME, Channel
-from drake_dae.studies.identification.driven import Driven
-from drake_dae.studies.identification.fit import COUPLINGS, SMALLEST, Fit, Fitted
+from drake_dae.studies.identification.driven import DrivenPlant
+from drake_dae.studies.identification.fit import COUPLINGS, SMALLEST, FitResult, ParameterFit
 from drake_dae.studies.identification.identified import (
     WHITE,
     Identified,
@@ -23,7 +23,7 @@ from drake_dae.studies.identification.identified import (
     undetermined_names,
 )
 from drake_dae.studies.identification.measured import measured, measured_ports
-from drake_dae.studies.identification.pieces import Pieces
+from drake_dae.studies.identification.pieces import RecordPieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
 ROUNDED = 10.0
@@ -79,7 +79,7 @@ def identify(
     if not named:
         raise ModelError("there is no record to identify parameters from")
     _check_differ(named)
-    driven = Driven(loop, context, measured_ports(loop), unknowns.places)
+    driven = DrivenPlant(loop, context, measured_ports(loop), unknowns.places)
     pieces = [pieces_of(record, driven, unknowns, title) for title, record in named.items()]
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
@@ -90,18 +90,20 @@ def identify(
 
 
 def _fitted(
-    pieces: Sequence[Pieces], start: FloatArray, given: tuple[FloatArray, FloatArray, np.ndarray]
-) -> Fitted:
+    pieces: Sequence[RecordPieces],
+    start: FloatArray,
+    given: tuple[FloatArray, FloatArray, np.ndarray],
+) -> FitResult:
     """The fit, of long records from a first estimate by their first rows."""
     if all(each.data.times.size <= LONG for each in pieces):
-        return Fit(pieces, start, *given).run()
-    first = Fit([each.first(BRIEF) for each in pieces], start, *given).run(COUPLINGS[:-1])
+        return ParameterFit(pieces, start, *given).run()
+    first = ParameterFit([each.first(BRIEF) for each in pieces], start, *given).run(COUPLINGS[:-1])
     with suppress(ModelError):  # From nearby, pieces need not be loose at first.
-        return Fit(pieces, first.values, *given, first.noise).run(COUPLINGS[-1:])
-    return Fit(pieces, first.values, *given).run()
+        return ParameterFit(pieces, first.values, *given, first.noise).run(COUPLINGS[-1:])
+    return ParameterFit(pieces, first.values, *given).run()
 
 
-def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) -> Pieces:
+def pieces_of(record: Record, driven: DrivenPlant, unknowns: Unknowns, title: str) -> RecordPieces:
     """A record in pieces.
 
     Raises:
@@ -116,7 +118,7 @@ def pieces_of(record: Record, driven: Driven, unknowns: Unknowns, title: str) ->
                 f"contacts of {title} open or close, or phases of its task end, and a delay is not "
                 "found across these; leave the delay out, or take a record between two of them"
             )
-    return Pieces(driven, data, biases, unknowns.num_sensed, delays=delays)
+    return RecordPieces(driven, data, biases, unknowns.num_sensed, delays=delays)
 
 
 def _check_differ(records: Mapping[str, Record]) -> None:
@@ -153,8 +155,8 @@ def _identified(
     unknowns: Unknowns,
     start: FloatArray,
     sizes: FloatArray,
-    pieces: Sequence[Pieces],
-    fitted: Fitted,
+    pieces: Sequence[RecordPieces],
+    fitted: FitResult,
 ) -> Identified:
     names, p = [unknown.name for unknown in unknowns.all], start.size
     parts = fitted.determined, fitted.undetermined
@@ -177,7 +179,7 @@ def _identified(
     )
 
 
-def _noise(loop: ClosedLoop, pieces: Sequence[Pieces], fitted: Fitted) -> dict[str, Noise]:
+def _noise(loop: ClosedLoop, pieces: Sequence[RecordPieces], fitted: FitResult) -> dict[str, Noise]:
     """What is left of each group of measured columns, over all records."""
     groups = dict[tuple[str, str], list[FloatArray]]()
     one_of = dict[tuple[str, str], Channel]()

@@ -18,7 +18,7 @@ from drake_dae.studies.identification.channels import (
     columns_of,
     is_position,
 )
-from drake_dae.studies.identification.driven import Driven
+from drake_dae.studies.identification.driven import DrivenPlant
 from drake_dae.studies.identification.openings import cuts, modes
 from drake_dae.systems.blocks.traced import Traced
 
@@ -75,7 +75,7 @@ def measured_ports(loop: ClosedLoop) -> dict[str, OutputPort]:
     return found
 
 
-def measured(record: Record, driven: Driven, title: str) -> Measured:
+def measured(record: Record, driven: DrivenPlant, title: str) -> Measured:
     """The data of a record.
 
     Args:
@@ -164,7 +164,7 @@ def _acts_before(hold: System, times: FloatArray, period: float) -> np.ndarray:
 
 def _first_states(
     record: Record,
-    driven: Driven,
+    driven: DrivenPlant,
     channels: Sequence[Channel],
     values: Sequence[FloatArray],
     title: str,
@@ -203,7 +203,7 @@ def _filled(times: FloatArray, column: FloatArray) -> FloatArray:
 
 
 def _rates(
-    driven: Driven, known: Mapping[str, FloatArray], times: FloatArray
+    driven: DrivenPlant, known: Mapping[str, FloatArray], times: FloatArray
 ) -> dict[str, FloatArray]:
     """Differences of positions, for velocities that a record lacks."""
     signals = driven.loop.plant.dae.state_signals

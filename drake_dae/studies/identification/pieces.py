@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from drake_dae.arrays import FloatArray
-from drake_dae.studies.identification.driven import Driven, Moved
+from drake_dae.studies.identification.driven import DrivenPlant, MovedPieces
 from drake_dae.studies.identification.measured import Measured
 from drake_dae.studies.identification.openings import parts
 
@@ -28,7 +28,7 @@ FEW = 0.1
 """If no larger share of the pieces needs more than `ENOUGH`, these are left out."""
 
 
-class Slopes(NamedTuple):
+class PieceDerivatives(NamedTuple):
     """Pieces and their derivatives with respect to their first states and all unknowns.
 
     Attributes:
@@ -49,7 +49,7 @@ class Slopes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class RecordPieces:
     """A record in pieces.
 
     Attributes:
@@ -61,7 +61,7 @@ class Pieces:
         delays: For each column the unknown that is its delay, as `biases`; None for none at all.
     """
 
-    driven: Driven
+    driven: DrivenPlant
     data: Measured
     biases: np.ndarray
     num_sensed: int
@@ -156,7 +156,7 @@ class Pieces:
 
     @cached_property
     def _controls(self) -> list[list[FloatArray]]:
-        """For each step between rows the controls as `Driven.step` takes them."""
+        """For each step between rows the controls as `DrivenPlant.step` takes them."""
         times, controls, rows = self.data.times, self.data.controls, self.rows
         if self.driven.period:
             count = round(float(times[1] - times[0]) / self.driven.period)
@@ -175,8 +175,8 @@ class Pieces:
         return [list(each) for each in found]
 
     def slopes(
-        self, states: FloatArray, unknown: FloatArray, known: Slopes | None = None
-    ) -> Slopes:
+        self, states: FloatArray, unknown: FloatArray, known: PieceDerivatives | None = None
+    ) -> PieceDerivatives:
         """All pieces from some states.
 
         Args:
@@ -186,8 +186,8 @@ class Pieces:
         """
         driven, times = self.driven, self.data.times[self.rows]
         of_plant, sensed = np.split(unknown, [unknown.size - self.num_sensed])
-        moved = driven.begun(states) if known is None else Moved(states)
-        shown = list[Moved]()
+        moved = driven.begun(states) if known is None else MovedPieces(states)
+        shown = list[MovedPieces]()
         for k, controls in enumerate(self._controls):
             acting = self.data.acting[self.rows[:, k]]
             shown.append(driven.seen(times[:, k], moved, of_plant, acting))
@@ -208,7 +208,7 @@ class Pieces:
             of_residual = self._padded(_slopes(shown[0])[:, own])
             is_finite = is_finite and bool(np.isfinite(of_errors).all())
         residuals = residual, of_residual
-        return Slopes(errors, of_errors, moved.values, of_ends, residuals, is_finite)
+        return PieceDerivatives(errors, of_errors, moved.values, of_ends, residuals, is_finite)
 
     def _shifts(self, sensed: FloatArray) -> tuple[np.ndarray, FloatArray]:
         """The delay of each column as a number of rows and a rest in s."""
@@ -255,11 +255,11 @@ class Pieces:
         """Derivatives with respect to biases as well, which are zero."""
         return np.concatenate([slopes, np.zeros((*slopes.shape[:2], self.num_sensed))], axis=2)
 
-    def first(self, count: int) -> "Pieces":
+    def first(self, count: int) -> "RecordPieces":
         """The first rows alone."""
         return replace(self, data=self.data.first(count))
 
-    def fine_enough(self, unknown: FloatArray) -> "Pieces":
+    def fine_enough(self, unknown: FloatArray) -> "RecordPieces":
         """The same with steps so short that the ends of pieces are accurate.
 
         A few pieces that need far shorter steps than the others, as in contact with friction at
@@ -280,7 +280,7 @@ class Pieces:
                 break  # It is not the steps.
         return found
 
-    def without(self, pieces: np.ndarray) -> "Pieces":
+    def without(self, pieces: np.ndarray) -> "RecordPieces":
         """The same without some pieces."""
         if not pieces.any():
             return self
@@ -292,13 +292,13 @@ class Pieces:
     def _found_ends(self, unknown: FloatArray) -> FloatArray:
         """The ends of pieces from their guessed states."""
         of_plant = unknown[: unknown.size - self.num_sensed]
-        times, moved = self.data.times[self.rows], Moved(self.first_states)
+        times, moved = self.data.times[self.rows], MovedPieces(self.first_states)
         with np.errstate(all="ignore"):
             for k, controls in enumerate(self._controls):
                 moved = self.driven.step(times[:, k], times[:, k + 1], moved, of_plant, controls)
         return moved.values
 
 
-def _slopes(moved: Moved) -> FloatArray:
+def _slopes(moved: MovedPieces) -> FloatArray:
     assert moved.slopes is not None
     return moved.slopes

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.given import numpy_explained, result_of
@@ -43,7 +43,7 @@ class RunSymbols:
         times: FloatArray,
         signals: Mapping[str, Sequence[Signal]],
         variables: Sequence[str],
-        layout: Layout | None = None,
+        layout: DerivativeLayout | None = None,
     ) -> None:
         self.time = ca.DM(times)
         self._layout, self._signals = layout, dict(signals)

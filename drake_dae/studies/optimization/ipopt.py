@@ -42,7 +42,7 @@ class IpoptProblem:
 
 
 @dataclass(frozen=True)
-class Solved:
+class IpoptResult:
     """How IPOPT ended.
 
     Attributes:
@@ -58,7 +58,7 @@ class Solved:
     iterations: int
 
 
-def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> Solved:
+def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> IpoptResult:
     """Runs IPOPT (Waechter and Biegler, 2006), whose second derivatives are those of BFGS.
 
     A function that raises an error of this library has no value there, and IPOPT takes a shorter
@@ -99,7 +99,7 @@ def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> Solved:
     if functions.errors:
         raise functions.errors[0]
     stats = solver.stats()
-    return Solved(
+    return IpoptResult(
         found["x"].full()[:, 0],
         str(stats["return_status"]),
         bool(stats["success"]),
@@ -107,7 +107,7 @@ def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> Solved:
     )
 
 
-class _Called(ca.Callback):
+class _PythonFunction(ca.Callback):
     """A function of Python for CasADi, which loses exceptions: they are kept in `errors`."""
 
     def __init__(self, name: str, problem: IpoptProblem, errors: list[BaseException]) -> None:
@@ -148,7 +148,7 @@ class _Called(ca.Callback):
             return [ca.DM(nothing)]
 
 
-class _Slopes(_Called):
+class _Slopes(_PythonFunction):
     def get_n_in(self) -> int:
         return 2
 
@@ -162,7 +162,7 @@ class _Slopes(_Called):
         return self._problem.slopes(x)
 
 
-class _Values(_Called):
+class _Values(_PythonFunction):
     def __init__(self, problem: IpoptProblem) -> None:
         super().__init__("values", problem, [])
         self._slopes: _Slopes | None = None  # CasADi does not keep it.

@@ -10,8 +10,8 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.rollout.events import Seed
-from drake_dae.running.rollout.gradient.chain import Link, projected
-from drake_dae.running.rollout.gradient.gradient import Chain
+from drake_dae.running.rollout.gradient.chain import ComputedFunction, projected
+from drake_dae.running.rollout.gradient.gradient import FunctionChain
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.studies.optimization.variables import Variable
@@ -73,7 +73,7 @@ class LoopRuns:
         """
         start, parameters, before = self._begun(values)
         given = start, parameters, self.times, self.config, self.seed
-        chain = Chain.of(self.loop, *given)
+        chain = FunctionChain.of(self.loop, *given)
         chain = replace(chain, links=[*before, *chain.links])
         count = len(self.variables)
         of_start, of_parameters = np.zeros((count, start.size)), np.zeros((count, parameters.size))
@@ -104,7 +104,7 @@ class LoopRuns:
     def _seeds(self) -> list[Seed] | None:
         return None if self.seed is None else [self.seed]
 
-    def _begun(self, values: FloatArray) -> tuple[FloatArray, FloatArray, list[Link]]:
+    def _begun(self, values: FloatArray) -> tuple[FloatArray, FloatArray, list[ComputedFunction]]:
         """Start and parameters, and the functions that brought the start onto N*."""
         program = program_of(self.loop)
         start, parameters = self.start.copy(), self.parameters.copy()

@@ -19,7 +19,7 @@ from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.simulation.records.interruption import ending_signals
 from drake_dae.studies.optimization.expressions import Objective, RunSymbols
-from drake_dae.studies.optimization.ipopt import IpoptProblem, Solved, solve
+from drake_dae.studies.optimization.ipopt import IpoptProblem, IpoptResult, solve
 from drake_dae.studies.optimization.loop_runs import LoopRuns
 from drake_dae.studies.optimization.optimum import MET, Optimum, limit_sizes, limit_states
 from drake_dae.studies.optimization.variables import Variable, chosen_variables
@@ -245,7 +245,7 @@ class _Search:
     def _scales(self) -> FloatArray:
         return np.concatenate([[self._cost_size], self._limit_sizes])
 
-    def optimum(self, context: Context, ended: Solved) -> Optimum:
+    def optimum(self, context: Context, ended: IpoptResult) -> Optimum:
         """The result."""
         assert self._best is not None
         values = np.clip(ended.x * self._sizes, *self._bounds)

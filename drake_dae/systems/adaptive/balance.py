@@ -15,7 +15,7 @@ _CLOSE = 1e-9
 """Two numbers are the same up to so much of the largest of their kind."""
 
 
-class Balance:
+class ForceBalance:
     """M v' = F(q, v) + J^T lambda + B u with J v = 0, and its derivatives by theta.
 
     Args:

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.adaptive.balance import Balance
+from drake_dae.systems.adaptive.balance import ForceBalance
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -109,9 +109,9 @@ class AdaptiveLaw:
         self.model, self.adapted = model, dict(adapted)
         self.rate, self.damping = positive("rate", rate), positive("damping", damping)
         self.force_rate = positive("force_rate", force_rate) if force_rate else 0.0
-        self._balance = balance = Balance(model, tuple(adapted))
+        self._balance = balance = ForceBalance(model, tuple(adapted))
         self.structure = structure_of("AdaptiveLaw", model.dae, structure)
-        self.layout = Layout(self.structure.output_degrees)
+        self.layout = DerivativeLayout(self.structure.output_degrees)
         count, forces = balance.num_positions, balance.num_forces
         if self.structure.output_degrees != (2,) * count + (0,) * forces:
             raise ModelError(

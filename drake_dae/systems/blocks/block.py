@@ -20,7 +20,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers, vector
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError, SimulationError
@@ -132,7 +132,7 @@ class ParameterizedSystem(DifferentiableSystem):
         self.dae = dae
         self._signals = signals
         self._exogenous: InputPort | None = None
-        self.exogenous_layout = Layout(())
+        self.exogenous_layout = DerivativeLayout(())
         self.exogenous_places: list[int] = []
         self._steps = StepWatch(self, sees_steps)
         self.DeclareNumericParameter(BasicVector(values))
@@ -148,7 +148,7 @@ class ParameterizedSystem(DifferentiableSystem):
         """
         tickets = {self.all_parameters_ticket()}
         if degrees:
-            self.exogenous_layout = Layout(tuple(degrees))
+            self.exogenous_layout = DerivativeLayout(tuple(degrees))
             self.exogenous_places = self.dae.exogenous.places(degrees)
             size = self.exogenous_layout.reference_size
             self._exogenous = self.DeclareVectorInputPort("exogenous", size)

@@ -17,7 +17,7 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
-from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, Fault
+from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind
 
 
 def cannot_go_on(
@@ -61,29 +61,29 @@ def simulation_error(
         for i in (entries if name in signals else entries[:1])
     )
     match failure.fault:
-        case Fault.INPUT:
+        case FailureKind.INPUT:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is not finite {where}", time, state
             )
-        case Fault.OVERFLOW:
+        case FailureKind.OVERFLOW:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
                 "without bound. Look at the gains, and at what the model has wrong",
                 time,
                 state,
             )
-        case Fault.VALUE:
+        case FailureKind.VALUE:
             return NonFiniteError(
                 f"{failure.function} is not finite {where}: a function left its domain or is not "
                 "differentiable there, or a matrix that is inverted is singular",
                 time,
                 state,
             )
-        case Fault.OUTSIDE:
+        case FailureKind.OUTSIDE:
             return SimulationError(
                 f"{failure.function} has no value {where}: {failure.singular}", time, state
             )
-        case Fault.SINGULAR:
+        case FailureKind.SINGULAR:
             return SingularityError(
                 f"{failure.singular} is singular {where}, so {failure.function} is not determined "
                 "there: a singular configuration, through which smaller steps do not lead. A plant "

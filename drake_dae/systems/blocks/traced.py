@@ -110,7 +110,7 @@ class Guard:
 
 
 @dataclass(frozen=True, eq=False)
-class Stepped:
+class DrakeStepped:
     """What Drake steps in a block at t_k = k period, as its own contact, since it is not traced.
 
     The first entries of the block's HELD are the values of some output ports of that system, below
@@ -179,7 +179,7 @@ class Block:
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
     guard: Guard | None = None
-    stepped: Stepped | None = None
+    stepped: DrakeStepped | None = None
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None

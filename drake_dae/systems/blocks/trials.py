@@ -58,7 +58,7 @@ _DONE = EventStatus.DidNothing()
 
 
 @dataclass
-class Progress:
+class RunProgress:
     """What a block knows of a simulation, in one context.
 
     Attributes:
@@ -88,7 +88,7 @@ class Progress:
     laws: list[tuple[float, FloatArray]] = field(default_factory=list)
     entry: CacheEntry | None = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Progress":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "RunProgress":
         return replace(
             self, state=self.state.copy(), parameters=list(self.parameters), laws=list(self.laws)
         )
@@ -165,9 +165,9 @@ class StepWatch:
         seen = self._progress(context).laws
         return _along(seen, times) if seen else None
 
-    def _progress(self, context: Context) -> Progress:
+    def _progress(self, context: Context) -> RunProgress:
         # The object stays the same, and is ours to change.
-        found: Progress = self._system.get_cache_entry(self._index).Eval(context)
+        found: RunProgress = self._system.get_cache_entry(self._index).Eval(context)
         return found
 
     def _begin(self, context: Context) -> EventStatus:
@@ -180,7 +180,7 @@ class StepWatch:
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
         laws = progress.laws
-        begun = Progress(time, start=time, mark=time, parameters=seen, laws=laws, entry=entry)
+        begun = RunProgress(time, start=time, mark=time, parameters=seen, laws=laws, entry=entry)
         vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
@@ -206,7 +206,7 @@ class StepWatch:
             progress.failures, progress.reason, progress.reason_time = 0, "", inf
         return _DONE
 
-    def _check_pace(self, progress: Progress, time: float) -> None:
+    def _check_pace(self, progress: RunProgress, time: float) -> None:
         before, progress.mark = progress.mark, time
         if time - before < SLOWEST * (time - progress.start):
             name = self._system.get_name()
@@ -226,12 +226,12 @@ def _along(seen: Sequence[tuple[float, FloatArray]], times: FloatArray) -> Float
 
 
 def _no_simulation() -> AbstractValue:
-    return AbstractValue.Make(Progress())
+    return AbstractValue.Make(RunProgress())
 
 
 def _note_parameters(context: Context, value: AbstractValue) -> None:
     """Notes that the parameters of a context are others since the last accepted state."""
-    progress: Progress = value.get_value()
+    progress: RunProgress = value.get_value()
     if progress.parameters:
         _add(progress.parameters, progress.time, _parameters(context))
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -121,7 +121,7 @@ class CommandFilter:
             """The derivative by the time."""
             return ca.jtimes(value, ca.vertcat(time, state), ca.vertcat(1.0, rate))
 
-        base = ca.SX.sym("base", Layout(tuple(degrees)).reference_size)
+        base = ca.SX.sym("base", DerivativeLayout(tuple(degrees)).reference_size)
         rows, first = [ca.SX(0, 1)], 0
         for change, degree in zip(changes, degrees, strict=True):
             own = base[first : first + degree + 1]  # r and its derivatives by s

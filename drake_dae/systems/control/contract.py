@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
@@ -78,7 +78,7 @@ class Controller(System):
     refused: Mapping[str, str] = {}
     follows: bool = False
     takes_over: bool = False
-    exogenous_layout: Layout = Layout(())
+    exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
 
     @property

@@ -10,7 +10,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import ReferenceSignalError
 
 
@@ -113,7 +113,7 @@ class SystemReference(Reference):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degrees", tuple(self.degrees))
-        system, size = self.system, Layout(self.degrees).reference_size
+        system, size = self.system, DerivativeLayout(self.degrees).reference_size
         if not self.degrees or min(self.degrees) < 0:
             raise ReferenceSignalError(
                 f"degrees must be one whole number from 0 for each output, got {self.degrees}"
@@ -147,7 +147,7 @@ class SystemReference(Reference):
                     f"the law needs {needed} derivatives of row {row}, its system gives {given}"
                 )
         context, port = self.system.CreateDefaultContext(), self.system.get_output_port()
-        table = Layout(self.degrees)
+        table = DerivativeLayout(self.degrees)
         places = [
             first + k
             for first, degree in zip(table.lowest, degrees, strict=True)

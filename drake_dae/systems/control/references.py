@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
 from drake_dae.dae.references import Reference, ReferenceRows, stack_references
 from drake_dae.dae.references.pieces import MOST_IN_EXPRESSION
 from drake_dae.dae.references.reference import not_finite, with_degrees
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.along import signal_along
@@ -254,5 +254,5 @@ class _ReferenceFormula:
         return stack_references(self._references, [degree + 1 for degree in self._degrees])
 
     def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
-        higher = Layout(tuple(degree + 1 for degree in self._degrees))
+        higher = DerivativeLayout(tuple(degree + 1 for degree in self._degrees))
         return np.delete(self._higher(time), higher.lowest)[:, None]

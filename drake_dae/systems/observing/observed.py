@@ -35,7 +35,7 @@ class Estimates(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class ContactTerms:
     """What friction and constraints do at a state, as expressions.
 
     Attributes:
@@ -92,7 +92,7 @@ class Observed:
             found[system.parameter_slice(name)] = friction[j]
         return found
 
-    def contact(self, state: ca.SX, parameters: ca.SX) -> Contact:
+    def contact(self, state: ca.SX, parameters: ca.SX) -> ContactTerms:
         """What friction and constraints do at a state."""
         observation, size = self.observation, len(self.observation.rows)
         friction = observation.friction.function(self._faster(state), self._force, parameters)
@@ -103,9 +103,9 @@ class Observed:
         held = planes * ca.repmat(ca.vec(ca.repmat(sticks.T, size, 1)).T, size, 1)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
         velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
-        return Contact(friction[0], metric, free, planes, held, velocity, slides, valid)
+        return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
 
-    def change(self, contact: Contact, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
+    def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
         """How mu changes at a sample, at which friction takes its share of r."""
         gain = -np.expm1(-self._observing.friction_rate * self._period)
         known = contact.friction, contact.planes, contact.velocity, contact.metric

@@ -14,7 +14,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class ObserverMemory:
     """What an observer holds between samples, as columns that stand below each other.
 
     Attributes:
@@ -73,7 +73,7 @@ class ObserverFunctions(Observed):
         degree, size = max(law.exogenous_degrees), len(self.observation.rows)
         self._lags = [Lags.of(rate, period, degree) for rate in rates]
         frictions = len(self.observation.frictions)
-        self.memory = memory = Memory.of(size, frictions, degree, law.system.num_controls)
+        self.memory = memory = ObserverMemory.of(size, frictions, degree, law.system.num_controls)
         self.sample = self._sampled(ca.SX.sym("hold", 1))
         self.exogenous = self.compensated(law, delay, memory.column, memory)
 

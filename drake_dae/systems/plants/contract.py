@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, System
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -89,7 +89,7 @@ class Plant(System):
     model: RobotModel | None = None
     time_step: float = 0.0
     functions: Collection[str] = ()
-    exogenous_layout: Layout = Layout(())
+    exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
     contacts: tuple[str, ...] = ()
     normals: tuple[int, ...] = ()

@@ -16,7 +16,7 @@ from drake_dae.errors import ModelError, SimulationError
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
-from drake_dae.trace.functions import Fault, TracedFunction
+from drake_dae.trace.functions import FailureKind, TracedFunction
 
 
 @checked(ModelError)
@@ -156,7 +156,7 @@ class ToleranceWatch(LeafSystem):
         force, state = (each + 0.0 for each in given[2:4])  # Without -0.
         function = self._function
         recent = np.sqrt(function.evaluate(*given[:5], np.array([time]))[0])
-        if function.failure().fault is not Fault.OUTSIDE:
+        if function.failure().fault is not FailureKind.OUTSIDE:
             return simulation_error(function.failure(), time, state, {})
         worst = int(np.argmax(recent / self._largest))
         signal = self._outputs[self._places[worst]]

@@ -24,7 +24,7 @@ from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.open_contact import opened_contact
 from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.prediction import predicted_errors
-from drake_dae.systems.task.progress import Segment, places_at
+from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.switch import LawSwitch
 from drake_dae.systems.task.task import Task, check_sampled
@@ -211,7 +211,7 @@ class TaskController(Diagram, Controller):
         """
         return tuple(segment.change for segment in self.segments(context))
 
-    def segments(self, context: Context) -> tuple[Segment, ...]:
+    def segments(self, context: Context) -> tuple[ReferenceSegment, ...]:
         """The references of a run, from one change of phases to the next.
 
         Args:

@@ -13,7 +13,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.progress import DONE, HELD, Segment
+from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task
 
 FREE, CONTACT = 0, 1
@@ -21,7 +21,7 @@ FREE, CONTACT = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
-class Goals:
+class PhaseReferences:
     """The references of a phase for its law.
 
     Attributes:
@@ -36,7 +36,7 @@ class Goals:
 
 
 @dataclass(frozen=True, eq=False)
-class Now:
+class ModelMoment:
     """A moment of a run, as the laws' model sees it.
 
     Attributes:
@@ -51,7 +51,7 @@ class Now:
 
 
 @dataclass(frozen=True)
-class Cause:
+class PhaseCause:
     """Why a phase begins.
 
     Attributes:
@@ -67,10 +67,10 @@ class Cause:
     ends_in_contact: bool | None = None
 
 
-BEGIN = Cause("the task begins")
+BEGIN = PhaseCause("the task begins")
 
 
-class Planner:
+class TaskPlanner:
     """Makes the references of each phase of a task.
 
     Args:
@@ -102,13 +102,13 @@ class Planner:
         self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
         self.moved = len(moved)
 
-    def motion(self, now: Now) -> tuple[float, float, FloatArray, FloatArray]:
+    def motion(self, now: ModelMoment) -> tuple[float, float, FloatArray, FloatArray]:
         """The distance and its derivative, then all outputs in m and their derivatives."""
         values = self.motion_function.evaluate(now.state, now.parameters)[0].copy()
         first, rates = values[2 : 2 + self.moved], values[2 + self.moved :]
         return float(values[0]), float(values[1]), first, rates
 
-    def first(self, now: Now) -> Segment:
+    def first(self, now: ModelMoment) -> ReferenceSegment:
         """The references of the first phase, which begin as the outputs are."""
         contact = self._task.contacts[0]
         force = self._task.contact_force if contact else 0.0
@@ -117,8 +117,13 @@ class Planner:
         return self._started(now, 0, self._name(0), contact, BEGIN, moment, present)
 
     def following(
-        self, now: Now, before: Segment, moment: Moment, place: int | None, cause: Cause
-    ) -> Segment:
+        self,
+        now: ModelMoment,
+        before: ReferenceSegment,
+        moment: Moment,
+        place: int | None,
+        cause: PhaseCause,
+    ) -> ReferenceSegment:
         """The references from now on, which begin as those before are.
 
         Args:
@@ -146,14 +151,14 @@ class Planner:
 
     def _started(
         self,
-        now: Now,
+        now: ModelMoment,
         place: int,
         name: str,
         contact: bool,
-        cause: Cause,
+        cause: PhaseCause,
         moment: Moment,
         present: FloatArray,
-    ) -> Segment:
+    ) -> ReferenceSegment:
         law, phases = self._laws[contact], self._phases
         rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
         if place < len(phases):
@@ -171,11 +176,11 @@ class Planner:
             failed=cause.failed,
         )
         origin = self.motion(now)[2]
-        return Segment.begin(
+        return ReferenceSegment.begin(
             change, law.layout, goals.function, goals.named, rate, present, over, origin
         )
 
-    def _met(self, now: Now, contact: bool, moment: Moment) -> FloatArray:
+    def _met(self, now: ModelMoment, contact: bool, moment: Moment) -> FloatArray:
         """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives.
 
         A force that a law reaches at once is what is measured.
@@ -203,7 +208,7 @@ def _integral_places(law: TrackingLaw) -> list[int]:
     return found
 
 
-def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
+def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> PhaseReferences:
     """The references of a phase."""
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
@@ -219,7 +224,7 @@ def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
     try:
         references = tuple(in_order(found, names))
         here = () if phase.is_relative else named
-        return Goals(stack_references(references, degrees), here, references)
+        return PhaseReferences(stack_references(references, degrees), here, references)
     except ReferenceSignalError as error:
         raise ModelError(f"{task.plan.where(index)}: {error}") from error
 
@@ -242,6 +247,6 @@ def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
     return found
 
 
-def _no_goals(law: TrackingLaw) -> Goals:
+def _no_goals(law: TrackingLaw) -> PhaseReferences:
     zero = np.zeros(law.layout.reference_size)
-    return Goals(lambda time: zero, ())
+    return PhaseReferences(lambda time: zero, ())

@@ -7,14 +7,14 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.systems.task.planner import CONTACT, FREE
-from drake_dae.systems.task.progress import Segment, places_at
+from drake_dae.systems.task.progress import ReferenceSegment, places_at
 
 
 def predicted_errors(
     laws: tuple[TrackingLaw, TrackingLaw],
     place: int,
     force: int,
-    segments: tuple[Segment, ...],
+    segments: tuple[ReferenceSegment, ...],
     times: FloatArray,
     values: Mapping[str, FloatArray],
 ) -> FloatArray:

@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.fade import fade
@@ -17,7 +17,7 @@ DONE, HELD = "done", "held"
 
 
 @dataclass(frozen=True, eq=False)
-class Segment:
+class ReferenceSegment:
     """The references from one change of phases on:
 
         R(t) = goal(t - t_0) + base + rate (t - t_0) + fade(t - t_0).
@@ -33,7 +33,7 @@ class Segment:
     """
 
     change: PhaseChange
-    layout: Layout
+    layout: DerivativeLayout
     goal: Callable[[float], FloatArray]
     base: FloatArray
     rate: FloatArray
@@ -45,14 +45,14 @@ class Segment:
     def begin(
         cls,
         change: PhaseChange,
-        layout: Layout,
+        layout: DerivativeLayout,
         goal: Callable[[float], FloatArray],
         named: Sequence[int],
         rate: FloatArray,
         present: FloatArray,
         over: float,
         origin: FloatArray,
-    ) -> "Segment":
+    ) -> "ReferenceSegment":
         """The references that begin with present values and derivatives.
 
         Args:
@@ -95,7 +95,7 @@ class Segment:
 
 
 @dataclass(frozen=True, eq=False)
-class Progress(Immutable):
+class TaskProgress(Immutable):
     """What a context holds of a task.
 
     Attributes:
@@ -105,7 +105,7 @@ class Progress(Immutable):
         is_felt: Whether it has been felt since then.
     """
 
-    segments: tuple[Segment, ...] = ()
+    segments: tuple[ReferenceSegment, ...] = ()
     step: float = -inf
     felt: float = -inf
     is_felt: bool = False
@@ -116,7 +116,7 @@ class Progress(Immutable):
         return tuple(segment.change for segment in self.segments)
 
 
-def places_at(segments: Sequence[Segment], times: FloatArray) -> Indices:
+def places_at(segments: Sequence[ReferenceSegment], times: FloatArray) -> Indices:
     """Which segment held at each time; at the moment of a change that before."""
     starts = [segment.change.time for segment in segments[1:]]
     return np.searchsorted(starts, times, side="left")

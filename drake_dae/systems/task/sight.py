@@ -11,7 +11,7 @@ from drake_dae.systems.task.traced import EARLY
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class PhaseDecision:
     """What decides whether a phase goes on.
 
     Attributes:

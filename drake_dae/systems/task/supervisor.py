@@ -25,9 +25,9 @@ from drake_dae.systems.blocks.traced import Block, Computation, Guard, Update
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
-from drake_dae.systems.task.planner import CONTACT, FREE, Cause, Now, Planner
-from drake_dae.systems.task.progress import Progress, Segment
-from drake_dae.systems.task.sight import Sight
+from drake_dae.systems.task.planner import CONTACT, FREE, ModelMoment, PhaseCause, TaskPlanner
+from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
+from drake_dae.systems.task.sight import PhaseDecision
 from drake_dae.systems.task.task import Task
 from drake_dae.systems.task.traced import EARLY, SEEN, TracedTask
 
@@ -78,7 +78,7 @@ class TaskSupervisor(LeafSystem):
         self.set_name("task")
         self._sample_period = sample_period
         self.task, self._laws, self._place, self._force = task, laws, place, force
-        self._phases, self._plan = task.plan.phases, Planner(task, laws, place)
+        self._phases, self._plan = task.plan.phases, TaskPlanner(task, laws, place)
         self._traced = TracedTask(task, laws, place, force, self._plan, num_forces, sample_period)
         system = laws[FREE].system
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
@@ -89,7 +89,7 @@ class TaskSupervisor(LeafSystem):
             self._control_port = declared("control", system.num_controls)
         self.signal_ports = {name: declared(SIGNAL + name, 1) for name in task.signals}
         self.DeclareNumericParameter(BasicVector(system.parameter_values))
-        self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
+        self._index = self.DeclareAbstractState(AbstractValue.Make(TaskProgress()))
         self._held = self.DeclareDiscreteState(self._traced.size)
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
         self._witnesses: list[WitnessFunction] = []
@@ -137,12 +137,12 @@ class TaskSupervisor(LeafSystem):
             size = self._force_port.size()
             self.DeclareVectorOutputPort("tared_force", size, weakly(self._calc_tared), seen)
 
-    def progress(self, context: Context) -> Progress:
+    def progress(self, context: Context) -> TaskProgress:
         """How far the task is, in a context of this system."""
-        found: Progress = context.get_abstract_state(self._index).get_value()
+        found: TaskProgress = context.get_abstract_state(self._index).get_value()
         return found
 
-    def desired(self, segment: Segment, time: float) -> FloatArray:
+    def desired(self, segment: ReferenceSegment, time: float) -> FloatArray:
         """The positions, the force and the distance that a segment wants at a time in s."""
         values = segment.reference(time)[segment.layout.lowest]
         found = np.append(values, 0.0)
@@ -153,18 +153,18 @@ class TaskSupervisor(LeafSystem):
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
 
-    def _now(self, context: Context) -> Now:
+    def _now(self, context: Context) -> ModelMoment:
         parameters = context.get_numeric_parameter(0).CopyToVector()
-        return Now(context.get_time(), self._state_port.Eval(context), parameters)
+        return ModelMoment(context.get_time(), self._state_port.Eval(context), parameters)
 
-    def _segment(self, context: Context) -> Segment:
+    def _segment(self, context: Context) -> ReferenceSegment:
         """The references that hold now."""
         progress = self.progress(context)
         return progress.segments[-1] if progress.segments else self._plan.first(self._now(context))
 
     # What ends a phase.
 
-    def _moment(self, context: Context, segment: Segment) -> Moment:
+    def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
         time = context.get_time()
         force = float(self._seen(context)[0])
         distance, rate, moved, rates = self._plan.motion(self._now(context))
@@ -187,7 +187,7 @@ class TaskSupervisor(LeafSystem):
         held = context.get_discrete_state(self._held).value()
         return self._traced.seen(held, float(self._force_port.Eval(context)[self._force]))
 
-    def _sight(self, context: Context, progress: Progress) -> Sight:
+    def _sight(self, context: Context, progress: TaskProgress) -> PhaseDecision:
         task, segment = self.task, progress.segments[-1]
         moment, over = self._moment(context, segment), self._is_over(segment)
         excess, lost, end, late = moment.force - task.contact_force, np.inf, np.inf, np.inf
@@ -205,7 +205,7 @@ class TaskSupervisor(LeafSystem):
             found = self._traced.tally.margins(phase, tally, moment)
             guards = np.array([np.inf, *map(float, found)])[-max(len(found), 1) :]
         felt = excess if progress.is_felt else -excess
-        return Sight(moment, guards, np.array([np.min(guards), end, lost, late, felt]))
+        return PhaseDecision(moment, guards, np.array([np.min(guards), end, lost, late, felt]))
 
     def _guard(self, context: Context) -> float:
         """Positive while the phase goes on: Drake seeks where that ends."""
@@ -220,7 +220,7 @@ class TaskSupervisor(LeafSystem):
         # start of a step.
         return 1.0 if least <= 0.0 and context.get_time() == progress.step else least
 
-    def _is_over(self, segment: Segment) -> bool:
+    def _is_over(self, segment: ReferenceSegment) -> bool:
         return segment.change.place >= len(self._phases)
 
     def _begin(self, context: Context, state: State) -> EventStatus:
@@ -234,7 +234,7 @@ class TaskSupervisor(LeafSystem):
                 time,
                 self._state_port.Eval(context).copy(),
             )
-        progress = Progress((self._segment(context),), time - self._sample_period, time)
+        progress = TaskProgress((self._segment(context),), time - self._sample_period, time)
         self._put(state, progress, np.zeros(len(SEEN)), np.zeros(self._traced.tally.size))
         return EventStatus.Succeeded()
 
@@ -262,17 +262,19 @@ class TaskSupervisor(LeafSystem):
         self._put(state, now, force, tally)
         return status
 
-    def _put(self, state: State, progress: Progress, seen: FloatArray, tally: FloatArray) -> None:
+    def _put(
+        self, state: State, progress: TaskProgress, seen: FloatArray, tally: FloatArray
+    ) -> None:
         state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
         state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, seen, tally))
 
     def _changed(
-        self, context: Context, progress: Progress, seen: Sight
-    ) -> tuple[Segment, EventStatus]:
+        self, context: Context, progress: TaskProgress, seen: PhaseDecision
+    ) -> tuple[ReferenceSegment, EventStatus]:
         """What follows where a phase has ended."""
         segment, now, moment = progress.segments[-1], self._now(context), seen.moment
         if self._is_over(segment):
-            cause = Cause("the contact is lost at rest", segment.change.chosen, True)
+            cause = PhaseCause("the contact is lost at rest", segment.change.chosen, True)
             following = self._plan.following(now, segment, moment, None, cause)
             return following, EventStatus.Succeeded()
         place = segment.change.place
@@ -289,7 +291,7 @@ class TaskSupervisor(LeafSystem):
         leaves = place >= self.task.plan.last  # As a phase before has failed or not.
         has_failed = outcome != "success" or (leaves and segment.change.failed)
         ends = self.task.plan.ends_in_contact(place) if outcome == "success" else None
-        cause = Cause(reason, after.chosen, has_failed, ends)
+        cause = PhaseCause(reason, after.chosen, has_failed, ends)
         return self._plan.following(now, segment, moment, after.place, cause), status
 
     # What is shown.

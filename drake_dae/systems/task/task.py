@@ -9,7 +9,7 @@ from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.phases.guards import Watched
-from drake_dae.systems.task.phases.plan import Plan, check_guards, named
+from drake_dae.systems.task.phases.plan import PhasePlan, check_guards, named
 
 _STEADY = 6.0
 """`contact_force` is at least so many standard deviations of the filtered noise, so that one sample
@@ -54,7 +54,7 @@ class Task:
     force_noise: float = 0.0
     tare_time: float = 0.0
     retries: int = 10
-    plan: Plan = field(init=False, repr=False, compare=False)
+    plan: PhasePlan = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
@@ -77,7 +77,7 @@ class Task:
             raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
         phases = named(self.phases)
         check_guards(phases, self.contact_force)
-        plan = Plan(phases, self.retries)
+        plan = PhasePlan(phases, self.retries)
         object.__setattr__(self, "phases", phases)
         object.__setattr__(self, "plan", plan)
 

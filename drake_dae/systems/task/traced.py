@@ -22,9 +22,9 @@ from drake_dae.systems.blocks.traced import (
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
 from drake_dae.systems.task.phases import Moment, Phase
-from drake_dae.systems.task.phases.tally import Tally
-from drake_dae.systems.task.planner import CONTACT, FREE, Planner
-from drake_dae.systems.task.progress import Progress, Segment
+from drake_dae.systems.task.phases.tally import GuardMemory
+from drake_dae.systems.task.planner import CONTACT, FREE, TaskPlanner
+from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
@@ -59,13 +59,13 @@ class TracedTask:
         laws: tuple[TrackingLaw, TrackingLaw],
         place: int,
         force: int,
-        plan: Planner,
+        plan: TaskPlanner,
         num_forces: int,
         sample_period: float,
     ) -> None:
         self._task, self._laws, self._place, self._plan = task, laws, place, plan
         self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
-        self.tally = Tally(self._phases, sample_period)
+        self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
@@ -113,7 +113,7 @@ class TracedTask:
         return bool(held[NAMES.index("count")] < self._tares - 0.5)
 
     def tally_of(self, held: FloatArray) -> FloatArray:
-        """What has been counted for the guards; see `Tally`."""
+        """What has been counted for the guards; see `GuardMemory`."""
         return held[self._tallied]
 
     def work_of(self, held: FloatArray) -> float:
@@ -124,7 +124,7 @@ class TracedTask:
     def _places(self) -> list[int]:
         return [NAMES.index(name) for name in SEEN]
 
-    def numbers(self, progress: Progress, seen: FloatArray, tally: FloatArray) -> FloatArray:
+    def numbers(self, progress: TaskProgress, seen: FloatArray, tally: FloatArray) -> FloatArray:
         """The numbers of a task that is so far, with what is seen of the force and counted."""
         found = np.zeros(self.size)
         if not progress.segments:
@@ -150,7 +150,7 @@ class TracedTask:
         return found
 
     @staticmethod
-    def touched(segments: Sequence[Segment]) -> bool:
+    def touched(segments: Sequence[ReferenceSegment]) -> bool:
         """Whether the present segment began where the robot had been free."""
         return len(segments) > 1 and not segments[-2].change.in_contact
 
@@ -163,7 +163,7 @@ class TracedTask:
         return found
 
     def _reference(self, which: int) -> ca.SX:
-        """R of a law, zero where the other one acts; see `Segment`."""
+        """R of a law, zero where the other one acts; see `ReferenceSegment`."""
         law, passed = self._laws[which], self._time - self._named["start"]
         size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
 

@@ -3,7 +3,7 @@
 import pytest
 
 from drake_dae import SensedContact, SensorNoise, advised_gains
-from drake_dae.dae.beyond.one_direction import Direction, Rates, sampled_loop
+from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, sampled_loop
 from drake_dae.errors import GainError, ModelError
 
 T, ROUGHNESS = 1e-3, 1.0
@@ -32,11 +32,11 @@ def test_gains_bear_other_masses_and_stiffnesses(numbers):
     own, fast = found.gains, found.state_rate
     quiet = SensorNoise(velocity_bandwidth=given.noise.velocity_bandwidth)
     lowest, middle, highest = own.position_gains(3)
-    free = Rates((lowest, middle, highest), 0.0, own.observer_rate, fast)
+    free = DirectionGains((lowest, middle, highest), 0.0, own.observer_rate, fast)
     for mass in (0.5, 1.0, 2.0):
         loop = sampled_loop(Direction(T, given.delay, mass_error=mass), free, quiet)
         assert loop.radius < 1.0 - 0.05 * T * own.position_rate / 1.5
-    contact = Rates(
+    contact = DirectionGains(
         (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
     )
     for mass in (2.0 / 3.0, 1.0, 1.5):
@@ -52,11 +52,11 @@ def test_errors_and_roughness_are_those_of_the_gains(numbers):
     """Of the two directions, by loops that other tests compare with runs."""
     found = advised_gains(given := situation(*numbers), ROUGHNESS)
     own, fast = found.gains, found.state_rate
-    free = Rates(tuple(own.position_gains(3)), 0.0, own.observer_rate, fast)
+    free = DirectionGains(tuple(own.position_gains(3)), 0.0, own.observer_rate, fast)
     direction = Direction(T, given.delay)
     error, _ = sampled_loop(direction, free, given.seen(0.7)).deviations()
     _, jump = sampled_loop(direction, free, given.seen(1.0)).deviations()
-    contact = Rates(
+    contact = DirectionGains(
         (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
     )
     pressing = Direction(T, given.delay, given.mobility, given.stiffness)

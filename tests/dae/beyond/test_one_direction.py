@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
-from drake_dae.dae.beyond.one_direction import Direction, Rates, SensorNoise, sampled_loop
+from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, SensorNoise, sampled_loop
 
 T = 1e-3
-FREE = Rates((15.0**3, 2.0 * 15.0**2, 30.0), 0.0, 20.0)
-PRESSING = Rates((0.0, 0.0, 23.0), 9.0, 10.0)
+FREE = DirectionGains((15.0**3, 2.0 * 15.0**2, 30.0), 0.0, 20.0)
+PRESSING = DirectionGains((0.0, 0.0, 23.0), 9.0, 10.0)
 CONTACT = Direction(T, 1, 0.03, 1e5)
 NOISE = SensorNoise(1e-5, 1e-3, 0.3)
 
@@ -111,7 +111,7 @@ def test_motion_within_a_sample_is_that_of_the_contact():
 
 def test_differences_lag_as_their_filter_does():
     """Without noise and with a bandwidth far above the loop's, poles are those of velocities."""
-    slow = Rates((1.0, 2.0, 2.0), 0.0, 2.0)
+    slow = DirectionGains((1.0, 2.0, 2.0), 0.0, 2.0)
     lagging = SensorNoise(velocity_bandwidth=5000.0)
     radii = [sampled_loop(Direction(T, 0), slow, each).radius for each in (SensorNoise(), lagging)]
     assert np.log(radii[1]) == pytest.approx(np.log(radii[0]), rel=5e-3)

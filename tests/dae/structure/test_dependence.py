@@ -6,7 +6,7 @@ import pytest
 from problems import redundant, system_of
 
 from drake_dae import DaeSystem, analyze, find_structure
-from drake_dae.dae.structure.assumptions import Cause
+from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.errors import AssumptionError, ModelError
 
 
@@ -46,7 +46,7 @@ def test_the_rows_that_follow_are_named_with_their_factors():
             constraint_output_signals=labels,
         )
     )
-    assert found.cause is Cause.REDUNDANT
+    assert found.cause is ViolationKind.REDUNDANT
     corner, again = found.combinations
     assert (corner.name, corner.others, corner.constant) == ("corner", ("floor", "wall"), True)
     np.testing.assert_allclose(corner.factors, [3.0, -1.0], rtol=1e-9)
@@ -60,14 +60,14 @@ def test_the_rows_that_follow_are_named_with_their_factors():
 def test_rows_are_named_also_where_their_derivatives_have_no_room():
     """Eight derivatives in six states."""
     found = violation(mass_point(lambda q: [q[0], q[1], 3 * q[0] - q[1], 1000 * q[1]]))
-    assert found.cause is Cause.NO_FORCE
+    assert found.cause is ViolationKind.NO_FORCE
     assert "gradients of constraints: 'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
 
 
 def test_factors_that_depend_on_the_state_are_reported():
     """k_2 = (2 + sin q_2) k_1 has the gradient (2 + sin q_2) dk_1 on N*."""
     found = violation(mass_point(lambda q: [q[0], (2 + ca.sin(q[1])) * q[0]]))
-    assert found.cause is Cause.REDUNDANT
+    assert found.cause is ViolationKind.REDUNDANT
     assert not found.combinations[0].constant
     np.testing.assert_allclose(found.combinations[0].factors, 2 + np.sin(found.state[1]), rtol=1e-9)
     assert " y0, with factors that depend on the state" in str(found)
@@ -80,7 +80,7 @@ def test_a_singular_configuration_is_one():
         return [q[1] - q[0] ** 2, q[1] + q[0] ** 2 + q[0] * q[2]]
 
     found = violation(mass_point(k))
-    assert found.cause is Cause.SINGULAR_CONFIGURATION
+    assert found.cause is ViolationKind.SINGULAR_CONFIGURATION
     assert found.combinations[0].name == "y1"
     np.testing.assert_allclose(found.combinations[0].factors, [1.0], rtol=1e-9)
     assert "This is a singular configuration" in str(found)
@@ -107,7 +107,7 @@ def hidden(k):
 def test_a_regular_difference_is_not_called_redundant(factor):
     """k = (a, factor a + b) has A = [1, 0; factor, 0]; b alone has degree 2, and A is regular."""
     found = violation(hidden(lambda x: [x[0], factor * x[0] + x[1]]))
-    assert found.cause is Cause.HIDDEN_DEGREE
+    assert found.cause is ViolationKind.HIDDEN_DEGREE
     (combination,) = found.combinations
     assert (combination.name, combination.others) == ("y1", ("y0",))
     np.testing.assert_allclose(combination.factors, [factor], rtol=1e-9)
@@ -130,7 +130,7 @@ def test_inputs_that_do_not_act_independently_at_one_state():
             m=lambda x: [[0, 0]],
         )
     )
-    assert found.cause is Cause.CONSTRAINT_RANK
+    assert found.cause is ViolationKind.CONSTRAINT_RANK
     assert "rows of A(x): 'y1' ~ 1 y0" in str(found)
 
 

@@ -33,7 +33,7 @@ from drake_dae import (
     poles,
     share_forces,
 )
-from drake_dae.dae.structure.assumptions import Cause
+from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 
 LOAD = np.array([9.81 * 4.0, -0.3, 0.2])
@@ -320,7 +320,7 @@ def test_a_redundant_mechanism_is_reported():
     dae = RobotModel.from_multibody(platform(), pins(), [], 0.8 * PARALLEL, forces=[]).dae
     with pytest.raises(AssumptionError, match="redundant at every state") as caught:
         find_constraint_structure(dae)
-    assert caught.value.violation.cause is Cause.REDUNDANT
+    assert caught.value.violation.cause is ViolationKind.REDUNDANT
     assert "share_forces, or `compliances` of a robot" in str(caught.value)
     assert "'pin2." in str(caught.value)
     assert "redundant at every state" in analyze(dae).problems[0]

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.sparse import diags, vstack
 
-from drake_dae.dae.timing.reachable import Lines, fastest_motion
+from drake_dae.dae.timing.reachable import LinearLimits, fastest_motion
 from drake_dae.dae.timing.smoothing import smoothed
 
 
@@ -35,7 +35,7 @@ def largest_by_program(points, lines, largest):
 
 def test_an_acceleration_and_a_speed_make_a_trapezoid():
     points = np.linspace(0.0, 1.0, 401)
-    lines = Lines(np.tile([0.5, -0.5], (401, 1)), np.zeros((401, 2)))
+    lines = LinearLimits(np.tile([0.5, -0.5], (401, 1)), np.zeros((401, 2)))
     found = fastest_motion(points, lines, np.full(401, 0.5))
     # |a| <= 2 and s' <= sqrt(0.5): length / speed + speed / a; a is constant in all intervals.
     wanted = 1.0 / np.sqrt(0.5) + np.sqrt(0.5) / 2.0
@@ -53,7 +53,7 @@ def test_the_result_is_that_of_a_linear_program(seed):
     ]
     # Next to a zero of alpha the largest b at one point and at the next exclude each other.
     walk[0] = np.sign(walk[0][0]) * (0.2 + np.abs(walk[0]))
-    lines = Lines(np.hstack([walk[0], -walk[0]]), np.hstack([walk[1], -walk[1]]))
+    lines = LinearLimits(np.hstack([walk[0], -walk[0]]), np.hstack([walk[1], -walk[1]]))
     largest = np.where(random.uniform(size=count + 1) < 0.5, np.inf, 0.3)
     found = fastest_motion(points, lines, largest)
     wanted = largest_by_program(points, lines, largest)
@@ -63,7 +63,7 @@ def test_the_result_is_that_of_a_linear_program(seed):
 
 def test_a_smoothed_motion_has_the_ends_and_a_continuous_acceleration():
     points = (1.0 - np.cos(np.pi * np.arange(301) / 300)) / 2.0
-    lines = Lines(np.tile([0.5, -0.5], (301, 1)), np.zeros((301, 2)))
+    lines = LinearLimits(np.tile([0.5, -0.5], (301, 1)), np.zeros((301, 2)))
     found = fastest_motion(points, lines, np.full(301, np.inf))
     b, a, times = smoothed(points, found.b, found.a)
     assert b[0] == b[-1] == 0.0

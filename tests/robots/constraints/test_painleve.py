@@ -34,9 +34,9 @@ from drake_dae import (
 from drake_dae.dae.references import stack_references
 from drake_dae.dae.system.contacts import (
     MOST,
-    Contact,
     Contacts,
     PainleveOutcome,
+    UnilateralInput,
     critical_factor,
     painleve_outcome,
 )
@@ -211,7 +211,7 @@ def test_the_reserve_is_positive_exactly_for_a_p_matrix(seed):
     mu = ca.SX.sym("mu")
     parameter = Parameter("mu", np.array([0.0]), symbol=mu)
     names = [Signal(name) for name in "abcd"]
-    contacts = Contacts("x", names, [parameter], [Contact(n, "mu") for n in "abd"])
+    contacts = Contacts("x", names, [parameter], [UnilateralInput(n, "mu") for n in "abd"])
     assert contacts.rows == rows
     function = TracedFunction("r", {"mu": mu}, {"r": contacts.reserve(ca.SX(A_0) - mu * D)})
     critical = critical_factor(A_0, D, rows)
@@ -236,7 +236,7 @@ def test_the_reserve_is_the_least_ratio_of_minors_in_any_order_of_the_contacts(s
     wanted = min(1.0, (minors(A_1, rows) / minors(A_0, rows)).min())
     for order in itertools.permutations(rows):
         places = [*order, count]
-        contacts = [Contact(f"f{i}", "mu") for i in range(count)]
+        contacts = [UnilateralInput(f"f{i}", "mu") for i in range(count)]
         both = Contacts("x", [Signal(names[i]) for i in places], [parameter], contacts)
         matrix = ca.SX(A_0 + 0.0) + mu * (A_1 - A_0)
         reserve = both.reserve(matrix[places, places])
@@ -272,13 +272,13 @@ def test_too_many_contacts_are_refused():
     names = [Signal(f"f{i}") for i in range(MOST + 1)]
     friction = Parameter("mu", np.array([0.3]))
     with pytest.raises(ModelError, match="9 unilateral forces"):
-        Contacts("x", names, [friction], [Contact(n.name, "mu") for n in names])
+        Contacts("x", names, [friction], [UnilateralInput(n.name, "mu") for n in names])
 
 
 def test_a_contact_needs_the_friction_that_it_names():
     system = touching("two_link").dae
     with pytest.raises(ModelError, match="no parameter"):
-        replace(system, contacts=(Contact("wall.force", "wall.friction"),))
+        replace(system, contacts=(UnilateralInput("wall.force", "wall.friction"),))
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from drake_dae.running.rollout.stepping.many import BLOCK, FEW, Many
+from drake_dae.running.rollout.stepping.many import BLOCK, FEW, VectorizedFunction
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
 a, b, c = ca.vertsplit(X)
@@ -32,7 +32,7 @@ def test_it_is_the_function_at_each_moment(name, count):
     random = np.random.default_rng(count)
     points = random.uniform([-2.0, 0.1, -0.9], [2.0, 2.0, 0.9], (count, 3))
     shared = np.array([1.5, -0.5])
-    found = Many(function)(points, shared)
+    found = VectorizedFunction(function)(points, shared)
     for index in {0, count // 2, count - 1}:
         wanted = function.call([points[index], shared])
         for values, value in zip(found, wanted, strict=True):

@@ -7,7 +7,7 @@ from runs import scenario
 
 from drake_dae import build_scenario
 from drake_dae.dae.states.family import Deciding
-from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.scenario.forms.keys import violated
 
@@ -16,7 +16,7 @@ PYTHON = re.compile(
 )
 
 
-@pytest.mark.parametrize("cause", Cause)
+@pytest.mark.parametrize("cause", ViolationKind)
 @pytest.mark.parametrize(("assumption", "key"), [(2, "constraints"), (5, "outputs")])
 def test_no_remedy_is_a_call_of_python(cause, assumption, key):
     deciding = Deciding(("wall.stiffness",), (1.0,), (0.0,))

@@ -20,7 +20,7 @@ from drake_dae.scenario.robot_file.changes import change_robot, finalize
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.readable.inertias import nearest_inertia
 from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import Base, Pose, Robot
+from drake_dae.scenario.robot_file.robot import Pose, Robot, RobotPlacement
 
 
 def plant_of(file: Path, scene_graph: SceneGraph | None = None, **more) -> MultibodyPlant:
@@ -124,7 +124,7 @@ def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
     text = texts[name].replace('diaginertia="0.02 0.01 0.01"', 'diaginertia="0 0 0"')
     own = Robot(
         str(written(tmp_path, text, name)),
-        base=Base("base") if name == "arm.urdf" else None,
+        base=RobotPlacement("base") if name == "arm.urdf" else None,
         actuators="all",
     )
     with pytest.raises(
@@ -139,7 +139,7 @@ def test_all_joints_that_move_no_mass_are_named(tmp_path):
     heavy, empty = [link(name, 1) for name in names[:2]], [f'<link name="{n}"/>' for n in names[2:]]
     file = written(tmp_path, robot("arm", *heavy, *empty, *joints))
     with pytest.raises(ScenarioError, match=r"move no mass: j1, j2\. .*: lower, hand;"):
-        robot_links(Robot(str(file), base=Base("base"), actuators="all"), SceneGraph())
+        robot_links(Robot(str(file), base=RobotPlacement("base"), actuators="all"), SceneGraph())
 
 
 def test_a_point_mass_moves_by_both_joints_though_not_where_the_arm_is_straight(tmp_path):
@@ -154,7 +154,9 @@ def test_a_point_mass_moves_by_both_joints_though_not_where_the_arm_is_straight(
         joint("j2", "upper", "lower", "0 1 0", (0.0, 0.0, 0.4)),
     ]
     file = written(tmp_path, robot("arm", *parts))
-    links, _ = robot_links(Robot(str(file), base=Base("base"), actuators="all"), SceneGraph())
+    links, _ = robot_links(
+        Robot(str(file), base=RobotPlacement("base"), actuators="all"), SceneGraph()
+    )
     plant = links.plant
     context = plant.CreateDefaultContext()
     for bend in (0.0, 0.7):
@@ -306,9 +308,9 @@ def test_a_mass_of_0_has_no_inertia(name, tmp_path):
     with pytest.raises(
         ModelError, match=r"'arm': without mass no body has the moments .*\(1, 1, 1\)"
     ):
-        plant_of(file, base=Base("arm"))
+        plant_of(file, base=RobotPlacement("arm"))
     with pytest.warns(RobotFileWarning, match="without mass"):
-        plant = plant_of(file, base=Base("arm"), leave_out=["inertia"])
+        plant = plant_of(file, base=RobotPlacement("arm"), leave_out=["inertia"])
     assert plant.GetBodyByName("arm").default_mass() == 0.0
 
 
@@ -324,7 +326,7 @@ def colours(folder: Path, *materials: str, top: str = "") -> list[float]:
     joints = [joint(f"j{k}", "l0", f"l{k}", "0 0 1") for k in range(1, len(materials))]
     file = written(folder, robot("r", *links, *joints, top))
     scene_graph = SceneGraph()
-    plant = plant_of(file, scene_graph, base=Base("l0"))
+    plant = plant_of(file, scene_graph, base=RobotPlacement("l0"))
     inspector = scene_graph.model_inspector()
     found = []
     for k in range(len(materials)):
@@ -464,7 +466,7 @@ def test_a_robot_that_its_file_holds_stands_where_the_user_says(name, tmp_path):
     plant = plant_of(two)
     np.testing.assert_allclose(place(plant, "tip", "left"), [0, 0, 0.25], atol=1e-12)
     np.testing.assert_allclose(place(plant, "tip", "right"), [1, 2, 3.25], atol=1e-12)
-    moved = Base("base", Pose((0.5, 0.0, 0.0), (0.0, 90.0, 0.0)))
+    moved = RobotPlacement("base", Pose((0.5, 0.0, 0.0), (0.0, 90.0, 0.0)))
     np.testing.assert_allclose(
         place(plant_of(file, base=moved), "tip", "arm"), [0.75, 0, 0], atol=1e-12
     )
@@ -546,10 +548,10 @@ def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
 
 @pytest.mark.parametrize("name", FLOATING)
 def test_a_floating_joint_can_be_welded(name, tmp_path):
-    plant = plant_of(written(tmp_path, FLOATING[name], name), base=Base("hull"))
+    plant = plant_of(written(tmp_path, FLOATING[name], name), base=RobotPlacement("hull"))
     assert plant.num_velocities() == 1
     links, _ = robot_links(
-        Robot(str(tmp_path / name), base=Base("hull"), actuators="all"), SceneGraph()
+        Robot(str(tmp_path / name), base=RobotPlacement("hull"), actuators="all"), SceneGraph()
     )
     assert [signal.name for signal in links.position_signals] == ["a"]
 

@@ -17,7 +17,7 @@ from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.excitation.promised import Trials
+from drake_dae.studies.excitation.promised import ScenarioRuns
 
 MASS, SIGMA, FASTEST, DURATION, STEP = 2.5, 1e-4, 1.0, 2.0, 0.01
 
@@ -148,7 +148,7 @@ def test_measured_values_spread_as_promised(slider):
     ],
 )
 def test_runs_beyond_limits_are_refused(slider, changes, kind):
-    trial = Trials(load_scenario(slider), ["mass.mass"], NOISE).run(changes)
+    trial = ScenarioRuns(load_scenario(slider), ["mass.mass"], NOISE).run(changes)
     assert list(trial.problems) == ([] if kind is None else [kind])
     assert (trial.promised is None) == (kind is not None)
 
@@ -172,7 +172,7 @@ WALL = ("duration=0.5", "integrator={integration_scheme: runge_kutta3, max_step_
 def test_a_contact_that_would_pull_or_opens_is_refused(settings, kind):
     made = load_scenario(find_scenario("two_link_wall"), [*WALL, *settings])
     noise = {"position": 1e-4, "force": 0.1}
-    run = Trials(made, ["link2.mass"], noise).run
+    run = ScenarioRuns(made, ["link2.mass"], noise).run
     assert not run({}).problems
     large = {
         "references.wall.force.amplitudes.0": 60.0,
@@ -182,7 +182,7 @@ def test_a_contact_that_would_pull_or_opens_is_refused(settings, kind):
 
 
 def test_ctrl_c_gives_the_best_so_far(slider, monkeypatch):
-    made, run = [], Trials.run
+    made, run = [], ScenarioRuns.run
 
     def interrupted(self, changes, judge_all=False):
         made.append(changes)
@@ -190,7 +190,7 @@ def test_ctrl_c_gives_the_best_so_far(slider, monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
         return run(self, changes, judge_all)
 
-    monkeypatch.setattr(Trials, "run", interrupted)
+    monkeypatch.setattr(ScenarioRuns, "run", interrupted)
     found = excite(load_scenario(slider), RANGES, ["mass.mass"], noise=NOISE, runs=40)
     assert (found.runs, found.interrupted) == (3, signal.SIGINT)
     assert found.after.d_size <= found.before.d_size
@@ -260,7 +260,7 @@ def test_the_best_is_better_than_random_choices(criterion):
     ranges = {f"references.{key}": ends for key, ends in keys.items()}
     noise, free = {"position": 1e-4, "force": 0.1}, ["link1.mass", "link2.mass"]
     found = excite(made, ranges, free, noise=noise, criterion=criterion, runs=80)
-    trials, random = Trials(made, free, noise), np.random.default_rng(1)
+    trials, random = ScenarioRuns(made, free, noise), np.random.default_rng(1)
     for _ in range(200):
         values = {key: random.uniform(*ends) for key, ends in ranges.items()}
         trial = trials.run(values)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_dae.studies.identification.chain import Chain
+from drake_dae.studies.identification.chain import StateChain
 
 STATES, COMMON, LAST = 3, 2, 5
 
@@ -43,7 +43,7 @@ def test_a_chain_gives_what_all_equations_together_give(growth):
     given = random_chain(0, growth)
     matrix, right = dense(*given)
     expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    chain = Chain.of(*given)
+    chain = StateChain.of(*given)
     theta = np.linalg.solve(chain.common[:, :COMMON], -chain.common[:, COMMON])
     states, along = chain.states(theta)
     # Both are backward stable; the conditions are below 1e4.
@@ -63,6 +63,6 @@ def test_states_that_nothing_is_known_about_do_no_harm():
     moves[:, :, 1] = 0.0
     matrix, right = dense(own, moves, loose, weak)
     expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    chain = Chain.of(own, moves, loose, weak)
+    chain = StateChain.of(own, moves, loose, weak)
     theta = np.linalg.solve(chain.common[:, :COMMON], -chain.common[:, COMMON])
     np.testing.assert_allclose(theta, expected[-COMMON:], rtol=1e-9)

@@ -15,10 +15,10 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.identification.driven import Driven
+from drake_dae.studies.identification.driven import DrivenPlant
 from drake_dae.studies.identification.identify import identify
 from drake_dae.studies.identification.measured import measured, measured_ports
-from drake_dae.studies.identification.pieces import Pieces
+from drake_dae.studies.identification.pieces import RecordPieces
 
 FIXED = (
     "integrator={integration_scheme: runge_kutta3, use_error_control: false, max_step_size: 0.001}",
@@ -77,10 +77,10 @@ def test_derivatives_are_those_of_differences(kind):
     loop, context, record = run_of((), *settings)
     places = [loop.plant.dae.parameter_slice("link2.mass").start]
     places += [place for _, place in loop.plant.further_parameters.values()][:1]
-    driven = Driven(loop, context, measured_ports(loop), places)
+    driven = DrivenPlant(loop, context, measured_ports(loop), places)
     data = measured(record, driven, "record")
     biases = np.array([-1] * (len(data.channels) - 1) + [0])
-    pieces = Pieces(driven, data, biases, 1, parts).first(40)
+    pieces = RecordPieces(driven, data, biases, 1, parts).first(40)
     x, theta = pieces.first_states, np.append(driven.nominal, 0.3)
     found = pieces.slopes(x, theta)
     n = x.shape[1]
@@ -496,13 +496,13 @@ def test_contacts_may_open_and_strike(settings, name, value):
 def test_steps_with_an_event_and_no_others_are_left_out():
     """A row whose time is that of an event may be before or after it."""
     loop, context, record = run_of((), *BOUNCE)
-    data = measured(record, Driven(loop, context, measured_ports(loop), []), "record")
+    data = measured(record, DrivenPlant(loop, context, measured_ports(loop), []), "record")
     expected = np.zeros(record.time.size - 1, dtype=bool)
     for event in record.events:
         expected[np.searchsorted(record.time, event.time) - 1] = True
     np.testing.assert_array_equal(data.cut, expected)
     shifted = replace(record, events=(replace(record.events[0], time=float(record.time[30])),))
-    data = measured(shifted, Driven(loop, context, measured_ports(loop), []), "record")
+    data = measured(shifted, DrivenPlant(loop, context, measured_ports(loop), []), "record")
     assert data.cut[[28, 29, 30, 31]].tolist() == [False, True, True, False]
 
 

@@ -38,7 +38,7 @@ from drake_dae import (
     with_disturbance,
 )
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.adaptive.balance import Balance
+from drake_dae.systems.adaptive.balance import ForceBalance
 
 MASSES = {"two_link": {"link1.mass": 3.0, "link2.mass": 2.0}, "seven_joint": {"tool.mass": 2.0}}
 MOVES = [SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
@@ -112,7 +112,7 @@ def late(record, after):
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 def test_skew_symmetry_and_the_coriolis_forces_of_multibody_plant(name):
     """To 1e-10 of forces of some 100 N m."""
-    balance = Balance(arm(name).model, tuple(MASSES[name]))
+    balance = ForceBalance(arm(name).model, tuple(MASSES[name]))
     q, v, s = balance.q, balance.v, ca.SX.sym("s", balance.v.numel())
     turns = ca.reshape(ca.jtimes(ca.vec(balance.mass), q, v), balance.mass.shape)
     values = ca.Function(

@@ -26,7 +26,7 @@ from drake_dae import (
 from drake_dae.errors import SimulationError
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.phases.tally import Tally
+from drake_dae.systems.task.phases.tally import GuardMemory
 
 PERIOD = 0.003
 PRESS = Press(10.0, over=0.05)
@@ -197,7 +197,7 @@ def test_a_task_that_is_done_in_contact_stays_there(phases):
 def test_a_guard_counts_consecutive_samples():
     """A force above its limit in every second sample, as of noise, never trips a guard of two."""
     phase = Dwell(1.0, guards=[PhaseGuard("force", 10.0, samples=2)])
-    tally, margins = Tally([phase], 1e-3), []
+    tally, margins = GuardMemory([phase], 1e-3), []
     counted = [0.0] * tally.size
     for force in (11.0, 9.0, 11.0, 9.0, 11.0, 12.0):
         now = Moment(0.1, force, 0.0, 0.0, 5.0)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.references.gcode.points import read_points
-from drake_dae.dae.references.gcode.program import Move, Program, read_program
+from drake_dae.dae.references.gcode.program import GCodeMove, GCodeProgram, read_program
 from drake_dae.dae.references.paths import check_order
 from drake_dae.dae.references.splines import (
     MOST_POINTS,
@@ -98,7 +98,7 @@ class GCodeReference(SplineReference):
         return replace(self, file=os.path.abspath(folder / self.file))
 
     @cached_property
-    def program(self) -> Program:
+    def program(self) -> GCodeProgram:
         """The moves of the file."""
         if Path(self.file).suffix.lower() == ".csv":
             return read_points(self.file)
@@ -131,7 +131,7 @@ class GCodeReference(SplineReference):
             parts.append(f"{', '.join(self.program.ignored)} not followed")
         return f"GCodeReference '{Path(self.file).name}': {'; '.join(parts)}"
 
-    def _speed(self, move: Move) -> float:
+    def _speed(self, move: GCodeMove) -> float:
         """The speed of a move along the outputs."""
         return min(move.speed, self.limits.speed)
 
@@ -181,7 +181,7 @@ class _Path:
         distances: Nodes along the path, with the ends of all moves among them, in m.
     """
 
-    def __init__(self, moves: Sequence[Move], speeds: Sequence[float]) -> None:
+    def __init__(self, moves: Sequence[GCodeMove], speeds: Sequence[float]) -> None:
         self.moves, self._speeds = moves, speeds
         self.ends = np.concatenate([[0.0], np.cumsum([move.length for move in moves])])
         parts = [

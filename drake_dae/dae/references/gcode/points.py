@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from drake_dae.dae.references.csv_file import numbers_of, read_cells
-from drake_dae.dae.references.gcode.program import MILLIMETRE, MINUTE, Move, Program
+from drake_dae.dae.references.gcode.program import MILLIMETRE, MINUTE, GCodeMove, GCodeProgram
 from drake_dae.errors import ReferenceSignalError
 
 SPEEDS = {"speed": MILLIMETRE, "feed": MILLIMETRE / MINUTE}
 """The names of the column of speeds -> their unit in m/s."""
 
 
-def read_points(file: str) -> Program:
+def read_points(file: str) -> GCodeProgram:
     """The straight moves between the points of a table.
 
     Its columns are x and y in mm, and if wanted speed in mm/s or feed in mm/min: that of the move
@@ -49,7 +49,9 @@ def read_points(file: str) -> Program:
                 f"'{file}', row {row + 2}: {named[0]} must be positive, got {values[row, 2]:g}"
             )
     pairs = zip(points, points[1:], speeds[1:].tolist(), strict=False)
-    moves = tuple(Move(start, end, speed) for start, end, speed in pairs if np.any(start != end))
+    moves = tuple(
+        GCodeMove(start, end, speed) for start, end, speed in pairs if np.any(start != end)
+    )
     if not moves:
         raise ReferenceSignalError(f"'{file}' moves nothing: all of its points are the same")
-    return Program(moves, ())
+    return GCodeProgram(moves, ())

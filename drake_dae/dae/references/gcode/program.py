@@ -28,7 +28,7 @@ _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 
 
 @dataclass(frozen=True, eq=False)
-class Move:
+class GCodeMove:
     """A straight move, or an arc, in m.
 
     Attributes:
@@ -82,7 +82,7 @@ class Move:
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class GCodeProgram:
     """What a program moves.
 
     Attributes:
@@ -90,7 +90,7 @@ class Program:
         ignored: What it says that no move follows, such as "M3" and "Z", in order.
     """
 
-    moves: tuple[Move, ...]
+    moves: tuple[GCodeMove, ...]
     ignored: tuple[str, ...]
 
 
@@ -107,7 +107,7 @@ class _Machine:
     ignored: dict[str, None] = field(default_factory=dict)
 
 
-def read_program(text: str, name: str) -> Program:
+def read_program(text: str, name: str) -> GCodeProgram:
     """The moves of a program.
 
     It follows G0, G1, G2 and G3 with X and Y, with I and J or R, F per minute, G20 and G21, G90 and
@@ -121,7 +121,7 @@ def read_program(text: str, name: str) -> Program:
     Raises:
         ReferenceSignalError: A line is not understood, or would not be followed, or nothing moves.
     """
-    machine, moves = _Machine(), list[Move]()
+    machine, moves = _Machine(), list[GCodeMove]()
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             goes_on = _follow(machine, line, moves)
@@ -131,10 +131,10 @@ def read_program(text: str, name: str) -> Program:
             break
     if not moves:
         raise ReferenceSignalError(f"'{name}' moves nothing along X or Y")
-    return Program(tuple(moves), tuple(machine.ignored))
+    return GCodeProgram(tuple(moves), tuple(machine.ignored))
 
 
-def _follow(machine: _Machine, line: str, moves: list[Move]) -> bool:
+def _follow(machine: _Machine, line: str, moves: list[GCodeMove]) -> bool:
     """Follows a line; whether the program goes on after it."""
     codes, values = _words(line)
     ends = False
@@ -189,7 +189,7 @@ def _words(line: str) -> tuple[list[tuple[str, float]], dict[str, float]]:
     return codes, values
 
 
-def _move(machine: _Machine, values: dict[str, float], moves: list[Move]) -> None:
+def _move(machine: _Machine, values: dict[str, float], moves: list[GCodeMove]) -> None:
     """Follows the coordinates of a line."""
     if machine.mode is None:
         raise ReferenceSignalError("coordinates before any G0, G1, G2 or G3")
@@ -209,14 +209,14 @@ def _move(machine: _Machine, values: dict[str, float], moves: list[Move]) -> Non
         if {"I", "J", "R"} & values.keys():
             raise ReferenceSignalError("I, J and R are those of arcs, G2 and G3")
         if np.any(start != end):
-            moves.append(Move(start, end, speed))
+            moves.append(GCodeMove(start, end, speed))
         return
     center = _center(machine, values, start, end)
     first, last = (np.arctan2(*(place - center)[::-1]) for place in (start, end))
     sweep = (last - first) % tau or tau
     if machine.mode == 2.0:
         sweep = sweep - tau or -tau
-    moves.append(Move(start, end, speed, center, float(sweep)))
+    moves.append(GCodeMove(start, end, speed, center, float(sweep)))
 
 
 def _center(

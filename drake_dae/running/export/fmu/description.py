@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 from drake_dae.dae.system.signals import Signal
-from drake_dae.running.export.steps.parts import CONTROLLER, Written
+from drake_dae.running.export.steps.parts import CONTROLLER, WrittenPart
 from drake_dae.running.export.steps.words import distinct, identifiers
 
 NEVER, AT_FIRST, ALWAYS = "NEVER", "AT_FIRST", "ALWAYS"
@@ -29,7 +29,7 @@ BASES = {
 
 
 @dataclass(frozen=True)
-class Variable:
+class FmuVariable:
     """A variable of an FMU.
 
     Attributes:
@@ -47,7 +47,7 @@ class Variable:
 
 
 @dataclass(frozen=True)
-class Group:
+class FmuVariableGroup:
     """Variables that follow each other in the memory of an FMU.
 
     Attributes:
@@ -57,29 +57,31 @@ class Group:
         kind: "Float64" or "Int32".
     """
 
-    variables: list[Variable]
+    variables: list[FmuVariable]
     place: str
     when: str
     kind: str = "Float64"
 
 
-def groups_of(written: Written) -> list[Group]:
+def groups_of(written: WrittenPart) -> list[FmuVariableGroup]:
     """The variables of a controller or a plant."""
     own = f"own.{written.kind}"
     is_controller = written.kind == CONTROLLER
 
-    def group(place: str, when: str, variables: Iterable[Variable], kind: str = "Float64") -> Group:
-        return Group(list(variables), place, when, kind)
+    def group(
+        place: str, when: str, variables: Iterable[FmuVariable], kind: str = "Float64"
+    ) -> FmuVariableGroup:
+        return FmuVariableGroup(list(variables), place, when, kind)
 
     values = zip(written.parameters, written.values.tolist(), strict=True)
-    parameters = [Variable(signal, "parameter", "tunable", value) for signal, value in values]
+    parameters = [FmuVariable(signal, "parameter", "tunable", value) for signal, value in values]
     starts = written.inputs.tolist()
     inputs = [
-        Variable(signal, "input", "continuous", start)
+        FmuVariable(signal, "input", "continuous", start)
         for signal, start in zip(_named(written.part.inputs), starts, strict=True)
     ]
     kind = "discrete" if is_controller else "continuous"
-    outputs = [Variable(signal, "output", kind) for signal in _named(written.part.outputs)]
+    outputs = [FmuVariable(signal, "output", kind) for signal in _named(written.part.outputs)]
     found = [group(_at(f"{own}.parameters"), ALWAYS, parameters)]
     if is_controller:
         controls = [
@@ -87,25 +89,25 @@ def groups_of(written: Written) -> list[Group]:
         ]
         settings = {"stop_time": ("s", 0.1), "max_age": ("s", 1.5 * written.part.ticks.period)}
         age = Signal("measurement_age", "s")
-        patience = Variable(
+        patience = FmuVariable(
             Signal("patience"), "parameter", "tunable", 10, "bad steps until it stops"
         )
         found += [
             group(
                 _at(f"{own}.stop_control"),
                 ALWAYS,
-                [Variable(signal, "parameter", "tunable", 0.0) for signal in controls],
+                [FmuVariable(signal, "parameter", "tunable", 0.0) for signal in controls],
             ),
             *(
                 group(
                     _at(f"{own}.{name}"),
                     ALWAYS,
-                    [Variable(Signal(name, unit), "parameter", "tunable", value)],
+                    [FmuVariable(Signal(name, unit), "parameter", "tunable", value)],
                 )
                 for name, (unit, value) in settings.items()
             ),
             group(f"{_at('own.in.measured_at')} + sizeof(double)", ALWAYS, inputs),
-            group(_at("own.age"), ALWAYS, [Variable(age, "input", "continuous", 0.0)]),
+            group(_at("own.age"), ALWAYS, [FmuVariable(age, "input", "continuous", 0.0)]),
             group(_at("own.out"), NEVER, outputs),
             group(_at(f"{own}.patience"), ALWAYS, [patience], "Int32"),
             group(_at("own.out.status"), NEVER, _told(), "Int32"),
@@ -119,21 +121,21 @@ def groups_of(written: Written) -> list[Group]:
                 _at("own.start"),
                 AT_FIRST,
                 [
-                    Variable(Signal(f"start.{s.name}", s.unit), "parameter", "fixed", value)
+                    FmuVariable(Signal(f"start.{s.name}", s.unit), "parameter", "fixed", value)
                     for s, value in states
                 ],
             ),
             group(
                 _at(f"{own}.longest"),
                 ALWAYS,
-                [Variable(Signal("step", "s"), "parameter", "tunable", written.longest)],
+                [FmuVariable(Signal("step", "s"), "parameter", "tunable", written.longest)],
             ),
             group(_at(f"{own}.row"), NEVER, outputs),
         ]
     return _distinct([each for each in found if each.variables])
 
 
-def ranges(groups: Sequence[Group], kind: str) -> str:
+def ranges(groups: Sequence[FmuVariableGroup], kind: str) -> str:
     """The rows of a table of fmi3.c. Value references count all variables, 0 is the time."""
     first, rows = 1, []
     for group in groups:
@@ -145,7 +147,12 @@ def ranges(groups: Sequence[Group], kind: str) -> str:
 
 
 def model_description(
-    groups: Sequence[Group], name: str, identifier: str, token: str, step: float, about: str
+    groups: Sequence[FmuVariableGroup],
+    name: str,
+    identifier: str,
+    token: str,
+    step: float,
+    about: str,
 ) -> str:
     """modelDescription.xml.
 
@@ -241,22 +248,22 @@ def _named(vectors: Mapping[str, Sequence[Signal]]) -> list[Signal]:
     ]
 
 
-def _control(written: Written) -> Sequence[Signal]:
+def _control(written: WrittenPart) -> Sequence[Signal]:
     return written.part.outputs["control"]
 
 
-def _told() -> list[Variable]:
+def _told() -> list[FmuVariable]:
     texts = {
         "status": "0 running, 1 holding, 2 stopped, 3 waiting for the first good inputs",
         "fault": "0 none, 1 no number, 2 stale, 3 late, 4 clock, 5 the law has no value",
         "bad_steps": "how many steps in a row were bad",
     }
     return [
-        Variable(Signal(name), "output", "discrete", None, text) for name, text in texts.items()
+        FmuVariable(Signal(name), "output", "discrete", None, text) for name, text in texts.items()
     ]
 
 
-def _distinct(groups: Sequence[Group]) -> list[Group]:
+def _distinct(groups: Sequence[FmuVariableGroup]) -> list[FmuVariableGroup]:
     """The same groups, in which no name comes twice."""
     signals = [Signal("time"), *(each.signal for group in groups for each in group.variables)]
     names = iter(distinct(signals)[1:])

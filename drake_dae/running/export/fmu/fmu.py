@@ -22,7 +22,7 @@ from drake_dae.running.export.steps.parts import (
     CONTROLLER,
     PLANT,
     Export,
-    Written,
+    WrittenPart,
     parts_of_loop,
 )
 from drake_dae.running.export.steps.words import file_of, prefix_of
@@ -87,7 +87,7 @@ def export_fmu(
     return Export(files, left_out)
 
 
-def _write_fmu(found: Written, name: str, place: Path) -> None:
+def _write_fmu(found: WrittenPart, name: str, place: Path) -> None:
     """Writes the glue, both descriptions and the terms."""
     prefix, file, kind = prefix_of(name), file_of(name), found.kind
     groups, identifier = groups_of(found), f"{prefix}_{found.kind}"
@@ -122,7 +122,7 @@ def _write_fmu(found: Written, name: str, place: Path) -> None:
     (place / "modelDescription.xml").write_text(about, encoding="utf-8")
 
 
-def _compile(found: Written, name: str, place: Path) -> None:
+def _compile(found: WrittenPart, name: str, place: Path) -> None:
     """Makes the binary for this machine.
 
     Raises:

@@ -30,7 +30,7 @@ NEVER = Ticks(0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ExportedPart:
     """A part of a loop that is exported by itself.
 
     Attributes:
@@ -48,7 +48,7 @@ class Part:
     acts_at_once: bool = False
 
 
-def controller_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
+def controller_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPart:
     """All that leads from what a plant and its sensors show to the plant's control.
 
     That is the law, the references, observers, integrals, samples, delays, limits, and any block of
@@ -88,7 +88,7 @@ def controller_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
     return _part(compiled, known, ticks, acts_at_once)
 
 
-def plant_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
+def plant_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPart:
     """The plant of a loop with its sensors, whose input is the control.
 
     Its outputs have the names of the controller's inputs, among others.
@@ -117,7 +117,9 @@ def plant_part(loop: ClosedLoop | Diagram, context: Context) -> Part:
     return _part(compiled, _known_signals(loop, plant))
 
 
-def loop_part(loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()) -> Part:
+def loop_part(
+    loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()
+) -> ExportedPart:
     """A loop as a whole, which has no inputs. Its outputs are those of the record.
 
     Args:
@@ -142,10 +144,10 @@ def _part(
     known: Mapping[str, tuple[Signal, ...]],
     ticks: Ticks = NEVER,
     acts_at_once: bool = False,
-) -> Part:
+) -> ExportedPart:
     inputs = {name: part.stop - part.start for name, part in compiled.inputs}
     ports = {name: port_of(compiled.wires.outputs[name]) for name in compiled.outputs}
-    return Part(
+    return ExportedPart(
         compiled,
         {name: _signals(known, name, size) for name, size in inputs.items()},
         {name: _signals(known, name, port.size()) for name, port in ports.items()},

@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.export.steps.boundary import Part, controller_part
+from drake_dae.running.export.steps.boundary import ExportedPart, controller_part
 from drake_dae.running.export.steps.cuts import CONTROL
-from drake_dae.running.export.steps.parts import CONTROLLER, Written, defaults
+from drake_dae.running.export.steps.parts import CONTROLLER, WrittenPart, defaults
 from drake_dae.running.export.steps.played import played_run
 from drake_dae.running.export.steps.words import (
     called,
@@ -82,7 +82,9 @@ def export_controller(
     return [*found, found[0].parent / f"{file}_run.csv"]
 
 
-def write_controller(part: Part, context: Context, name: str, folder: str | Path) -> Written:
+def write_controller(
+    part: ExportedPart, context: Context, name: str, folder: str | Path
+) -> WrittenPart:
     """Writes a controller as name_controller.h, .c and .hpp.
 
     Args:
@@ -98,10 +100,10 @@ def write_controller(part: Part, context: Context, name: str, folder: str | Path
     files = _written(folder, file_of(name), _words(part, context, name))
     signals = parameter_signals(part.compiled)
     values, inputs = defaults(part, context)
-    return Written(part, CONTROLLER, signals, values, inputs, tuple(files), context.get_time())
+    return WrittenPart(part, CONTROLLER, signals, values, inputs, tuple(files), context.get_time())
 
 
-def _words(part: Part, context: Context, name: str) -> dict[str, Any]:
+def _words(part: ExportedPart, context: Context, name: str) -> dict[str, Any]:
     prefix = prefix_of(name)
     return _Words(part, context, prefix).found | {
         "title": comment(name),
@@ -122,7 +124,7 @@ def _written(folder: str | Path, file: str, words: Mapping[str, Any]) -> list[Pa
 class _Words:
     """What stands in the templates of a controller."""
 
-    part: Part
+    part: ExportedPart
     context: Context
     prefix: str
 

@@ -11,8 +11,8 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.errors import ModelError
-from drake_dae.running.export.steps.boundary import Part
-from drake_dae.running.export.steps.parts import PLANT, Written, defaults
+from drake_dae.running.export.steps.boundary import ExportedPart
+from drake_dae.running.export.steps.parts import PLANT, WrittenPart, defaults
 from drake_dae.running.export.steps.words import (
     called,
     file_of,
@@ -35,13 +35,13 @@ SCHEME, LONGEST = "runge_kutta5", 1e-3
 
 
 def write_integrated(
-    part: Part,
+    part: ExportedPart,
     kind: str,
     context: Context,
     name: str,
     folder: str | Path,
     config: SimulatorConfig | None,
-) -> Written:
+) -> WrittenPart:
     """Writes a plant or a loop as name_kind.h and name_kind.c, which integrate it.
 
     Args:
@@ -139,7 +139,7 @@ def write_integrated(
     }
     names = {f"integrated.{suffix}": f"{file}_{kind}.{suffix}" for suffix in ("h", "c")}
     files = tuple(written(TEMPLATES, folder, names, words))
-    return Written(part, kind, parameters, values, inputs, files, time, states, start, longest)
+    return WrittenPart(part, kind, parameters, values, inputs, files, time, states, start, longest)
 
 
 def fixed_steps(config: SimulatorConfig | None) -> tuple[str, float]:

@@ -13,7 +13,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import (
-    Part,
+    ExportedPart,
     controller_part,
     loop_part,
     plant_part,
@@ -22,7 +22,7 @@ from drake_dae.running.export.steps.boundary import (
 CONTROLLER, PLANT, LOOP = "controller", "plant", "loop"
 """The kinds of parts."""
 
-MAKERS: dict[str, Callable[[ClosedLoop | Diagram, Context], Part]] = {
+MAKERS: dict[str, Callable[[ClosedLoop | Diagram, Context], ExportedPart]] = {
     LOOP: loop_part,
     PLANT: plant_part,
     CONTROLLER: controller_part,
@@ -30,7 +30,7 @@ MAKERS: dict[str, Callable[[ClosedLoop | Diagram, Context], Part]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
+class WrittenPart:
     """A part that was written as C99.
 
     Attributes:
@@ -44,7 +44,7 @@ class Written:
         files: The header and the source, and what else there is.
     """
 
-    part: Part
+    part: ExportedPart
     kind: str
     parameters: Sequence[Signal]
     values: FloatArray
@@ -70,7 +70,7 @@ class Export(NamedTuple):
 
 def parts_of_loop(
     loop: ClosedLoop | Diagram, context: Context, kinds: Sequence[str]
-) -> tuple[dict[str, Part], list[str]]:
+) -> tuple[dict[str, ExportedPart], list[str]]:
     """The parts of a loop that can be exported, and why the others can not.
 
     Args:
@@ -81,7 +81,7 @@ def parts_of_loop(
     Raises:
         ModelError: No part can be exported: why.
     """
-    found, left_out = dict[str, Part](), list[str]()
+    found, left_out = dict[str, ExportedPart](), list[str]()
     for kind in kinds:
         try:
             found[kind] = MAKERS[kind](loop, context)
@@ -92,7 +92,7 @@ def parts_of_loop(
     return found, left_out
 
 
-def defaults(part: Part, context: Context) -> tuple[FloatArray, FloatArray]:
+def defaults(part: ExportedPart, context: Context) -> tuple[FloatArray, FloatArray]:
     """The parameters of a part, and its inputs when a run begins.
 
     Args:

@@ -8,12 +8,12 @@ from pydrake.systems.framework import Context, Diagram, OutputPortIndex
 
 from drake_dae.compiler.wires import Port
 from drake_dae.errors import SimulationError
-from drake_dae.running.export.steps.boundary import Part
+from drake_dae.running.export.steps.boundary import ExportedPart
 
 
 def played_run(
     diagram: Diagram,
-    part: Part,
+    part: ExportedPart,
     context: Context,
     config: SimulatorConfig | None,
     duration: float,

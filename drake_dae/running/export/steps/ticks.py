@@ -6,7 +6,7 @@ from functools import reduce
 from math import ceil, gcd
 from typing import Self
 
-from drake_dae.compiler.rates import Rate
+from drake_dae.compiler.rates import UpdateRate
 from drake_dae.errors import ModelError
 
 FINEST = 1000
@@ -32,7 +32,7 @@ class Ticks:
     rates: tuple[tuple[float, float], ...] = ()
 
     @classmethod
-    def of(cls, rates: tuple[Rate, ...], alone: float = 0.0) -> Self:
+    def of(cls, rates: tuple[UpdateRate, ...], alone: float = 0.0) -> Self:
         """The ticks of some rates, or of a single period where there are none.
 
         Raises:

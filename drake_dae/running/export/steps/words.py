@@ -9,7 +9,7 @@ from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
-from drake_dae.compiler.rates import Rate
+from drake_dae.compiler.rates import UpdateRate
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -91,7 +91,7 @@ def numbers(values: FloatArray, spare: bool = True) -> str:
 
 
 def updates(
-    rates: Sequence[Rate], own: str, call: Callable[[int], str], due: Callable[[int], str]
+    rates: Sequence[UpdateRate], own: str, call: Callable[[int], str], due: Callable[[int], str]
 ) -> dict[str, str]:
     """The functions of all rates, and for each kind a block that calls those that are due at once.
 

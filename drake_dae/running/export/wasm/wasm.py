@@ -21,7 +21,7 @@ from drake_dae.running.export.steps.parts import (
     LOOP,
     PLANT,
     Export,
-    Written,
+    WrittenPart,
     parts_of_loop,
 )
 from drake_dae.running.export.steps.words import file_of, identifiers, prefix_of
@@ -72,7 +72,7 @@ def export_wasm(
 
 
 def write_module(
-    found: Sequence[Written],
+    found: Sequence[WrittenPart],
     name: str,
     folder: str | Path,
     further: Mapping[str, ca.Function] | None = None,
@@ -132,14 +132,14 @@ def write_module(
     return [target, module, source]
 
 
-def _glue(each: Written, words: dict[str, str]) -> str:
+def _glue(each: WrittenPart, words: dict[str, str]) -> str:
     """What the module shows of a part, in C."""
     template = "controller.c" if each.kind == CONTROLLER else "integrated.c"
     text = Template((TEMPLATES / template).read_text(encoding="utf-8"))
     return text.substitute(words, kind=each.kind, KIND=each.kind.upper())
 
 
-def _described(each: Written) -> dict[str, Any]:
+def _described(each: WrittenPart) -> dict[str, Any]:
     """What name.mjs says of a part."""
     found: dict[str, Any] = {
         "parameters": [

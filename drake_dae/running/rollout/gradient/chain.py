@@ -9,9 +9,9 @@ import casadi as ca
 from drake_dae.arrays import FloatArray, show
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.run import Problem, Tableau
-from drake_dae.running.rollout.stepping.called import Called
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import RunProblem, Tableau
+from drake_dae.running.rollout.stepping.called import BufferedFunction
 from drake_dae.running.rollout.stepping.course import REACHED
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
 
@@ -19,7 +19,7 @@ MOST = 8
 """So often two Newton steps may follow each other, as the rollout has it."""
 
 
-class Link(NamedTuple):
+class ComputedFunction(NamedTuple):
     """A function that a run has computed.
 
     Attributes:
@@ -39,25 +39,25 @@ class Differentiable:
     """A function with its derivatives in both directions, made when they are needed."""
 
     def __init__(self, function: ca.Function) -> None:
-        self._function, self.value = function, Called(function)
+        self._function, self.value = function, BufferedFunction(function)
         self.forward = cache(self._forward)
         self.backward = cache(self._backward)
 
-    def _forward(self, count: int) -> Called:
+    def _forward(self, count: int) -> BufferedFunction:
         """(arguments, changes of state, held and parameters) -> the result, and its change.
 
         Args:
             count: How many changes are followed at once, side by side.
         """
-        return Called(_forward(self._function, count))
+        return BufferedFunction(_forward(self._function, count))
 
-    def _backward(self) -> Called:
+    def _backward(self) -> BufferedFunction:
         """(arguments, weights of the result) -> the gradient by state, held and parameters."""
         symbols = _symbols(self._function)
         value = self._function.call(symbols)[0]
         weights = ca.SX.sym("weights", value.numel())
         found = [ca.jtimes(value, x, weights, True) for x in symbols[1:4]]
-        return Called(_dense("backward", [*symbols, weights], found))
+        return BufferedFunction(_dense("backward", [*symbols, weights], found))
 
 
 class RungeKuttaStep(Differentiable):
@@ -72,7 +72,7 @@ class RungeKuttaStep(Differentiable):
         super().__init__(_step(rate, tableau))
         self._rate, self._tableau = rate, tableau
 
-    def _forward(self, count: int) -> Called:
+    def _forward(self, count: int) -> BufferedFunction:
         # The stages share one function, which keeps the derivatives by many changes short.
         rate, sizes = _forward(self._rate, count), [self._rate.numel_in(i) for i in range(4)]
         time, state, held, parameters = (ca.MX.sym("x", size) for size in sizes)
@@ -87,19 +87,19 @@ class RungeKuttaStep(Differentiable):
         b = self._tableau.b
         found = [state + step * _sum(b, values), changes[0] + step * _sum(b, slopes)]
         symbols = [time, state, held, parameters, step, *changes]
-        return Called(ca.Function("forward", symbols, found))
+        return BufferedFunction(ca.Function("forward", symbols, found))
 
 
-class Links:
+class ComputedFunctions:
     """The functions of a run, found as they are computed, in the order of stepper.c."""
 
-    def __init__(self, program: Program, problem: Problem, tableau: Tableau) -> None:
+    def __init__(self, program: RolloutProgram, problem: RunProblem, tableau: Tableau) -> None:
         self._program, self._problem, self._tableau = program, problem, tableau
         self._state, self._held, self._event = problem.state, problem.held, 0
         self._given = (problem.parameters,)
         self._key = repr(tableau)
         self._functions: dict[str, Differentiable] = {}
-        self.found: list[Link] = []
+        self.found: list[ComputedFunction] = []
 
     def run(self, longest: float) -> None:
         """Runs from the start to the end."""
@@ -146,7 +146,7 @@ class Links:
         function = self._function(name)
         arguments = (time, self._state, self._held, *self._given, *others)
         value = function.value(*arguments)[0].copy()
-        self.found.append(Link(kind, function, arguments, row))
+        self.found.append(ComputedFunction(kind, function, arguments, row))
         if kind == "state":
             self._state = value
         elif kind == "held":
@@ -171,20 +171,24 @@ class Links:
 
 
 def projected(
-    program: Program, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-) -> tuple[FloatArray, list[Link]]:
+    program: RolloutProgram,
+    time: float,
+    state: FloatArray,
+    held: FloatArray,
+    parameters: FloatArray,
+) -> tuple[FloatArray, list[ComputedFunction]]:
     """A state brought to N*, and the functions that did it.
 
     Raises:
         InconsistentStateError: Newton's steps do not reach it.
     """
-    links = list[Link]()
+    links = list[ComputedFunction]()
     if not program.compiled.projects:
         return state, links
     newton, start = _newton(program), state
     for _ in range(MOST):
         arguments = time, state, held, parameters
-        links.append(Link("state", newton, arguments))
+        links.append(ComputedFunction("state", newton, arguments))
         found, left = newton.value(*arguments)
         state = found.copy()
         if left[0] <= REACHED:
@@ -192,7 +196,7 @@ def projected(
     raise InconsistentStateError(f"{program.name}: no start on N* near {show(start)}", left.copy())
 
 
-def _newton(program: Program) -> Differentiable:
+def _newton(program: RolloutProgram) -> Differentiable:
     """Two Newton steps to N*."""
     return program.kept("gradient newton", lambda: Differentiable(program.compiled.newton(2)))
 

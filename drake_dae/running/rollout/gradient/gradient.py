@@ -13,13 +13,13 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.asked import Asked
+from drake_dae.running.rollout.asked import RolloutRequest
 from drake_dae.running.rollout.events import Seed
-from drake_dae.running.rollout.gradient.chain import Link, Links
+from drake_dae.running.rollout.gradient.chain import ComputedFunction, ComputedFunctions
 from drake_dae.running.rollout.problems import problems_of
-from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.rollout import Rollout, run_loop
-from drake_dae.running.rollout.run import Problem
+from drake_dae.running.rollout.run import RunProblem
 
 
 class RolloutGradient(NamedTuple):
@@ -65,7 +65,7 @@ def rollout_gradient(
         InconsistentStateError: The start is not on N*.
         SimulationError: The run fails.
     """
-    chain = Chain.of(loop, start, parameters, times, config, seed)
+    chain = FunctionChain.of(loop, start, parameters, times, config, seed)
     seeds = np.zeros((chain.problem.times.size, chain.program.width))
     for name, given in weights.items():
         part = chain.part(name)
@@ -102,7 +102,7 @@ def rollout_tangent(
     Returns:
         Name of a signal -> its derivative, of the shape that the signal has in the record.
     """
-    chain = Chain.of(loop, start, parameters, times, config, seed)
+    chain = FunctionChain.of(loop, start, parameters, times, config, seed)
     changes = []
     for what, given, size in (
         ("start_change", start_change, chain.size),
@@ -117,7 +117,7 @@ def rollout_tangent(
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class FunctionChain:
     """A run as a chain of functions, each of which has a derivative.
 
     Attributes:
@@ -127,10 +127,10 @@ class Chain:
         links: The functions, in their order.
     """
 
-    program: Program
+    program: RolloutProgram
     run: Rollout
-    problem: Problem
-    links: Sequence[Link]
+    problem: RunProblem
+    links: Sequence[ComputedFunction]
 
     @classmethod
     def of(
@@ -141,8 +141,8 @@ class Chain:
         times: ArrayLike,
         config: SimulatorConfig,
         seed: Seed | None,
-    ) -> "Chain":
-        asked = Asked.of(loop, times, config, None, None)
+    ) -> "FunctionChain":
+        asked = RolloutRequest.of(loop, times, config, None, None)
         program, settings = asked.program, asked.settings
         if settings.tableau is None:
             raise ModelError(
@@ -163,7 +163,7 @@ class Chain:
         if run.failure is not None:
             raise run.failure
         problem = problems[0]
-        links = Links(program, problem, settings.tableau)
+        links = ComputedFunctions(program, problem, settings.tableau)
         links.run(settings.longest)
         return cls(program, run, problem, links.found)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.running.rollout.problems import Problems
-from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.run import Ending, Run, Settings, num_cores
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping.machine import Library, RunState, go_on
 
 STOPPED = 1 << 62
@@ -37,7 +37,7 @@ class _Batch(ctypes.Structure):
 
 
 def run_many(
-    lanes: Library, code: Library, program: Program, problems: Problems, settings: Settings
+    lanes: Library, code: Library, program: RolloutProgram, problems: Problems, settings: Settings
 ) -> list[Run]:
     """Runs a diagram many times, on all cores.
 
@@ -48,13 +48,13 @@ def run_many(
         problems: What to run.
         settings: How to step; nothing looks at these runs while they go on.
     """
-    many = Many(program, problems, settings, ENDLESS)
+    many = RunBatch(program, problems, settings, ENDLESS)
     _run(lanes, many)
     return many.ended(partial(go_on, code), num_cores())
 
 
 def run_briefly(
-    lanes: Library, program: Program, problems: Problems, settings: Settings, most: int
+    lanes: Library, program: RolloutProgram, problems: Problems, settings: Settings, most: int
 ) -> list[Run | None]:
     """The same on one core, of runs that come to their end side by side; None for the others.
 
@@ -62,13 +62,13 @@ def run_briefly(
         lanes, program, problems, settings: As of `run_many`.
         most: A run that takes more steps is none of them.
     """
-    many = Many(program, problems, settings, most)
+    many = RunBatch(program, problems, settings, most)
     lanes.run_lanes(ctypes.byref(many.here()))
     endings = many.arrays["endings"].tolist()
     return [None if ending else many.done(index) for index, ending in enumerate(endings)]
 
 
-class Many:
+class RunBatch:
     """Runs that go side by side.
 
     Args:
@@ -83,7 +83,9 @@ class Many:
             (k, j, width).
     """
 
-    def __init__(self, program: Program, problems: Problems, settings: Settings, most: int) -> None:
+    def __init__(
+        self, program: RolloutProgram, problems: Problems, settings: Settings, most: int
+    ) -> None:
         self._problems, self._settings, self._most = problems, settings, most
         count = len(problems)
         a, b, c = settings.tableau or (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
@@ -134,7 +136,7 @@ class Many:
         own = RunState.from_buffer(self.arrays["runs"][index])
         state, held = self.arrays["states"][index], self.arrays["held"][index]
         given = own.time, state, held, own.event, own.steps, own.before, own.next
-        return Run(self.arrays["rows"][index], Ending.DONE, *given, np.inf, _NOWHERE)
+        return Run(self.arrays["rows"][index], RunEnding.DONE, *given, np.inf, _NOWHERE)
 
     def ended(self, go_on: Callable[..., Run], threads: int) -> list[Run]:
         """What all runs come to.
@@ -161,7 +163,7 @@ class Many:
 _NOWHERE = np.zeros(0)
 
 
-def _run(lanes: Library, many: Many) -> None:
+def _run(lanes: Library, many: RunBatch) -> None:
     """Runs all in threads, which need no lock of Python's; Ctrl-C ends them."""
     arrays, batch = many.arrays, many.here()
     threads = max(1, min(num_cores(), len(arrays["endings"]) // 8))

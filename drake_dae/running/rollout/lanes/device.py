@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.lanes.batch import ENDLESS, Many
+from drake_dae.running.rollout.lanes.batch import ENDLESS, RunBatch
 from drake_dae.running.rollout.lanes.library import can_run, source
 from drake_dae.running.rollout.problems import Problems
-from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Settings
 
 BLOCK = 64
@@ -40,7 +40,7 @@ def find_device() -> Any:
     return cupy
 
 
-def run_on_device(program: Program, problems: Problems, settings: Settings) -> Many:
+def run_on_device(program: RolloutProgram, problems: Problems, settings: Settings) -> RunBatch:
     """Runs a diagram many times on a GPU.
 
     Args:
@@ -61,7 +61,7 @@ def run_on_device(program: Program, problems: Problems, settings: Settings) -> M
     kernel = program.kept(
         "device", lambda: cupy.RawModule(code=source(program), options=options)
     ).get_function("run_on_device")
-    many = Many(program, problems, settings, ENDLESS)
+    many = RunBatch(program, problems, settings, ENDLESS)
     there = {name: cupy.asarray(array) for name, array in many.arrays.items()}
     batch = many.batch({name: array.data.ptr for name, array in there.items()})
     given = cupy.asarray(np.frombuffer(bytes(batch), dtype=np.uint8))

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.running.rollout.lanes.emitter import can_be_emitted, emitted
-from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.stepping.machine import DOP_TABLES, RUN, c_table
 from drake_dae.trace.compiled import Compiled, library
 
@@ -24,7 +24,7 @@ SLOWER = 4
 """Operations of registers take so many times as long to compile."""
 
 
-def can_run(program: Program) -> bool:
+def can_run(program: RolloutProgram) -> bool:
     """Whether runs of a diagram can go side by side: no block changes, and Drake steps none."""
     compiled = program.compiled
     if compiled.changes or compiled.has_stepped:
@@ -32,7 +32,7 @@ def can_run(program: Program) -> bool:
     return all(can_be_emitted(each) for each in _functions(program).values())
 
 
-def load(program: Program, compiled: Compiled, make: bool) -> ctypes.CDLL | None:
+def load(program: RolloutProgram, compiled: Compiled, make: bool) -> ctypes.CDLL | None:
     """The library of a diagram; None if there is none.
 
     Args:
@@ -48,7 +48,7 @@ def load(program: Program, compiled: Compiled, make: bool) -> ctypes.CDLL | None
     return None if path is None else ctypes.CDLL(str(path))
 
 
-def source(program: Program) -> str:
+def source(program: RolloutProgram) -> str:
     """The C source of a diagram."""
     functions, compiled = _functions(program), program.compiled
     texts = [emitted(function, f"dae_{name}") for name, function in functions.items()]
@@ -67,7 +67,7 @@ def source(program: Program) -> str:
     return Template(_text("lanes.c")).substitute(words)
 
 
-def _functions(program: Program) -> Mapping[str, ca.Function]:
+def _functions(program: RolloutProgram) -> Mapping[str, ca.Function]:
     return program.functions
 
 
@@ -75,7 +75,7 @@ def _text(name: str) -> str:
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
-def _constants(program: Program, functions: Mapping[str, ca.Function]) -> str:
+def _constants(program: RolloutProgram, functions: Mapping[str, ca.Function]) -> str:
     compiled = program.compiled
     sizes = {
         "SIZE": program.size,

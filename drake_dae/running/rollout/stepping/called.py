@@ -6,7 +6,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 
-class Called:
+class BufferedFunction:
     """A CasADi function that is called on arrays of its own; a column of its is a row of these.
 
     Args:

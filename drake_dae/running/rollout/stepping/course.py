@@ -9,23 +9,23 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.run import Ending, Problem, Run
-from drake_dae.running.rollout.stepping.fused import Fused, Seen
-from drake_dae.running.rollout.stepping.many import BLOCK, Many
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
+from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
+from drake_dae.running.rollout.stepping.many import BLOCK, VectorizedFunction
 from drake_dae.systems.blocks.trials import SLOWEST, STEPS
 
 REACHED = 1e-11
 """A Newton step longer than this, the second, says that N* was not reached in two."""
 
 
-class Ended(Exception):
+class RunEnded(Exception):
     """The run cannot go on."""
 
-    def __init__(self, ending: Ending) -> None:
+    def __init__(self, ending: RunEnding) -> None:
         self.ending = ending
 
 
-class Step(NamedTuple):
+class Dop853Step(NamedTuple):
     """A step of DOP853.
 
     Attributes:
@@ -48,7 +48,7 @@ class Step(NamedTuple):
     rejected: bool
 
 
-class Rows(NamedTuple):
+class RecordRows(NamedTuple):
     """Rows of a record to be.
 
     Attributes:
@@ -68,7 +68,7 @@ class Rows(NamedTuple):
         return self._replace(times=self.times[:-1], states=self.states[:-1])
 
 
-class Span(NamedTuple):
+class StepSpan(NamedTuple):
     """A step, and the times within it at which the state is wanted.
 
     Attributes:
@@ -90,7 +90,7 @@ class Span(NamedTuple):
     found: FloatArray
 
 
-def fill(spans: Sequence[Span], rate: Many, parameters: FloatArray) -> None:
+def fill(spans: Sequence[StepSpan], rate: VectorizedFunction, parameters: FloatArray) -> None:
     """Writes the states within steps, by the interpolant of seventh order as SciPy has it.
 
     Args:
@@ -128,23 +128,23 @@ def fill(spans: Sequence[Span], rate: Many, parameters: FloatArray) -> None:
 
 
 @dataclass(eq=False)
-class Course:
-    """A run under way; see `Run` and `Problem`."""
+class RunStepper:
+    """A run under way; see `Run` and `RunProblem`."""
 
-    fused: Fused
-    problem: Problem
+    fused: DiagramFunctions
+    problem: RunProblem
     time: float
     state: FloatArray
     held: FloatArray
-    rows: list[Rows] = field(default_factory=list)
-    spans: list[Span] = field(default_factory=list)
+    rows: list[RecordRows] = field(default_factory=list)
+    spans: list[StepSpan] = field(default_factory=list)
     done: list[FloatArray] = field(default_factory=list)
     event: int = 0
     steps: int = 0
     before: float = 0.0
     mark: float = 0.0
     next: float = 0.0
-    seen: Seen | None = None
+    seen: GuardInputs | None = None
     trial_time: float = np.inf
     trial: FloatArray = field(default_factory=lambda: np.full(1, np.nan))
 
@@ -159,7 +159,7 @@ class Course:
         """The derivative at the accepted state."""
         values = self.rate(self.time, self.state)
         if np.isnan(values[0]):
-            raise Ended(Ending.INVALID)
+            raise RunEnded(RunEnding.INVALID)
         return values
 
     def projected(self, time: float, state: FloatArray) -> FloatArray:
@@ -173,7 +173,7 @@ class Course:
         try:
             return self.problem.project(time, state, self.held)
         except InconsistentStateError:
-            raise Ended(Ending.OFF_MANIFOLD) from None
+            raise RunEnded(RunEnding.OFF_MANIFOLD) from None
 
     def note_stages(self, rate: FloatArray, size: float) -> None:
         """Evaluates the stages of a step of DOP853 one by one, to keep the trial that fails."""
@@ -197,7 +197,7 @@ class Course:
                 found = self.fused.watched(self.time, state, self.held, problem.parameters)
                 if found.is_due:
                     self.state, self.next = state, self.time
-                    raise Ended(Ending.CHANGE)
+                    raise RunEnded(RunEnding.CHANGE)
             # Unrestricted updates see what was before the projection, which is one of them.
             for seen, is_unrestricted in ((state, True), (self.state, False)):
                 held = self.fused.update(
@@ -210,7 +210,7 @@ class Course:
                     is_unrestricted,
                 )
                 if not np.isfinite(held).all():
-                    raise Ended(Ending.INVALID)
+                    raise RunEnded(RunEnding.INVALID)
                 self.held = held
             self.event += 1
         return self.event > before
@@ -223,19 +223,19 @@ class Course:
         if self.steps % STEPS == 0:
             self.before, self.mark = self.mark, time
             if time - self.before < SLOWEST * (time - self.problem.times[0]):
-                raise Ended(Ending.SLOW)
+                raise RunEnded(RunEnding.SLOW)
 
     def write(self, time: float, state: FloatArray) -> None:
         """Keeps a row of the record."""
-        self.rows.append(Rows(np.array([time]), state[None], self.held, False))
+        self.rows.append(RecordRows(np.array([time]), state[None], self.held, False))
 
-    def write_between(self, step: "Step", times: FloatArray) -> None:
+    def write_between(self, step: "Dop853Step", times: FloatArray) -> None:
         """Keeps rows that lie within a step, for its interpolant to be computed with others."""
         found = np.zeros((times.size, self.state.size))
         rates = np.concatenate([step.stages, step.rate[None]])
         ends = self.time, step.size, self.state, step.reached
-        self.spans.append(Span(*ends, rates, self.held, times, found))
-        self.rows.append(Rows(times, found, self.held, True))
+        self.spans.append(StepSpan(*ends, rates, self.held, times, found))
+        self.rows.append(RecordRows(times, found, self.held, True))
         if len(self.spans) == BLOCK:
             self.fill()
 
@@ -251,7 +251,7 @@ class Course:
             is_begin = self.problem.has_reacted and self.time == self.problem.times[0]
             if self.seen.is_due and not is_begin:
                 self.next = self.time
-                raise Ended(Ending.CHANGE)
+                raise RunEnded(RunEnding.CHANGE)
 
     def check(self, time: float, state: FloatArray) -> None:
         """Ends where a step that leads to a state passes a change."""
@@ -259,7 +259,7 @@ class Course:
             found = self.fused.seen(time, state, self.held, self.problem.parameters)
             if found.follows_change(self.seen):
                 self.next = time
-                raise Ended(Ending.CHANGE)
+                raise RunEnded(RunEnding.CHANGE)
 
     def boundary(self) -> float:
         """The next time at which a sample changes what is held, or the last one."""
@@ -307,13 +307,13 @@ class Course:
         self.done.append(rows[:count])
         if count < len(valid):
             self.time, self.state = self.trial_time, self.trial = times[count], states[count]
-            raise Ended(Ending.INVALID)
+            raise RunEnded(RunEnding.INVALID)
 
-    def finish(self, ending: Ending) -> Run:
+    def finish(self, ending: RunEnding) -> Run:
         """What the run came to."""
         try:
             self._compute()
-        except Ended as ended:
+        except RunEnded as ended:
             ending = ended.ending
         return Run(
             self._joined(),

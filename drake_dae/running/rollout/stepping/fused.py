@@ -10,10 +10,10 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import ARGUMENTS
-from drake_dae.running.rollout.program import Program
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Tableau
-from drake_dae.running.rollout.stepping.called import Called
-from drake_dae.running.rollout.stepping.many import Many
+from drake_dae.running.rollout.stepping.called import BufferedFunction
+from drake_dae.running.rollout.stepping.many import VectorizedFunction
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
 
 CHUNK = 64
@@ -21,7 +21,7 @@ CHUNK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class GuardInputs:
     """What the guards of a diagram see at a moment, see `Guard`.
 
     Attributes:
@@ -39,7 +39,7 @@ class Seen:
         """Whether a block has to react."""
         return bool((self.margins <= 0.0).any())
 
-    def follows_change(self, before: "Seen") -> bool:
+    def follows_change(self, before: "GuardInputs") -> bool:
         """Whether something happened since another moment, at which it had not."""
         if ((self.margins <= 0.0) & (before.margins > 0.0)).any():
             return True
@@ -47,7 +47,7 @@ class Seen:
         return bool((lowest(self.time - before.time, *given) < -TOUCHING).any())
 
 
-class Fused:
+class DiagramFunctions:
     """The functions of a diagram, and steps of its state as functions.
 
     All functions take the time, the state, what is held, and the parameters.
@@ -59,22 +59,25 @@ class Fused:
         rates: The derivative of the state at many moments, and what is finite where it is of use.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: RolloutProgram) -> None:
         self.program, compiled = program, program.compiled
         self._sizes = [compiled.sizes[name] for name in ARGUMENTS]
         self._rate, self._projection = compiled.rate, compiled.newton(2)
-        self._rows, self._projections = Many(compiled.row), Many(self._projection)
+        self._rows, self._projections = (
+            VectorizedFunction(compiled.row),
+            VectorizedFunction(self._projection),
+        )
         self._updates = [
-            (rate.is_unrestricted, list(rate.places), Called(rate.function))
+            (rate.is_unrestricted, list(rate.places), BufferedFunction(rate.function))
             for rate in compiled.rates
             if rate.stepped is None
         ]
-        self._steps: dict[bytes, tuple[Called, Called]] = {}
-        self._called = Called(self._rate)
-        self.controlled = Called(self._controlled_step())
-        self.rates = Many(self._rate)
-        self._guard = Called(compiled.guard) if compiled.guards else None
-        self._watch = Called(compiled.watch) if compiled.watched else None
+        self._steps: dict[bytes, tuple[BufferedFunction, BufferedFunction]] = {}
+        self._called = BufferedFunction(self._rate)
+        self.controlled = BufferedFunction(self._controlled_step())
+        self.rates = VectorizedFunction(self._rate)
+        self._guard = BufferedFunction(compiled.guard) if compiled.guards else None
+        self._watch = BufferedFunction(compiled.watch) if compiled.watched else None
         self.watched_rates = compiled.watched_rates
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
@@ -87,22 +90,22 @@ class Fused:
 
     def seen(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-    ) -> Seen:
+    ) -> GuardInputs:
         """What the guards see; a diagram without any has none to call."""
         assert self._guard is not None
         margins, gaps, rates, valid = self._guard(time, state, held, parameters)
         # What has no value is no change: the step tells why.
         found = margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
-        return Seen(time, found, gaps.copy(), rates.copy())
+        return GuardInputs(time, found, gaps.copy(), rates.copy())
 
     def watched(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-    ) -> Seen:
+    ) -> GuardInputs:
         """What the guards see that are looked at in samples; as `seen`."""
         assert self._watch is not None
         margins, *_, valid = self._watch(time, state, held, parameters)
         found = margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
-        return Seen(time, found, np.zeros(0), np.zeros(0))
+        return GuardInputs(time, found, np.zeros(0), np.zeros(0))
 
     def update(
         self,
@@ -153,7 +156,7 @@ class Fused:
         found, left = self._projections(times[:, None], states, held, parameters)
         return found, left[:, 0]
 
-    def steps(self, tableau: Tableau) -> tuple[Called, Called]:
+    def steps(self, tableau: Tableau) -> tuple[BufferedFunction, BufferedFunction]:
         """A fixed step, as `_step` has it, and many of them as one function.
 
         Args:
@@ -162,7 +165,10 @@ class Fused:
         key = tableau.a.tobytes() + tableau.b.tobytes()
         if key not in self._steps:
             one = self._step(tableau)
-            self._steps[key] = Called(one), Called(one.mapaccum("steps", CHUNK, 1))
+            self._steps[key] = (
+                BufferedFunction(one),
+                BufferedFunction(one.mapaccum("steps", CHUNK, 1)),
+            )
         return self._steps[key]
 
     def _symbols(self) -> list[ca.MX]:

@@ -7,9 +7,15 @@ from math import isfinite, sqrt
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, Tableau
-from drake_dae.running.rollout.stepping.course import REACHED, Course, Ended, Rows, Step
-from drake_dae.running.rollout.stepping.fused import CHUNK, Fused
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings, Tableau
+from drake_dae.running.rollout.stepping.course import (
+    REACHED,
+    Dop853Step,
+    RecordRows,
+    RunEnded,
+    RunStepper,
+)
+from drake_dae.running.rollout.stepping.fused import CHUNK, DiagramFunctions
 
 SHORTEST = 1e-12
 """A step that is shorter than this, relative to the time, is none."""
@@ -18,7 +24,7 @@ MOST_FAILURES = 100
 """So many trials of a step may fail for another reason than its error."""
 
 
-def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
+def runner(fused: DiagramFunctions, settings: Settings) -> Callable[[RunProblem], Run]:
     """What runs a closed loop.
 
     Args:
@@ -27,11 +33,11 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
     """
     steps = None
     if settings.tableau is not None:
-        steps = _Steps(fused, settings.tableau, settings)
+        steps = _FixedSteps(fused, settings.tableau, settings)
 
-    def run(problem: Problem) -> Run:
+    def run(problem: RunProblem) -> Run:
         start = float(problem.times[0])
-        course = Course(
+        course = RunStepper(
             fused, problem, start, problem.state, problem.held, before=start, mark=start
         )
         try:
@@ -39,14 +45,14 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
                 _control(course, settings)
             else:
                 steps.run(course)
-        except Ended as ended:
+        except RunEnded as ended:
             return course.finish(ended.ending)
-        return course.finish(Ending.DONE)
+        return course.finish(RunEnding.DONE)
 
     return run
 
 
-def _control(course: Course, settings: Settings) -> None:
+def _control(course: RunStepper, settings: Settings) -> None:
     """Error control by DOP853 as in stepper.c; rows between steps from its interpolant, on N*."""
     times, row, tried = course.problem.times, 1, 0.0
     moments = times.tolist()
@@ -54,7 +60,7 @@ def _control(course: Course, settings: Settings) -> None:
     course.write(course.time, course.state)
     while course.time < moments[-1]:
         if settings.look(course.so_far, course.problem.context):
-            raise Ended(Ending.PAUSED)
+            raise RunEnded(RunEnding.PAUSED)
         if course.update(is_on=rate is not None):
             rate = None
         if rate is None:
@@ -83,8 +89,8 @@ def _control(course: Course, settings: Settings) -> None:
 
 
 def _controlled(
-    course: Course, settings: Settings, rate: FloatArray, size: float, limit: float
-) -> Step:
+    course: RunStepper, settings: Settings, rate: FloatArray, size: float, limit: float
+) -> Dop853Step:
     """An accepted step from where a course is, at most to a limit in s."""
     problem, failures, rejected = course.problem, 0, False
     while True:
@@ -93,7 +99,7 @@ def _controlled(
             end = limit
         size = end - course.time
         if not size > SHORTEST * abs(course.time) or failures > MOST_FAILURES:
-            raise Ended(Ending.STUCK)
+            raise RunEnded(RunEnding.STUCK)
         reached, last, checks, stages = course.fused.controlled(
             course.time,
             course.state,
@@ -116,13 +122,13 @@ def _controlled(
         elif error < 1.0:
             following = size * (min(1.0, factor) if rejected else factor)
             values = reached.copy(), last.copy(), stages
-            return Step(end, size, *values, is_on, following, rejected)
+            return Dop853Step(end, size, *values, is_on, following, rejected)
         failures += not good
         size *= factor if good else 0.2
         rejected = True
 
 
-def _first_step(course: Course, rate: FloatArray, settings: Settings) -> float:
+def _first_step(course: RunStepper, rate: FloatArray, settings: Settings) -> float:
     """A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4)."""
     state, longest = course.state, settings.longest
     unit = settings.absolute + np.abs(state) * settings.relative
@@ -141,7 +147,7 @@ def _first_step(course: Course, rate: FloatArray, settings: Settings) -> float:
     return min(100.0 * h0, h1, longest)
 
 
-def fixed_steps(problem: Problem, longest: float) -> Iterator[FloatArray]:
+def fixed_steps(problem: RunProblem, longest: float) -> Iterator[FloatArray]:
     """Times of steps between samples: where each begins, where it ends, and what is a row."""
     times = problem.times
     inside = problem.events[(problem.events > times[0]) & (problem.events < times[-1])]
@@ -161,14 +167,14 @@ def fixed_steps(problem: Problem, longest: float) -> Iterator[FloatArray]:
     yield from np.split(block, last[np.flatnonzero(np.isin(ends[1:-1], inside))])
 
 
-class _Steps:
+class _FixedSteps:
     """Fixed steps, many in one call of CasADi."""
 
-    def __init__(self, fused: Fused, tableau: Tableau, settings: Settings) -> None:
+    def __init__(self, fused: DiagramFunctions, tableau: Tableau, settings: Settings) -> None:
         self._tableau, self._longest, self._look = tableau, settings.longest, settings.look
         self._one, self._many = fused.steps(tableau)
 
-    def run(self, course: Course) -> None:
+    def run(self, course: RunStepper) -> None:
         """Runs to the end of the record."""
         times = course.problem.times
         course.write(course.time, course.state)
@@ -177,13 +183,13 @@ class _Steps:
             done = 0
             while done < len(block):
                 if self._look(course.so_far, course.problem.context):
-                    raise Ended(Ending.PAUSED)
+                    raise RunEnded(RunEnding.PAUSED)
                 done += self._advance(course, block[done : done + CHUNK])
         course.rows[-1] = course.rows[-1].without_last()
         course.update()
         course.write(times[-1], course.state)
 
-    def _advance(self, course: Course, block: FloatArray) -> int:
+    def _advance(self, course: RunStepper, block: FloatArray) -> int:
         """Takes some steps, and says how many."""
         problem = course.problem
         step, is_guarded = self._many, bool(course.fused.program.compiled.guards)
@@ -204,13 +210,13 @@ class _Steps:
             course.check(end, state)
             course.accept(end, state)
         chosen = np.flatnonzero(is_row[:count])
-        course.rows.append(Rows(ends[chosen], states[chosen], course.held, False))
+        course.rows.append(RecordRows(ends[chosen], states[chosen], course.held, False))
         if count == len(block):
             return count
         self._advance_slowly(course, *block[count])
         return count + 1
 
-    def _advance_slowly(self, course: Course, start: float, end: float, is_row: float) -> None:
+    def _advance_slowly(self, course: RunStepper, start: float, end: float, is_row: float) -> None:
         """A step where two Newton steps do not reach N*, or where something has no value."""
         course.state = course.projected(start, course.state)
         a, b, c = self._tableau
@@ -221,7 +227,7 @@ class _Steps:
         state = course.state + step * (b @ np.array(rates))
         course.next = end
         if not np.isfinite(state).all():
-            raise Ended(Ending.SPOILT)
+            raise RunEnded(RunEnding.SPOILT)
         course.check(end, state)
         course.accept(end, state)
         if is_row:

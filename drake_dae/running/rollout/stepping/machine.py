@@ -10,10 +10,10 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.rates import Rate
+from drake_dae.compiler.rates import UpdateRate
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.program import Program
-from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
 
@@ -60,7 +60,7 @@ DOP_TABLES = {
 """The tables of DOP853 by the names that the C sources have for them."""
 
 
-def load(program: Program, compiled: Compiled, make: bool) -> Library | None:
+def load(program: RolloutProgram, compiled: Compiled, make: bool) -> Library | None:
     """The library of a diagram; None if there is none.
 
     Args:
@@ -75,7 +75,7 @@ def load(program: Program, compiled: Compiled, make: bool) -> Library | None:
     return None if path is None else ctypes.CDLL(str(path))
 
 
-def run(code: Library, program: Program, problem: Problem, settings: Settings) -> Run:
+def run(code: Library, program: RolloutProgram, problem: RunProblem, settings: Settings) -> Run:
     """Runs a diagram until its end, or to where it cannot go on by machine code alone.
 
     Args:
@@ -94,7 +94,7 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
 
 def go_on(
     code: Library,
-    problem: Problem,
+    problem: RunProblem,
     settings: Settings,
     own: RunState,
     state: FloatArray,
@@ -119,21 +119,21 @@ def go_on(
     given = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
     given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
-    ending, budget = Ending.PAUSED, FIRST
-    while ending is Ending.PAUSED and not settings.look(
+    ending, budget = RunEnding.PAUSED, FIRST
+    while ending is RunEnding.PAUSED and not settings.look(
         lambda: problem.whole(rows[: own.row]), problem.context
     ):
         began = time.perf_counter()
-        ending = Ending(step(ctypes.byref(own), *arguments, _argument(budget)))
+        ending = RunEnding(step(ctypes.byref(own), *arguments, _argument(budget)))
         passed = time.perf_counter() - began
         budget = max(1, int(budget * min(4.0, PAUSE / max(passed, 1e-9))))
-        if ending is Ending.OFF_MANIFOLD:
+        if ending is RunEnding.OFF_MANIFOLD:
             try:
                 state[:] = problem.project(own.time, state, held)
             except InconsistentStateError:
                 break
             own.pending &= ~_PROJECTION
-            ending = Ending.PAUSED
+            ending = RunEnding.PAUSED
     return Run(
         rows[: own.row],
         ending,
@@ -155,7 +155,7 @@ def _argument(value: Any) -> Any:
     return ctypes.c_double(value) if isinstance(value, float) else ctypes.c_longlong(value)
 
 
-def _source(program: Program) -> str:
+def _source(program: RolloutProgram) -> str:
     compiled, calls = program.compiled, program.functions
     sizes: dict[str, int] = {
         "SIZE": max(1, program.size),  # An array has one entry at least.
@@ -195,7 +195,7 @@ def _source(program: Program) -> str:
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
 
 
-def _updated(number: int, rate: Rate) -> str:
+def _updated(number: int, rate: UpdateRate) -> str:
     """How stepper.c computes an update that is due."""
     count = len(rate.places)
     return f"""  if (due >> {number} & 1 && unrestricted == {int(rate.is_unrestricted)}) {{

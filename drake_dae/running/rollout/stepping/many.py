@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.stepping.called import Called
+from drake_dae.running.rollout.stepping.called import BufferedFunction
 
 BLOCK = 512
 """So many moments are computed together: what they need in between stays near the processor."""
@@ -67,7 +67,7 @@ UFUNCS: dict[int, Callable[..., Any]] = {
 """What NumPy does for an operation of CasADi's; a function with another one is mapped."""
 
 
-class Many:
+class VectorizedFunction:
     """A function at many moments.
 
     Args:
@@ -84,7 +84,7 @@ class Many:
             [function.numel_out(i) for i in range(function.n_out())],
         ]
         self._given, self._found = ([np.zeros((k, BLOCK)) for k in each] for each in sizes)
-        self._one = Called(function)
+        self._one = BufferedFunction(function)
         if known.issuperset(codes):
             self._steps = self._program(codes)
 

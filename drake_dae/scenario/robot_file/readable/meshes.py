@@ -50,7 +50,7 @@ DRAWN = (".obj", ".gltf", ".dae")
 
 
 @dataclass(frozen=True)
-class Copies:
+class ReadableCopies:
     """Copies of the user's files that Drake reads instead.
 
     Attributes:
@@ -76,7 +76,7 @@ class Copies:
         return text
 
 
-def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict[str, Path]:
+def add_models(file: Path, parser: Parser, folder: Path, copies: ReadableCopies) -> dict[str, Path]:
     """Adds the models of a file to a plant, without the meshes that Drake cannot read.
 
     Args:
@@ -130,7 +130,7 @@ def _readable(
     file: Path,
     packages: PackageMap,
     folder: Path,
-    copies: Copies,
+    copies: ReadableCopies,
     has_geometry: bool,
     instance: str,
     placed: Collection[str],

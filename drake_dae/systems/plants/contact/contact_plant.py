@@ -35,7 +35,7 @@ from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.traced import Block, Stepped
+from drake_dae.systems.blocks.traced import Block, DrakeStepped
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
@@ -317,7 +317,7 @@ class ContactPlant(Diagram, Plant):
 
     def traced(self) -> Block:
         count = self.multibody.num_multibody_states()
-        stepped = Stepped(
+        stepped = DrakeStepped(
             self._scene,
             self.time_step,
             ("link_state", "contact_force"),

@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
-from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped, Update
+from drake_dae.systems.blocks.traced import HELD, Block, Computation, DrakeStepped, Update
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages
 from drake_dae.systems.plants.contract import Plant
 
@@ -16,7 +16,7 @@ from drake_dae.systems.plants.contract import Plant
 def traced_contact(
     plant: Plant,
     contact_signals: Sequence[Signal],
-    stepped: Stepped,
+    stepped: DrakeStepped,
     stages: SteppedStages | None,
     values: FloatArray,
 ) -> Block:

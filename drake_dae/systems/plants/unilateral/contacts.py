@@ -20,7 +20,7 @@ from drake_dae.systems.plants.unilateral.impacts import TouchRows, is_p_matrix
 
 
 @dataclass(frozen=True, eq=False)
-class Terms:
+class ConstraintTerms:
     """The rates, accelerations and matrices of all constraints at one state.
 
     Attributes:
@@ -217,7 +217,9 @@ class UnilateralContacts:
             rows[touch.rows] = shut
         return np.repeat(rows, self.sizes)
 
-    def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
+    def terms(
+        self, state: FloatArray, control: FloatArray, parameters: FloatArray
+    ) -> ConstraintTerms:
         """The numbers at a state; nan where a function has no value."""
         values = self._terms.evaluate(state, control, parameters)
         n, m = state.size, self.dae.num_constraints
@@ -230,7 +232,7 @@ class UnilateralContacts:
         except np.linalg.LinAlgError:
             solved = np.full((n, 1 + m + rates.size), np.nan)
         moved = slope @ solved
-        return Terms(
+        return ConstraintTerms(
             all_rates=rates,
             accelerations=moved[:m, 0] + drift,
             force_matrix=moved[:m, 1 : m + 1],

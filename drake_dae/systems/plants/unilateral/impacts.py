@@ -47,7 +47,7 @@ class TouchRows:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class ImpactSolution:
     """A solution of the complementarity problem.
 
     Attributes:
@@ -61,7 +61,7 @@ class Fit:
 
 def complementary(
     matrix: FloatArray, offset: FloatArray, kept: Indices, touches: Sequence[TouchRows]
-) -> Fit | None:
+) -> ImpactSolution | None:
     """The y that fits with the fewest acting contacts.
 
     Args:
@@ -94,7 +94,7 @@ def complementary(
             ]
             violation = max(0.0, *amiss) if amiss else 0.0
             if violation < least - TIE * size:
-                best, least = Fit(pushing, values), violation
+                best, least = ImpactSolution(pushing, values), violation
     return best if least <= FITS * size else None
 
 

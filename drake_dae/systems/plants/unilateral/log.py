@@ -13,7 +13,7 @@ MARGIN = 1e-13
 
 
 @dataclass
-class Log:
+class RunLog:
     """The log of one run, in one context.
 
     Attributes:
@@ -36,7 +36,7 @@ class Log:
     waits: bool = False
 
 
-def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:
+def clearance(log: RunLog, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:
     """For each open contact a number that is positive until it penetrates.
 
     An opening contact has a gap of round-off size with any sign. A contact penetrates if its gap is

@@ -29,7 +29,7 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
-from drake_dae.systems.plants.unilateral.log import Log, clearance
+from drake_dae.systems.plants.unilateral.log import RunLog, clearance
 from drake_dae.systems.plants.unilateral.modes import Closed, closed_of, numbers_of
 from drake_dae.systems.plants.unilateral.ports import ModalPorts
 from drake_dae.systems.plants.unilateral.resets import Resets
@@ -147,9 +147,9 @@ class UnilateralRobotPlant(ModalPorts):
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
 
-    def _log(self, context: Context) -> Log:
+    def _log(self, context: Context) -> RunLog:
         # The object is not replaced, and is changed in place.
-        found: Log = self.get_cache_entry(self._log_index).Eval(context)
+        found: RunLog = self.get_cache_entry(self._log_index).Eval(context)
         return found
 
     def _guard(self, place: int, context: Context) -> float:
@@ -193,7 +193,7 @@ class UnilateralRobotPlant(ModalPorts):
         earlier = [
             event for event in log.events if event.time < now
         ]  # For a run that is continued.
-        vars(log).update(vars(Log(events=earlier, time=now)))
+        vars(log).update(vars(RunLog(events=earlier, time=now)))
         if context.get_accuracy() is None:
             raise SimulationError(
                 f"{self.dae.name}: the context has no accuracy, and without one Drake does not "
@@ -310,7 +310,7 @@ class UnilateralRobotPlant(ModalPorts):
 
 
 def _no_events() -> AbstractValue:
-    return AbstractValue.Make(Log())
+    return AbstractValue.Make(RunLog())
 
 
 def _no_margins() -> AbstractValue:

@@ -10,11 +10,11 @@ from drake_dae.dae.system.contacts import PainleveOutcome
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
-from drake_dae.systems.plants.unilateral.contacts import Terms, UnilateralContacts
+from drake_dae.systems.plants.unilateral.contacts import ConstraintTerms, UnilateralContacts
 from drake_dae.systems.plants.unilateral.frictional import impact
 from drake_dae.systems.plants.unilateral.impacts import (
     MOST,
-    Fit,
+    ImpactSolution,
     TouchRows,
     complementary,
     rows_of,
@@ -30,7 +30,7 @@ REPEATED = 100
 
 
 @dataclass(frozen=True, eq=False)
-class After:
+class ResetResult:
     """The result of a reset.
 
     Attributes:
@@ -88,7 +88,7 @@ class Resets:
         control: FloatArray,
         parameters: FloatArray,
         restitution: FloatArray,
-    ) -> After:
+    ) -> ResetResult:
         """The reset at a time from a state, in a mode, with the e of each contact.
 
         Raises:
@@ -135,7 +135,7 @@ class Resets:
         closed = tuple(i in pushing for i in range(len(closed)))
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
-        return After(x, closed, tuple(self._completed(events, closed)))
+        return ResetResult(x, closed, tuple(self._completed(events, closed)))
 
     def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
         """The contacts that touch at rest, as many as can be closed together."""
@@ -155,7 +155,7 @@ class Resets:
         time: float,
         state: FloatArray,
         touching: Sequence[int],
-        terms: Terms,
+        terms: ConstraintTerms,
         control: FloatArray,
         parameters: FloatArray,
         e: FloatArray,
@@ -232,7 +232,7 @@ class Resets:
         matrix: FloatArray,
         offset: FloatArray,
         touches: Sequence[TouchRows],
-    ) -> Fit:
+    ) -> ImpactSolution:
         fit = complementary(matrix, offset, self._contacts.kept, touches)
         if fit is None:
             raise self._unfit(time, state)

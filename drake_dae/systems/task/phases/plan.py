@@ -76,7 +76,7 @@ def contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
     return (*found, left)
 
 
-class Plan:
+class PhasePlan:
     """What follows what in a task.
 
     Args:

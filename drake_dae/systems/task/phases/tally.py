@@ -9,7 +9,7 @@ from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
 
-class Tally:
+class GuardMemory:
     """Numbers from which guards are decided that one sample does not decide.
 
     They are the work since the phase began, where a guard watches it, and for each guard that takes

@@ -21,7 +21,7 @@ from scipy.integrate import quad
 from drake_dae import CoincidentPoints, RobotModel, UnilateralRobotPlant
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.systems.plants.contact_events import ContactChange
-from drake_dae.systems.plants.unilateral.log import Log, clearance
+from drake_dae.systems.plants.unilateral.log import RunLog, clearance
 
 
 @pytest.fixture(scope="module")
@@ -203,13 +203,13 @@ def test_what_dips_below_the_floor_within_a_step_is_pierced():
     def margin(a, b):
         gap = np.poly1d([a, b, -1.0], r=True)
         rate = gap.deriv()
-        log = Log(time=0.0, gaps=np.array([gap(0.0)]), rates=np.array([rate(0.0)]))
+        log = RunLog(time=0.0, gaps=np.array([gap(0.0)]), rates=np.array([rate(0.0)]))
         return clearance(log, 1.0, np.array([gap(1.0)]), np.array([rate(1.0)])).item()
 
     lowest = np.poly1d([0.3, 0.6, -1.0], r=True)
     assert margin(0.3, 0.6) == pytest.approx(min(map(lowest, lowest.deriv().roots)), rel=1e-12)
     assert margin(0.3 + 0.1j, 0.3 - 0.1j) > 0.0
-    log = Log(time=0.0, gaps=np.array([-1e-10]), rates=np.array([0.1]))
+    log = RunLog(time=0.0, gaps=np.array([-1e-10]), rates=np.array([0.1]))
     assert clearance(log, 1e-9, np.array([-5e-11]), np.array([0.1])).item() > 0.0
     # What was above is pierced below even where it rises, and what left is where it falls back.
     assert clearance(log, 0.1, np.array([-1e-3]), np.array([0.1])).item() == -1e-3
