@@ -33,13 +33,22 @@ Block = TypeVar("Block", bound=System)
 
 
 def add_block(builder: DiagramBuilder, block: Block) -> Block:
-    """Adds a block that the caller made."""
+    """Adds a block of the caller.
+
+    Raises:
+        WiringError: The block belongs to another diagram.
+    """
+    taken = WiringError(
+        f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
+    )
+    # Drake's AddSystem refuses a block of an unfinished diagram, but one of a built diagram only
+    # its Build, which would fail here without the name of the argument.
+    if block.GetSystemPathname() != f"::{block.get_name()}":
+        raise taken
     try:
         return builder.AddSystem(block)
     except RuntimeError:
-        raise WiringError(
-            f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
-        ) from None
+        raise taken from None
 
 
 def add_signals(

@@ -63,6 +63,12 @@ def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
         rigid(ForceSensor(2, time_constant=0.01))
 
 
+def test_a_plant_of_another_diagram_is_refused_with_its_name():
+    loop, _ = build_scenario(scenario("two_link_wall"))
+    with pytest.raises(WiringError, match="'two_link_arm' belongs to another diagram already"):
+        make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
+
+
 def test_a_law_for_another_system_is_refused_with_both_sizes():
     found = arm("two_link")
     with pytest.raises(
