@@ -25,6 +25,9 @@ from drake_dae.robots.surfaces.surface import (
 )
 from drake_dae.trace.smoothness import length_of
 
+_SOLID_LENGTH = 100.0
+"""The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""
+
 
 @checked(ModelError)
 @dataclass(frozen=True)
@@ -160,6 +163,12 @@ class Cylinder(Surface):
         axis = np.array(self.axis)
         pose = RigidTransform(RotationMatrix(axes_along(axis)), np.dot(center, axis) * axis)
         return PosedShape(geometry.Cylinder(self.radius, size), pose)
+
+    def solid(self) -> PosedShape | None:
+        if self.inside:
+            return None
+        pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
+        return PosedShape(geometry.Cylinder(self.radius, _SOLID_LENGTH), pose)
 
 
 @checked(ModelError)

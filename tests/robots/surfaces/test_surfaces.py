@@ -99,6 +99,23 @@ def test_distance_grows_with_one_along_the_normal(name):
             assert function(p + d * normal)[0][0] == pytest.approx(d, abs=20 * d * d)
 
 
+@pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].solid() is not None])
+def test_a_solid_has_the_distance_of_its_surface(name):
+    """By Drake's signed distance, up to 0.1 m away; round-off alone, 1e-12 has room."""
+    solid, scene = SURFACES[name].solid(), geometry.SceneGraph()
+    source = scene.RegisterSource("test")
+    shape = geometry.GeometryInstance(solid.pose, solid.form, "solid")
+    shape.set_proximity_properties(geometry.ProximityProperties())
+    scene.RegisterAnchoredGeometry(source, shape)
+    context = scene.CreateDefaultContext()
+    query = scene.get_query_output_port().Eval(context)
+    function, points = points_on(SURFACES[name])
+    for p, d in zip(points, np.linspace(-0.1, 0.1, len(points)), strict=True):
+        near = p + d * function(p)[1]
+        (found,) = query.ComputeSignedDistanceToPoint(near)
+        assert found.distance == pytest.approx(function(near)[0][0], abs=1e-12)
+
+
 @pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].coordinate_signals])
 def test_coordinates_cover_the_surface(name):
     """Normal and gradients of the two coordinates are independent away from the poles."""

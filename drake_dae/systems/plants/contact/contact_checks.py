@@ -31,7 +31,7 @@ def check_model(model: RobotModel) -> None:
         if constraint.solid(values) is None:
             raise ModelError(
                 f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
-                "Plane, or on the outside of a Sphere, or an ideal plant"
+                "Plane, or on the outside of a Sphere or a Cylinder, or an ideal plant"
             )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
     CollisionFilterDeclaration,
+    Cylinder,
     GeometryId,
     GeometrySet,
     HalfSpace,
@@ -208,6 +209,12 @@ class ContactPlant(Diagram, Plant):
         ):
             solid = constraint.solid(own_values(constraint, self.dae, self._values))
             assert solid is not None  # check_model.
+            if material.contact_model == "hydroelastic" and isinstance(solid.form, Cylinder):
+                # Drake meshes a long cylinder too coarsely: 2 N of ripple in a force of 20 N.
+                raise ModelError(
+                    f"hydroelastic contact needs a Plane or a Sphere as surface of "
+                    f"'{constraint.name}'; use point contact (contact_model: point)"
+                )
             friction = material.friction
             if friction is None:
                 name = constraint.friction_parameter

@@ -18,6 +18,7 @@ from pydrake.geometry import (
     Role,
     SceneGraph,
 )
+from pydrake.geometry import Cylinder as Rod
 from pydrake.geometry import Sphere as Ball
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
@@ -40,6 +41,7 @@ from runs import run_scenario, scenario
 from drake_dae import (
     CoincidentPoints,
     CompliantPlant,
+    Cylinder,
     Ellipsoid,
     Plane,
     PointCoordinates,
@@ -74,13 +76,16 @@ class Pair(NamedTuple):
 
 
 def drawn(shape: str):
-    """The seven-joint arm on a plane or on the outside of a sphere, and the solid of it."""
+    """A surface for the seven-joint arm, and its solid for Drake, outside for round ones."""
     point, radius = np.array([0.7, 0.0, 0.6]), 0.4
     if shape == "plane":
         tilt = np.array([-1.0, 0.1, 0.2]) / np.linalg.norm([-1.0, 0.1, 0.2])
         solid = HalfSpace(), HalfSpace.MakePose(tilt, point)
         return Plane(point=point, normal=tilt), solid
     center = point + np.array([radius, 0.0, 0.0])
+    if shape == "cylinder":
+        surface = Cylinder(point=center, axis=(0.0, 0.0, 1.0), radius=radius)
+        return surface, (Rod(radius, 10.0), RigidTransform(center))
     return Sphere(center=center, radius=radius), (Ball(radius), RigidTransform(center))
 
 
@@ -123,6 +128,7 @@ def add_ball(plant, drake, scene: SceneGraph, form, pose, dissipation) -> None:
         normal = pose.rotation().matrix()[:, 2]
     else:
         normal = at.translation() - pose.translation()
+        normal[2] *= not isinstance(form, Rod)
         normal /= np.linalg.norm(normal)
     center = at.rotation().matrix().T @ normal * MATERIAL["radius"]
     frame = drake.GetFrameByName("tool")
@@ -149,7 +155,7 @@ def near_contact(plant, count: int, seed: int):
         yield start + change, random.normal(0.0, 20.0, size)
 
 
-@pytest.mark.parametrize("shape", ["plane", "sphere"])
+@pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
 def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
     """To 1e-9 of the largest acceleration: both are a few thousand operations of round-off."""
     both, pressed = pair(shape, 0.0), 0
@@ -166,7 +172,7 @@ def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
 
 
 @pytest.mark.parametrize("dissipation", [0.0, 2.0])
-@pytest.mark.parametrize("shape", ["plane", "sphere"])
+@pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
 def test_a_step_is_that_of_a_discrete_multibody_plant(shape, dissipation):
     """Its solver stops at a relative residual of 1e-6; without contact only round-off is left."""
     both, pressed = pair(shape, 1e-3, dissipation), 0

@@ -236,6 +236,13 @@ def test_analysis_and_pictures_stay(tmp_path):
         (["known_forces=[{frame: tool}]"], r"no known_forces; .*\(plant_disturbances"),
         (["plant_parameters={link1.mas: [1.0]}"], "no parameter 'link1.mas'; did you"),
         (["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"], "solid"),
+        (
+            [
+                "constraints.0.surface=!Cylinder {point: [1, 0, 0], axis: [0, 0, 1], radius: 0.4}",
+                "plant.contact_model=hydroelastic",
+            ],
+            "hydroelastic contact needs a Plane or a Sphere",
+        ),
     ],
 )
 def test_what_drakes_contact_cannot_be_is_refused(settings, message):
