@@ -294,6 +294,10 @@ def test_refused_with_key_value_and_remedy(settings, words):
     assert [word for word in words if word not in message] == [], message
 
 
+def test_only_a_scalar_in_place_of_text_is_advised_to_go_in_quotes():
+    assert refusal("constraints.0.frame=[a]") == "constraints.0.frame: expected text, got ['a']"
+
+
 def test_all_problems_are_reported_at_once():
     """Also below a wrong key, in several entries of a list, and beside a missing key."""
     message = refusal(

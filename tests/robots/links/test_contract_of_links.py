@@ -224,6 +224,13 @@ def test_forces_have_the_power_of_their_work(links):
     )
     assert tau @ values[1] == pytest.approx(power[0], abs=1e-10)
     np.testing.assert_allclose(balance, longer - tau, **CLOSE)
+    # Forces that act together add up: twice the same ones are twice as large.
+    (double,), _ = numbers(
+        links,
+        {"F": F, "M": M, "acceleration": acceleration},
+        {"tau": links.generalized_force(kinematics, reaction + reaction)},
+    )
+    np.testing.assert_allclose(double, 2.0 * tau, **CLOSE)
     # Of a power that is written by hand, too.
     again = kinematics.reaction(ca.dot(F, velocity) + ca.dot(M, spin))
     (other,), _ = numbers(

@@ -294,6 +294,16 @@ def test_parameters_have_derivatives_by_the_time_in_autodiff():
     np.testing.assert_allclose(found, wanted, rtol=1e-14)
 
 
+def test_references_of_several_degrees_have_derivatives_by_the_time_in_autodiff():
+    turn, push = SinusoidReference(0.0, [0.1], [2.0]), SinusoidReference(1.0, [0.5], [3.0])
+    converted = ReferenceGenerator([turn, push], [2, 0]).ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    context.SetTime(AutoDiffXd(0.5, [1.0]))
+    found = ExtractGradient(converted.GetOutputPort("reference").Eval(context))[:, 0]
+    wanted = [0.2 * np.cos(1.0), -0.4 * np.sin(1.0), -0.8 * np.cos(1.0), 1.5 * np.cos(1.5)]
+    np.testing.assert_allclose(found, wanted, rtol=1e-14)
+
+
 def test_wrong_parameters_are_refused():
     generator = pushing()
     context = generator.CreateDefaultContext()
