@@ -171,8 +171,10 @@ def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
     assert 20 < pressed < 80
 
 
-@pytest.mark.parametrize("dissipation", [0.0, 2.0])
-@pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
+@pytest.mark.parametrize(
+    ("shape", "dissipation"),
+    [("plane", 0.0), ("plane", 2.0), ("plane", 30.0), ("sphere", 2.0), ("cylinder", 2.0)],
+)
 def test_a_step_is_that_of_a_discrete_multibody_plant(shape, dissipation):
     """Its solver stops at a relative residual of 1e-6; without contact only round-off is left."""
     both, pressed = pair(shape, 1e-3, dissipation), 0
