@@ -8,7 +8,7 @@ from drake_dae.dae.zero_dynamics.periods import find_period
 
 @pytest.mark.parametrize("begin", [0.0, 100.0])
 def test_a_period_is_found_wherever_the_interval_begins(begin):
-    """It is asked inside alone. To 1e-9: the values are known to 1e-16, and repeat to 1e-12 where they are refined."""
+    """To 1e-9: the values are known to 1e-16, and repeat to 1e-12 where they are refined."""
 
     def reference(time):
         assert begin <= time <= begin + 10.0
