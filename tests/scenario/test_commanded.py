@@ -6,7 +6,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
 from drake_dae import build_commanded, build_scenario
-from drake_dae.running.bench.controls import Inputs
+from drake_dae.running.bench.inputs import Inputs
 from drake_dae.scenario.shipped import shipped_scenarios
 
 FIXED = SimulatorConfig(

@@ -103,17 +103,13 @@ function draw() {
   const last = bench.samples.at(-1);
   view.show(last);
   const chosen = Number(element("signal").value);
+  const desired = { value: ({ r }) => r[chosen], color: DESIRED, dashed: true };
   plots.signal.draw(bench.samples, [
-    { value: ({ z }) => z[chosen], color: COLORS[1] },
-    { value: ({ r }) => r[chosen], color: DESIRED, dashed: true },
-  ], [["actual", COLORS[1], false], ["desired", DESIRED, true]]);
+    { value: ({ z }) => z[chosen], color: COLORS[1] }, ...(data.compares ? [desired] : []),
+  ], data.compares ? [["actual", COLORS[1], false], ["desired", DESIRED, true]] : []);
   const errors = element("error").value.split(",").map(Number);
-  const legend = [["error", COLORS[0], false]];
-  if (prediction) legend.push(["predicted", PREDICTED, true]);
-  plots.error.draw(bench.samples, errors.flatMap((i, k) => [
-    { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
-    ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
-  ]), legend);
+  if (data.compares) draw_errors(errors);
+  else plots.error.draw(bench.samples, errors.map((i) => ({ value: ({ z }) => z[i], color: COLORS[0] })), []);
   const slow = bench.isRunning && bench.speed < 0.95 ? `, runs at ${bench.speed.toFixed(2)} of that` : "";
   const rate = RATES[bench.rate] === 1 ? "real time" : `${RATES[bench.rate]} x real time`;
   element("clock").textContent = `t = ${last.time.toFixed(2)} s, ${rate}${slow}` +
@@ -122,6 +118,17 @@ function draw() {
   element("state").textContent = bench.failure;
   element("state").className = bench.failure ? "wrong" : "";
   element("run").textContent = bench.isRunning ? "pause" : "run";
+}
+
+/* Errors over the predicted ones; they are round-off beside the outputs themselves. */
+function draw_errors(chosen) {
+  const legend = [["error", COLORS[0], false]];
+  if (prediction) legend.push(["predicted", PREDICTED, true]);
+  const sizes = bench.samples.flatMap(({ z, r }) => chosen.flatMap((i) => [z[i], r[i]]));
+  plots.error.draw(bench.samples, chosen.flatMap((i, k) => [
+    { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
+    ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
+  ]), legend, sizes.reduce((most, size) => Math.max(most, Math.abs(size ?? 0)), 0));
 }
 
 /* Sticks of a gamepad move the target along its axes; the last axis changes the first force. */
@@ -195,14 +202,22 @@ for (const [name, action] of Object.entries(act)) element(name).addEventListener
 element("lose").hidden = !data.opens;
 element("title").textContent = data.title;
 data.outputs.forEach(({ name, unit }, i) => element("signal").append(new Option(unit ? `${name} [${unit}]` : name, i)));
-const units = [...new Set(data.outputs.map(({ unit }) => unit))];
+const units = data.compares ? [...new Set(data.outputs.map(({ unit }) => unit))] : [];
 for (const unit of units) {
   const own = data.outputs.flatMap((output, i) => (output.unit === unit ? [i] : []));
   element("error").append(new Option(`errors${unit ? ` [${unit}]` : " without unit"}`, own.join()));
 }
-data.outputs.forEach(({ name }, i) => element("error").append(new Option(`error of ${name}`, i)));
+data.outputs.forEach(({ name, unit }, i) => {
+  const text = data.compares ? `error of ${name}` : unit ? `${name} [${unit}]` : name;
+  element("error").append(new Option(text, i));
+});
 const force = data.outputs.findIndex(({ unit }) => unit === "N");
 element("signal").value = Math.max(force, 0);
+if (!data.compares) {
+  element("error").value = data.outputs.length > 1 ? (force === 1 ? 0 : 1) : 0;
+  element("error").setAttribute("aria-label", "second output to plot");
+}
+document.body.classList.toggle("bench-without-view", !data.bodies.length && !data.constraints.length);
 for (const name of ["signal", "error"]) element(name).addEventListener("change", () => (bench.fresh = true));
 viewer.gui.domElement.style.display = "none";
 new Drag(view, panel, pushed);

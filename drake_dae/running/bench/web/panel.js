@@ -3,6 +3,8 @@ const GROUPS = [
   ["reference", "References", true],
   ["surface", "Surfaces", false],
   ["signal", "Signals that the task waits for", true],
+  ["input", "Inputs", true],
+  ["parameter", "Parameters", true],
   ["plant", "Plant", true],
   ["pole", "Law", true],
 ];
@@ -15,8 +17,12 @@ class Panel {
     for (const [kind, title, isOpen] of GROUPS) this.group(kind, title, isOpen);
     this.rest();
     for (const note of data.notes) this.note(note);
-    this.note("Drag the green ball (target) or the orange one (surface); pull a link to push it; " +
-      "drag elsewhere to turn the view.");
+    const balls = [data.targets.some(({ axes }) => axes.length) && "the green ball (target)",
+      data.surfaces.length && "the orange one (surface)"].filter(Boolean);
+    const says = [balls.length && `drag ${balls.join(" or ")}`,
+      data.bodies.some(({ name }) => name in data.pushes) && "pull a link to push it", data.bodies.length && "drag elsewhere to turn the view"];
+    const said = says.filter(Boolean).join("; ");
+    if (said) this.note(`${said[0].toUpperCase()}${said.slice(1)}.`);
   }
   group(kind, title, isOpen) {
     const chosen = data.controls.map((control, i) => [control, i])

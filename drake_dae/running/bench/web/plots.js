@@ -1,13 +1,14 @@
 /* Curves over the last seconds on a canvas. */
 const SECONDS = 8;
+const ROUND_OFF = 1e-12; /* Less than this part of what is compared is no error of a loop. */
 const COLORS = ["#1a5fb4", "#c01c28", "#8833bb", "#9c6a00", "#0a7d6c", "#555"];
 
 class Plot {
   constructor(canvas) {
     this.canvas = canvas;
   }
-  /* curves: [{ value: sample -> number, color, dashed }]. */
-  draw(samples, curves, legend) {
+  /* curves: [{ value: sample -> number, color, dashed }]; size: of what rounds their values. */
+  draw(samples, curves, legend, size = 0) {
     const { canvas } = this;
     const ratio = window.devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -28,6 +29,8 @@ class Plot {
     if (low > high) return;
     const least = Math.max(1e-12, 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
     if (high - low < least) [low, high] = [low - least, high + least];
+    const rounds = ROUND_OFF * size, is_round_off = Math.max(Math.abs(low), Math.abs(high)) <= rounds;
+    if (is_round_off) [low, high] = [-rounds, rounds];
     const [left, right, top, bottom] = [58, width - 8, 30, height - 18];
     const last = samples.at(-1).time, first = Math.max(samples[0].time, last - SECONDS);
     const span = Math.max(last - first, 1e-3);
@@ -39,7 +42,8 @@ class Plot {
     pen.lineWidth = 1;
     pen.textAlign = "right";
     for (const part of [0, 0.5, 1]) {
-      const value = low + part * (high - low);
+      const between = low + part * (high - low);
+      const value = Math.abs(between) < 1e-6 * (high - low) ? 0 : between;
       pen.beginPath();
       pen.moveTo(left, y(value));
       pen.lineTo(right, y(value));
@@ -72,6 +76,10 @@ class Plot {
       pen.stroke();
     });
     pen.setLineDash([]);
+    if (is_round_off) {
+      pen.fillStyle = "#667";
+      pen.fillText(`round-off: below ${ROUND_OFF} of the outputs`, left + 4, bottom - 4);
+    }
   }
 }
 
