@@ -129,7 +129,7 @@ def test_links_of_drakes_own_plant_are_drawn_where_they_are_and_pushed():
         "two_link_arm::link1",
         "two_link_arm::link2",
     ]
-    scene = Sampler(bench)(context)["scene"]
+    scene = Sampler(bench)(bench.context)["scene"]
     own = plant.GetMyContextFromRoot(context)
     pose = plant.EvalBodyPoseInWorld(own, plant.GetBodyByName("link2"))
     wanted = np.append(pose.rotation().matrix().flatten("F"), pose.translation())
@@ -156,7 +156,7 @@ def test_links_of_drakes_own_plant_are_drawn_where_they_are_and_pushed():
 def test_a_robot_in_a_diagram_has_its_links_contact_and_sliders():
     diagram, context, robot = wired_by_hand()
     bench = bench_of(diagram, context, "arm")
-    data, column = bench.data, Sampler(bench)(context)["scene"]
+    data, column = bench.data, Sampler(bench)(bench.context)["scene"]
     labels = [each["label"] for each in data["controls"]]
     assert labels[:2] == ["disturbance[0]", "disturbance[1]"]
     assert {"wall.friction", "link1.mass", "link2.mass", "pole of all errors"} <= set(labels)
@@ -166,7 +166,7 @@ def test_a_robot_in_a_diagram_has_its_links_contact_and_sliders():
     assert [each["name"] for each in data["outputs"]] == [
         "tool.z", "wall.force", "torques[0]", "torques[1]"
     ]  # fmt: skip
-    own = robot.GetMyContextFromRoot(context)
+    own = robot.GetMyContextFromRoot(bench.context)
     drawn = robot.model.links.plant
     at = drawn.CreateDefaultContext()
     drawn.SetPositions(at, robot.state(own)[:2])
@@ -195,9 +195,9 @@ def test_commands_of_a_diagram_are_replayed_exactly():
 def test_what_a_bench_cannot_show_is_refused(tmp_path):
     builder = DiagramBuilder()
     builder.AddSystem(ConstantVectorSource([1.0]))
-    with pytest.raises(ModelError, match="no output port with a vector.*ExportOutput"):
+    with pytest.raises(ModelError, match=r"no output port with a vector.*ExportOutput"):
         Server(builder.Build())
-    with pytest.raises(ModelError, match="Drake's own MultibodyPlant.*cannot be traced"):
+    with pytest.raises(ModelError, match=r"Drake's own MultibodyPlant.*cannot be traced"):
         write_page(drakes_arm()[0], None, tmp_path / "no.html")
     assert not (tmp_path / "no.html").exists()
 
