@@ -17,6 +17,10 @@ from drake_dae.systems.control.command_filter import SPEED
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.task.phases.by_hand import BY_HAND
+
+SLOW = 0.05
+"""How fast a surface moves that no law knows, in m/s."""
 
 _ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
 """The order of sliders; others follow."""
@@ -33,6 +37,7 @@ class Control:
         inputs: The entries of `Inputs` that it sets.
         known: Those of the law's model with the same meaning, which it sets if the law is to know.
         powers: For poles: each input is `factors[i] * |value| ** powers[i]`.
+        rate: How fast it changes at most, in its unit per s; 0 for at once.
     """
 
     kind: str
@@ -45,6 +50,7 @@ class Control:
     known: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
     powers: tuple[int, ...] = ()
+    rate: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +83,11 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
     inputs = Inputs.of(loop)
     values = inputs.values(context)
     found = _commands(loop, inputs, context, size) + _surfaces(loop, inputs, 0.2 * size)
+    found += _unknown_surfaces(loop.plant, inputs, values, 0.2 * size)
     found += [
-        Control("signal", port.get_name().removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (place,))
+        Control("signal", name, "", 0.0, 1.0, 0.0, (place,))
         for port, place in inputs.ports.items()
+        if not (name := port.get_name().removeprefix(SIGNAL)).startswith(BY_HAND)
     ]
     plant, controller = loop.plant, loop.controller
     found += of_plant(plant, controller, inputs, values) + of_pole(controller, inputs, values)
@@ -174,6 +182,27 @@ def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
         for name, places in found.items()
         if ".position" in name and inputs.units[places[0]] == "m"
     ]
+
+
+def _unknown_surfaces(
+    plant: Plant, inputs: Inputs, values: FloatArray, reach: float
+) -> list[Control]:
+    """The positions of the surfaces of a compliant contact, which no law knows.
+
+    They are parameters of the plant, and so change in steps: slow ones, which are small.
+    """
+    if plant.is_ideal or plant.model is None or plant not in inputs.blocks:
+        return []
+    places, moving = _places(plant.dae, inputs.blocks[plant]), plant.dae.exogenous.moving
+    known, most, found = {one.name for one in moving}, rounded(reach), list[Control]()
+    for constraint in plant.model.constraints:
+        name = f"{constraint.name}.position"
+        for k in range(3) if f"{name}.0" in places and name not in known else ():
+            place = places[f"{name}.{k}"]
+            value, label = float(values[place]), inputs.names[place].partition(".")[2]
+            limits = value - most, value + most, value
+            found.append(Control("surface", label, "m", *limits, (place,), rate=SLOW))
+    return found
 
 
 def of_pole(controller: Controller, inputs: Inputs, values: FloatArray) -> list[Control]:

@@ -16,7 +16,7 @@ from drake_dae.pictures.scene.arrows import path_of
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.running.bench.any_diagram import controls_of_diagram, parts_of_diagram
 from drake_dae.running.bench.controls import Controls, controls_of, prediction
-from drake_dae.running.bench.inputs import started
+from drake_dae.running.bench.inputs import Inputs, started
 from drake_dae.running.bench.pushes import strongest_pushes
 from drake_dae.running.bench.scene import (
     RobotScene,
@@ -25,6 +25,7 @@ from drake_dae.running.bench.scene import (
     scene_of,
     surface_direction,
 )
+from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.plants.contract import Plant
 
 SHARE = 0.15
@@ -131,6 +132,7 @@ def bench_of(
             for name, place in controls.pushes.items()
         },
         "prediction": compared,
+        "phases": _phase_inputs(loop, inputs),
         "inputs": [
             {"name": name, "unit": unit, "value": value}
             for name, unit, value in zip(inputs.names, inputs.units, values.tolist(), strict=True)
@@ -141,6 +143,14 @@ def bench_of(
         for key, found in _robot_data(robot, controls, context).items():
             data[key] = data[key] or found if key == "opens" else data[key] + found
     return Bench(loop, context, scene, controls, ports, plotted, data)
+
+
+def _phase_inputs(loop: ClosedLoop | Diagram, inputs: Inputs) -> list[int | None]:
+    """The input that ends each phase of a task by hand; None where there is none."""
+    if isinstance(loop, Diagram):
+        return []
+    places = {port.get_name(): place for port, place in inputs.ports.items()}
+    return [places.get(SIGNAL + name) for name in loop.controller.phase_ends]
 
 
 def _robot_data(robot: RobotScene, controls: Controls, context: Context) -> dict[str, Any]:
@@ -186,7 +196,7 @@ def _robot_data(robot: RobotScene, controls: Controls, context: Context) -> dict
             }
             for each, turns in zip(robot.constraints, robot.with_moment, strict=True)
         ],
-        "opens": bool(set(plant.contacts) & set(links)),
+        "opens": bool(links if not plant.is_ideal else set(plant.contacts) & set(links)),
         "surfaces": surfaces,
         "targets": targets,
     }

@@ -237,7 +237,7 @@ class Sampler:
         shown = self._function(*values.values(), bench.controls.inputs.values(context))[0]
         posed = bench.scene.posed.poses(context)
         shown[: posed.size] = posed
-        z, r, phase = self._compared(context, values)
+        z, r, phase, place = self._compared(context, values)
         size = len(shown) - self._count
         return {
             "time": context.get_time(),
@@ -246,18 +246,20 @@ class Sampler:
             "scene": _plain(shown[:size]),
             "coordinates": _plain(shown[size:]),
             "phase": phase,
+            "place": place,
         }
 
     def _compared(
         self, context: Context, values: Mapping[str, FloatArray]
-    ) -> tuple[FloatArray, FloatArray, str]:
-        """z and r, which a diagram does not know, and the name of the phase."""
+    ) -> tuple[FloatArray, FloatArray, str, int]:
+        """z and r, which a diagram does not know, and the name and the place of the phase."""
         loop = self._bench.loop
         if isinstance(loop, Diagram):
             z = np.concatenate([values[name] for name in self._bench.outputs])
-            return z, np.full(z.size, np.nan), ""
+            return z, np.full(z.size, np.nan), "", 0
         changes = loop.changes(context)
-        return *self._of_loop(loop, context), changes[-1].phase if changes else ""
+        now = (changes[-1].phase, changes[-1].place) if changes else ("", 0)
+        return *self._of_loop(loop, context), *now
 
     def _of_loop(self, loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
         z = loop.diagram.GetOutputPort("controlled_output").Eval(context)

@@ -108,7 +108,7 @@ def _robot_scene(plant: Plant, scene_graph: SceneGraph | None) -> RobotScene:
     model = plant.robot("a bench")
     drawn = _drawn_bodies(model, scene_graph)
     wrenches = ConstraintWrenches(model)
-    surfaces = [each for each in model.constraints if _moves(each)]
+    surfaces = [each for each in model.constraints if _moves(each, plant.is_ideal)]
     targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
     return RobotScene(
         plant,
@@ -163,8 +163,9 @@ def _drawn_bodies(
     return found
 
 
-def _moves(constraint: Constraint) -> bool:
-    names = [each.name for each in constraint.parameters if each.exogenous]
+def _moves(constraint: Constraint, is_ideal: bool) -> bool:
+    """Whether a surface moves: of a compliant contact also by its parameters."""
+    names = [each.name for each in constraint.parameters if each.exogenous or not is_ideal]
     return f"{constraint.name}.position" in names or f"{constraint.name}.rpy" in names
 
 

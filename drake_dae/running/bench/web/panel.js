@@ -98,6 +98,22 @@ class Panel {
     const control = data.controls[i], row = this.rows[i];
     row.value = Math.min(Math.max(wanted, control.low), control.high);
     this.show(i);
+    if (!control.rate) this.pass(i);
+  }
+  /* Moves what has a limited speed for a time in s; whether there was any. */
+  moves(seconds) {
+    let found = false;
+    data.controls.forEach(({ rate, inputs: [input] }, i) => {
+      const off = rate ? this.rows[i].value - this.present[input] : 0;
+      if (!off) return;
+      const step = Math.sign(off) * Math.min(Math.abs(off), rate * seconds);
+      this.give(input, step === off ? this.rows[i].value : this.present[input] + step, "surface");
+      found = true;
+    });
+    return found;
+  }
+  pass(i) {
+    const control = data.controls[i], row = this.rows[i];
     control.inputs.forEach((input, k) => {
       const { factors, powers } = control;
       const value = factors.length ? factors[k] * Math.abs(row.value) ** powers[k] : row.value;

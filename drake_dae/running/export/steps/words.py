@@ -157,6 +157,9 @@ def parameters_of_block(system: System, count: int) -> list[Signal]:
     own = list(getattr(system, "commands", ()))
     if dae is not None:
         own = parameter_names(dae, law)
+        further = dict(getattr(system, "further_parameters", {}).values())
+        places = {place: signal for signal, place in further.items()}
+        own += [places.get(i, Signal(f"parameter[{i}]")) for i in range(len(own), count)]
     if len(own) != count:
         own = [Signal(f"parameter[{i}]") for i in range(count)]
     return [Signal(f"{block_name(system)}.{s.name}", s.unit) for s in own]

@@ -1,0 +1,39 @@
+"""Phases that also end by hand."""
+
+from dataclasses import fields
+from typing import ClassVar
+
+import casadi as ca
+
+from drake_dae.systems.task.phases.phase import Moment, Phase
+
+BY_HAND = "by_hand_"
+"""Begins the names of the signals that end phases by hand."""
+
+
+class _EndedByHand(Phase):
+    """A phase that succeeds when it would, or when a signal comes."""
+
+    by_hand: ClassVar[str]
+
+    @property
+    def signal(self) -> str:
+        return self.by_hand
+
+    def margin(self, now: Moment, contact_force: float) -> float:
+        found: float = ca.fmin(super().margin(now, contact_force), 0.5 - now.signal)
+        return found
+
+
+def ended_by_hand(phase: Phase, place: int) -> Phase:
+    """A phase that also succeeds when the signal by_hand_<place> comes.
+
+    Args:
+        phase: A phase that waits for no signal.
+        place: Its place in the task.
+    """
+    kind = type(phase)
+    made = type(kind)(kind.__name__, (_EndedByHand, kind), {"by_hand": f"{BY_HAND}{place}"})
+    values = {one.name: getattr(phase, one.name) for one in fields(phase) if one.init}
+    found: Phase = made(**values)
+    return found
