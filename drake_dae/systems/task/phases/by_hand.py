@@ -1,7 +1,7 @@
 """Phases that also end by hand."""
 
 from dataclasses import fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -21,7 +21,8 @@ class _EndedByHand(Phase):
         return self.by_hand
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        found: float = ca.fmin(super().margin(now, contact_force), 0.5 - now.signal)
+        own = super().margin(now, contact_force)  # type: ignore[safe-super]
+        found: float = ca.fmin(own, 0.5 - now.signal)
         return found
 
 
@@ -32,7 +33,7 @@ def ended_by_hand(phase: Phase, place: int) -> Phase:
         phase: A phase that waits for no signal.
         place: Its place in the task.
     """
-    kind = type(phase)
+    kind: Any = type(phase)
     made = type(kind)(kind.__name__, (_EndedByHand, kind), {"by_hand": f"{BY_HAND}{place}"})
     values = {one.name: getattr(phase, one.name) for one in fields(phase) if one.init}
     found: Phase = made(**values)
