@@ -48,7 +48,7 @@ class Plot {
       pen.moveTo(left, y(value));
       pen.lineTo(right, y(value));
       pen.stroke();
-      pen.fillText(short(value), left - 4, y(value) + 4);
+      pen.fillText(tick(value, high - low), left - 4, y(value) + 4);
     }
     pen.textAlign = "center";
     for (let t = Math.ceil(first); t <= last; t++) pen.fillText(`${t} s`, x(t), height - 5);
@@ -81,6 +81,14 @@ class Plot {
       pen.fillText(`round-off: below ${ROUND_OFF} of the outputs`, left + 4, bottom - 4);
     }
   }
+}
+
+/* A number at an axis of some length: with digits that tell it from its neighbours. */
+function tick(value, length) {
+  const size = Math.abs(value);
+  if (!size || size < 1e-3 || size >= 1e4) return short(value);
+  const digits = Math.min(Math.max(3, 2 + Math.ceil(Math.log10(size / length))), 9);
+  return String(Number(value.toPrecision(digits)));
 }
 
 /* A number with three digits. */
