@@ -48,6 +48,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         address: The address of the page.
         run: The present run.
+        lock: Held while the run advances.
 
     Raises:
         ModelError: The plant is no robot.
@@ -80,7 +81,7 @@ class Server(ThreadingHTTPServer):
             bench = bench_of(loop, context, title or title_of(loop), notes)
             self._sampler = Sampler(bench)
             self._made = loop, context, config
-            self._save, self._lock = save, threading.Lock()
+            self._save, self.lock = save, threading.Lock()
             self.path = f"/{secrets.token_urlsafe(12)}/"
             self.address = f"http://{HOST}:{self.server_port}{self.path}"
             self.page = page_of(
@@ -103,7 +104,7 @@ class Server(ThreadingHTTPServer):
             ModelError: It asks for what there is not.
             DrakeDaeError: The loop cannot go on.
         """
-        with self._lock:  # A browser keeps several connections, each of which has a thread.
+        with self.lock:  # A browser keeps several connections, each of which has a thread.
             return self._answer(what, told)
 
     def _answer(self, what: str, told: Any) -> dict[str, Any]:

@@ -82,6 +82,24 @@ def write_page(
         MachineCodeError: There is no zig, as of `pip install 'drake_dae[compiler]'`, or it fails.
         OSError: A file cannot be written.
     """
+    target, bundle = Path(file), list[Path]()
+    page = page_text(loop, context, config, title, notes)
+    if shared_bundle is not None:
+        bundle = [Path(shared_bundle)]
+        page = _with_shared_bundle(page, target, bundle[0])
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(page, encoding="utf-8")
+    return [target, *bundle]
+
+
+def page_text(
+    loop: ClosedLoop | Diagram,
+    context: Context | None,
+    config: SimulatorConfig | None = None,
+    title: str = "",
+    notes: Sequence[str] = (),
+) -> str:
+    """The page of a loop or diagram as text; arguments and errors are those of `write_page`."""
     diagram = loop if isinstance(loop, Diagram) else loop.diagram
     context = diagram.CreateDefaultContext() if context is None else context
     if isinstance(loop, Diagram):
@@ -104,14 +122,7 @@ def write_page(
     data["plotted"] = [word_of[name] for name in bench.outputs]
     encoded = base64.b64encode(code).decode()
     parts = [text, f'const wasm = "{encoded}";', web_text("page.js")]
-    target = Path(file)
-    page, bundle = page_of(bench, data, parts), []
-    if shared_bundle is not None:
-        bundle = [Path(shared_bundle)]
-        page = _with_shared_bundle(page, target, bundle[0])
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(page, encoding="utf-8")
-    return [target, *bundle]
+    return page_of(bench, data, parts)
 
 
 def title_of(loop: ClosedLoop | Diagram) -> str:
