@@ -28,8 +28,8 @@ class Plot {
     }
     if (low > high) return;
     const least = Math.max(1e-12, 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
-    if (high - low < least) [low, high] = [low - least, high + least];
     const rounds = ROUND_OFF * size, is_round_off = Math.max(Math.abs(low), Math.abs(high)) <= rounds;
+    if (high - low < least) [low, high] = [low - least, high + least];
     if (is_round_off) [low, high] = [-rounds, rounds];
     const [left, right, top, bottom] = [58, width - 8, 30, height - 18];
     const last = samples.at(-1).time, first = Math.max(samples[0].time, last - SECONDS);
@@ -43,7 +43,7 @@ class Plot {
     pen.textAlign = "right";
     for (const part of [0, 0.5, 1]) {
       const between = low + part * (high - low);
-      const value = Math.abs(between) < 1e-6 * (high - low) ? 0 : between;
+      const value = Math.abs(between) < 1e-3 * (high - low) ? 0 : between;
       pen.beginPath();
       pen.moveTo(left, y(value));
       pen.lineTo(right, y(value));
