@@ -60,7 +60,7 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
             systems.append(system)
     for (taker, taken), (giver, given) in diagram.connection_map().items():
         source = _output(giver, int(given))
-        for port in _inputs(taker, int(taken)):
+        for port in leaf_inputs(taker, int(taken)):
             sources[port] = source
 
 
@@ -77,11 +77,11 @@ def _output(system: System, index: int) -> Port:
     return system, index
 
 
-def _inputs(system: System, index: int) -> list[Port]:
+def leaf_inputs(system: System, index: int) -> list[Port]:
     """The leaves' ports behind an input port."""
     if not isinstance(system, Diagram) or isinstance(system, Traced):
         return [(system, index)]
     found = []
     for inner, port in system.GetInputPortLocators(InputPortIndex(index)):
-        found += _inputs(inner, int(port))
+        found += leaf_inputs(inner, int(port))
     return found

@@ -1,6 +1,7 @@
 """A scenario whose references, surfaces and links a person moves while it runs."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.systems.control.command_filter import CommandLimits
+from drake_dae.systems.task.phases.by_hand import ended_by_hand
 
 PUSH = "push."
 """Begins the names of the wrenches that push links."""
@@ -56,46 +58,61 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
     Raises:
         ScenarioError: The scenario itself does not fit; the message names its key.
     """
-    limits = limits or CommandLimits()
-    parts = dict(_PARTS)
-    left_out = dict[str, str]()
-    while True:
+    limits, left_out = limits or CommandLimits(), dict[str, str]()
+    with suppress(DrakeDaeError):
+        return _built(scenario, _with_parts(scenario, left_out), limits, left_out)
+    # Some part does not fit: one is added after the other.
+    left_out, wanted = {}, scenario
+    found = _built(scenario, wanted, limits, left_out)
+    for name, add in _PARTS.items():
+        added = add(wanted)
         try:
-            found = scenario
-            for name, add in parts.items():
-                added = add(found)
-                if isinstance(added, str):
-                    left_out[name] = f"{name}: {added}"
-                else:
-                    found = added
-            completed, loop = build_completed(found, commands=limits)
-            # At rest, where the scenario itself starts at rest.
-            begun = replace(completed.scenario, exogenous=scenario.exogenous)
-            context = start_scenario(begun, loop)
-            if loop.plant.pushes is not None:
-                left_out.pop(_PUSHED, None)
-            return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
+            if isinstance(added, str):
+                raise ScenarioError(("", added))
+            found = _built(scenario, added, limits, left_out)
+            wanted = added
         except DrakeDaeError as error:
-            if not parts:
-                raise
-            name = next(iter(parts))
-            del parts[name]
             left_out[name] = f"{name}: {error}"
+    return replace(found, left_out=tuple(left_out.values()))
 
 
-_PUSHED = "links that are pushed"
+def _with_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
+    """A scenario with all parts, except those that say why not."""
+    for name, add in _PARTS.items():
+        added = add(scenario)
+        if isinstance(added, str):
+            left_out[name] = f"{name}: {added}"
+        else:
+            scenario = added
+    return scenario
 
-_COMPLIANT = "none, since the contact of the plant is compliant"
+
+def _built(
+    given: Scenario, wanted: Scenario, limits: CommandLimits, left_out: Mapping[str, str]
+) -> Commanded:
+    """The loop of a scenario that is made from a given one."""
+    completed, loop = build_completed(wanted, commands=limits)
+    # At rest, where the scenario itself starts at rest.
+    begun = replace(completed.scenario, exogenous=given.exogenous)
+    context = start_scenario(begun, loop)
+    return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Surfaces whose positions are exogenous signals that stand still; or why there are none."""
+    """Surfaces whose positions are exogenous signals that stand still; or why there are none.
+
+    Those of a compliant contact are moved as parameters of the plant, which no law knows.
+    """
+    if scenario.plant.carries:
+        return "none, since the surfaces of Drake's own contact stand still"
     if scenario.plant.material is not None:
-        return _COMPLIANT
-    if scenario.task is not None:
-        return "none, since tasks support no moving surfaces"
-    if scenario.observer is not None:
-        return "none, since an observer supports no exogenous signals"
+        return scenario
+    for part, what in ((scenario.task, "a task"), (scenario.observer, "an observer")):
+        if part is not None:
+            return (
+                f"none, since {what} does not know how a surface moves, and an ideal contact needs "
+                "a law that does; with `plant: !CompliantContact` they are dragged"
+            )
     moving = dict[str, Any]()
     for constraint in scenario.constraints:
         if isinstance(constraint, PointOnSurface):
@@ -125,8 +142,8 @@ def _with_friction(scenario: Scenario) -> Scenario | str:
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
     """Links with wrenches that are zero; or why there are none."""
-    if scenario.plant.material is not None:
-        return _COMPLIANT
+    if scenario.plant.carries:
+        return scenario  # Its plant has pushes of its own.
     plant = robot_links(scenario.robot, SceneGraph())[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
@@ -137,9 +154,26 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
 
 
+def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
+    """A task whose phases end by hand, too, except those that make or break contact."""
+    task = scenario.task
+    if task is None:
+        return scenario
+    contacts = task.made().contacts
+    phases = [
+        phase
+        if phase.signal or contacts[place] != contacts[place + 1]
+        else ended_by_hand(phase, place)
+        for place, phase in enumerate(task.phases)
+    ]
+    given = {phase.signal: 0.0 for phase in phases if phase.signal}
+    return replace(scenario, task=replace(task, phases=phases, signals={**given, **task.signals}))
+
+
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
+    "phases that are ended by hand": _with_phases_ended_by_hand,
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
-    _PUSHED: _with_pushes,
+    "links that are pushed": _with_pushes,
 }
-"""What is added, in the order in which it is left out again."""
+"""What is added, in this order."""

@@ -58,7 +58,7 @@ class ScenarioPlant(ABC):
     1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
     2. With `carries` the plant includes payloads, disturbances and changed parameters. Otherwise
        the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context.
+       the context. A plant that `carries` has `pushes` of its own.
     3. `material` is the material of compliant contacts; None for ideal ones.
     4. `rolled` is the member that a rollout runs in its place: itself, or one with a traced plant.
     5. With `adjusts` the parameters of the plant can be set in a context. `in_context` are the keys

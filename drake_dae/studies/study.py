@@ -4,7 +4,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
+from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.variations import Variation, run_name
+from drake_dae.studies.variations import Variation, rerun_commands, run_name
 
 FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
 """The files of `Study.save`."""
@@ -33,10 +35,14 @@ class Study:
     Attributes:
         variations: For each run, dotted key of the scenario -> value.
         results: For each run its outcome, its figures and the signals beyond their limits.
+        scenario: What was varied, of which `save` tells how a run is made again; None if unknown.
+        rollout: Whether the runs were rollouts.
     """
 
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
+    scenario: Scenario | None = field(default=None, repr=False)
+    rollout: bool = False
 
     def __post_init__(self) -> None:
         if len(self.variations) != len(self.results):
@@ -100,19 +106,24 @@ class Study:
         return found
 
     def save(
-        self, folder: str | Path, title: str = "", again: Sequence[str] = (), duration: float = 1.0
+        self,
+        folder: str | Path,
+        title: str = "",
+        again: Sequence[str] = (),
+        duration: float | None = None,
     ) -> list[Path]:
         """Writes `runs.csv`, `summary.txt`, `study.html`, and the plots that it has figures for.
 
         `study.html` is one page without anything from outside: a table to sort, parallel
         coordinates, and runs beside each other. It shows the plots and the animation of a run that
-        has a folder "run<number>" beside the page.
+        has a folder "run<number>" beside the page. A study that knows its scenario writes
+        `scenario.yaml` as well, and the page has the commands that make these folders.
 
         Args:
             folder: The folder to write to; it is made.
             title: The title of the page; that of the folder if empty.
-            again: For each run a command that makes its folder, shown in the page.
-            duration: The duration of the runs, in s.
+            again: For each run a command that makes its folder, in place of these.
+            duration: The duration of the runs, in s; that of the scenario, or 1, if None.
         """
         from drake_dae.studies.study_plots import save_study_plots
 
@@ -120,6 +131,12 @@ class Study:
             raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
+        if self.scenario is not None:
+            base = place / "scenario.yaml"
+            save_scenario(self.scenario, base)
+            made = ["drake-dae", "simulate", str(base), *(["--rollout"] if self.rollout else [])]
+            again = again or rerun_commands(made, self.variations, place)
+            duration = self.scenario.duration if duration is None else duration
         table, summary, page = (place / name for name in FILES[:3])
         columns = self.table()
         with open(table, "w", newline="", encoding="utf-8") as file:
@@ -130,7 +147,8 @@ class Study:
             )
         summary.write_text(f"{self}\n", encoding="utf-8")
         named = title or place.resolve().name
-        page.write_text(self._page(named, again, duration), encoding="utf-8")
+        seconds = 1.0 if duration is None else duration
+        page.write_text(self._page(named, again, seconds), encoding="utf-8")
         plots = save_study_plots(columns, self.keys, self.figures, place)
         return [table, summary, page, *plots]
 

@@ -67,8 +67,8 @@ class Controller(System):
     8. Observers. A controller whose law has another state and control than the plant names its
        output ports with these in `observed`, and has the input port `acting_control` for what acts
        on the plant. None if they are those of the plant.
-    9. Phases. `changes` are the times at which phases of a run began, with reasons; empty without
-       phases.
+    9. Phases. `changes` are the times at which phases of a run began, with reasons, and
+       `phase_ends` the signals for which phases wait, "" for none; both empty without phases.
     """
 
     __slots__ = ()
@@ -184,6 +184,11 @@ class Controller(System):
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
         """The start of each phase of a run, with the reason."""
+        return ()
+
+    @property
+    def phase_ends(self) -> tuple[str, ...]:
+        """The signal for which each phase waits, "" for none; empty without phases."""
         return ()
 
 

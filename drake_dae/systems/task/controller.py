@@ -211,6 +211,10 @@ class TaskController(Diagram, Controller):
         """
         return tuple(segment.change for segment in self.segments(context))
 
+    @property
+    def phase_ends(self) -> tuple[str, ...]:
+        return tuple(phase.signal for phase in self.task.plan.phases)
+
     def segments(self, context: Context) -> tuple[ReferenceSegment, ...]:
         """The references of a run, from one change of phases to the next.
 

@@ -147,7 +147,7 @@ def parameter_signals(compiled: CompiledDiagram) -> list[Signal]:
         found[part] = parameters_of_block(system, part.stop - part.start)
     for system, name, part in compiled.fixed:
         count = part.stop - part.start
-        found[part] = [Signal(f"{system.get_name()}.{name}[{i}]") for i in range(count)]
+        found[part] = [Signal(f"{block_name(system)}.{name}[{i}]") for i in range(count)]
     return distinct(found)
 
 
@@ -157,9 +157,17 @@ def parameters_of_block(system: System, count: int) -> list[Signal]:
     own = list(getattr(system, "commands", ()))
     if dae is not None:
         own = parameter_names(dae, law)
+        further = dict(getattr(system, "further_parameters", {}).values())
+        places = {place: signal for signal, place in further.items()}
+        own += [places.get(i, Signal(f"parameter[{i}]")) for i in range(len(own), count)]
     if len(own) != count:
         own = [Signal(f"parameter[{i}]") for i in range(count)]
-    return [Signal(f"{system.get_name()}.{s.name}", s.unit) for s in own]
+    return [Signal(f"{block_name(system)}.{s.name}", s.unit) for s in own]
+
+
+def block_name(system: System) -> str:
+    """The name of a block, the same in every process: of one without a name its class."""
+    return system.get_name().partition("@")[0].rpartition("/")[2]
 
 
 def distinct(signals: Sequence[Signal]) -> list[Signal]:
