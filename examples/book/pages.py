@@ -73,6 +73,12 @@ def blocks(page: Path) -> list[Block]:
     return found
 
 
+def file_of(block: Block) -> tuple[str, str]:
+    """Name and text of the file that a block writes; the name is empty if it writes none."""
+    match = _FILE.match(block.text)
+    return (match[1], block.text[match.end() :]) if match else ("", "")
+
+
 def run_page(page: Path, folder: Path) -> None:
     """Runs the blocks of a page in a folder.
 
@@ -91,8 +97,8 @@ def run_page(page: Path, folder: Path) -> None:
                         compare(following.text, printed)
                 elif block.language == "console":
                     _run_commands(block)
-                elif name := _FILE.match(block.text):
-                    Path(name[1]).write_text(block.text[name.end() :], "utf-8")
+                elif (named := file_of(block))[0]:
+                    Path(named[0]).write_text(named[1], "utf-8")
             except Exception as error:
                 raise PageError(f"{page.relative_to(BOOK)}, line {block.line}: {error}") from error
 
