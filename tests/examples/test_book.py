@@ -30,7 +30,7 @@ def named(page: Path) -> str:
     ],
 )
 def test_page_runs_as_shown(page, tmp_path):
-    run_page(page, tmp_path / page.stem)
+    run_page(page, tmp_path / page.stem, pictures=False)
 
 
 @pytest.mark.parametrize(
