@@ -35,6 +35,7 @@ _MODULES = {
     "schema": "keys",
     "print": "keys",
     "cache": "keys",
+    "explain": "keys",
     "page": "play",
     "live": "play",
     "render": "plot",
@@ -84,9 +85,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         with _warnings(*ignored), ending_signals(end_at_once):
             return run_command(options)
     except DrakeDaeError as error:
+        from drake_dae.scenario.manual.remedies import code_of
+
         # A scenario's error has a line for each problem; other texts, as of Drake, become one line.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
-        print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
+        lines = [f"error: {line} [{code_of(line, type(error))}]" for line in text.splitlines()]
+        print(*lines, sep="\n", file=sys.stderr)
         if as_json:
             print(json.dumps({"error": text}))
         return 1

@@ -41,6 +41,8 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     shown.add_argument("--path", action="store_true", help="print where its file is instead")
     commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
     commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
+    explained = commands.add_parser("explain", help="print what to do about an error, by its code")
+    explained.add_argument("code", nargs="?", default="", help="as E12 (default: all codes)")
     named = argparse.ArgumentParser(add_help=False)
     named.add_argument(
         "scenario",
