@@ -41,8 +41,8 @@ def _identify(options: argparse.Namespace) -> int:
         scenario = recorded_scenario(records)
     else:
         scenario = load_scenario(find_scenario(options.scenario), options.settings)
-    found, identified = identify_scenario(scenario, records, _listed(options.free))
-    _tell(found, identified, options)
+    result, identified = identify_scenario(scenario, records, _listed(options.free))
+    _tell(result, identified, options)
     return 0
 
 
@@ -52,7 +52,7 @@ def _excite(options: argparse.Namespace) -> int:
     from drake_dae.studies.excitation.excite import excite
 
     scenario = load_scenario(find_scenario(options.scenario), options.settings)
-    found = excite(
+    result = excite(
         scenario,
         parse_ranges(options.vary, scenario),
         _listed(options.free),
@@ -62,12 +62,12 @@ def _excite(options: argparse.Namespace) -> int:
         seed=options.seed,
         progress=True,
     )
-    _tell(found, found.scenario, options)
-    return 0 if found.interrupted is None else 128 + found.interrupted
+    _tell(result, result.scenario, options)
+    return 0 if result.interrupted is None else 128 + result.interrupted
 
 
 def _tell(
-    found: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
+    result: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
 ) -> None:
     """Writes the scenario and prints the result."""
     path: Path | None = options.out
@@ -75,9 +75,9 @@ def _tell(
         with stage(path.parent, path.name) as place:
             save_scenario(scenario, place / path.name, MARK)
     if options.json:
-        print(json.dumps(found.to_dict(), indent=2))
+        print(json.dumps(result.to_dict(), indent=2))
         return
-    print(found.text())
+    print(result.text())
     if path is not None:
         print(f"the scenario with these values is written to {path}")
 
@@ -93,14 +93,14 @@ def _noise(texts: list[str]) -> dict[str, float]:
     Raises:
         ModelError: An option is no name with a number.
     """
-    found = dict[str, float]()
+    deviations = dict[str, float]()
     for text in _listed(texts):
         name, _, number = text.partition("=")
         value = number_in(number)
         if value is None:
             raise ModelError(f"--noise takes position=1e-5,force=0.3, got '{text}'")
-        found[name] = value
-    return found
+        deviations[name] = value
+    return deviations
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:
@@ -121,11 +121,11 @@ def _columns(path: Path) -> dict[str, str]:
         ModelError: The file cannot be read, or is no mapping of names to names.
     """
     try:
-        found = load_yaml(read_text(path, 10**6), str(path))
+        data = load_yaml(read_text(path, 10**6), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ModelError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
-    if not isinstance(found, dict) or not all(isinstance(v, str) for v in found.values()):
+    if not isinstance(data, dict) or not all(isinstance(v, str) for v in data.values()):
         raise ModelError(
             f"{path} must name columns line by line, such as 'tau1: control.joint1_motor'"
         )
-    return {str(name): meant for name, meant in found.items()}
+    return {str(name): target for name, target in data.items()}

@@ -37,12 +37,12 @@ def _tip(text: str) -> tuple[str, Vector]:
     Raises:
         ScenarioError: The point is not three numbers.
     """
-    found = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
-    if found is None:
+    match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
+    if match is None:
         return text, (0.0, 0.0, 0.0)
-    numbers = [number_in(word) for word in found[2].split(",")]
+    numbers = [number_in(word) for word in match[2].split(",")]
     x, y, z = numbers if len(numbers) == 3 else (None, None, None)
     if x is None or y is None or z is None:
         wanted = "LINK or LINK:x,y,z with three numbers in m"
         raise ScenarioError(("--tip", f"expected {wanted}, got '{text}'"))
-    return found[1], (x, y, z)
+    return match[1], (x, y, z)

@@ -85,7 +85,7 @@ def add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
 
 def add_identify(commands: Any) -> None:
     """`drake-dae identify`."""
-    found = commands.add_parser(
+    command = commands.add_parser(
         "identify",
         help="find masses, friction, stiffness, places and biases from records",
         description="Finds parameters of the plant of a scenario from records of it, with 95 % "
@@ -93,14 +93,14 @@ def add_identify(commands: Any) -> None:
         "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
         "closes or is struck are left out.",
     )
-    found.add_argument(
+    command.add_argument(
         "records",
         nargs="+",
         type=path_option,
         metavar="RECORD",
         help="a run's folder, .npz, .csv or .mcap",
     )
-    found.add_argument(
+    command.add_argument(
         "--free",
         action="append",
         required=True,
@@ -108,10 +108,10 @@ def add_identify(commands: Any) -> None:
         help="parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
         "position.bias, force.delay and position.delay of sensors; may be repeated",
     )
-    found.add_argument(
+    command.add_argument(
         "--scenario", help="that of the plant (default: the one in the first record)"
     )
-    found.add_argument(
+    command.add_argument(
         "--set",
         dest="settings",
         action="append",
@@ -119,22 +119,22 @@ def add_identify(commands: Any) -> None:
         metavar="KEY=VALUE",
         help="change the scenario that --scenario names; may be repeated",
     )
-    found.add_argument(
+    command.add_argument(
         "--columns",
         type=path_option,
         metavar="FILE",
         help='of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
         '"/topic.field: control.joint1_motor"',
     )
-    found.add_argument(
+    command.add_argument(
         "--out", type=path_option, metavar="FILE", help="a scenario with these values"
     )
-    add_json(found, "print the values as JSON")
+    add_json(command, "print the values as JSON")
 
 
 def add_excite(commands: Any, named: argparse.ArgumentParser) -> None:
     """`drake-dae excite`."""
-    found = commands.add_parser(
+    command = commands.add_parser(
         "excite",
         parents=[named],
         help="find the motion and the force that determine parameters best",
@@ -142,40 +142,42 @@ def add_excite(commands: Any, named: argparse.ArgumentParser) -> None:
         "parameters of the plant best, within all limits, and prints the 95 % intervals that "
         "`identify` will find from it, before and after. Ctrl-C gives the best so far.",
     )
-    found.add_argument(
+    command.add_argument(
         "--free",
         action="append",
         required=True,
         metavar="NAMES",
         help="parameters of the plant, as tool.mass,link3.mass; may be repeated",
     )
-    found.add_argument(
+    command.add_argument(
         "--vary",
         action="append",
         required=True,
         metavar="KEY=LOW..HIGH",
         help='what may be chosen, as "references.wall.force.amplitudes.0=0..15"; may be repeated',
     )
-    found.add_argument(
+    command.add_argument(
         "--noise",
         action="append",
         default=[],
         metavar="KIND=DEVIATION",
         help="of sensors, where the scenario states none: position=1e-5,force=0.3 (rad or m; N)",
     )
-    found.add_argument(
+    command.add_argument(
         "--criterion",
         choices=("D", "A"),
         default="D",
         help="D: the volume of the ellipsoid of the relative errors; A: the sum of their squares "
         "(default: D)",
     )
-    found.add_argument(
+    command.add_argument(
         "--runs", type=whole_option, default=100, help="how many runs are made (default: 100)"
     )
-    found.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
-    found.add_argument("--out", type=path_option, metavar="FILE", help="a scenario with the choice")
-    add_json(found, "print the choice and the intervals as JSON")
+    command.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
+    command.add_argument(
+        "--out", type=path_option, metavar="FILE", help="a scenario with the choice"
+    )
+    add_json(command, "print the choice and the intervals as JSON")
 
 
 def path_option(text: str) -> Path:

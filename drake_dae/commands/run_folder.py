@@ -147,9 +147,9 @@ def _check(folder: Path, text: str | None) -> None:
     # Empty: new, or from a run that was killed at once.
     own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
     if present and (present[0] != scenario or scenario.is_symlink() or not own):
-        found = ", ".join(file.name for file in present)
+        names = ", ".join(file.name for file in present)
         raise ModelError(
-            f"'{folder}' holds {found}, not from an earlier run; choose another folder"
+            f"'{folder}' holds {names}, not from an earlier run; choose another folder"
         )
 
 

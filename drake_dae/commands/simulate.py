@@ -196,14 +196,14 @@ def _roll(run: _CommandRun) -> RunStatistics:
         return ending.signal is not None
 
     with ending_signals(ending := Interruption()):
-        found = roll_scenario(run.scenario, run.loop, run.context, look=look)
-    run.record, run.recorded = found.record, found.record.after
-    run.context = found.context or run.context
-    if found.failure is not None:
-        raise found.failure
+        rollout = roll_scenario(run.scenario, run.loop, run.context, look=look)
+    run.record, run.recorded = rollout.record, rollout.record.after
+    run.context = rollout.context or run.context
+    if rollout.failure is not None:
+        raise rollout.failure
     times, wall = run.record.time, time.perf_counter() - began
     simulated = float(times[-1] - times[0]) if times.size else 0.0
-    return RunStatistics(simulated, wall, found.steps, ending.signal)
+    return RunStatistics(simulated, wall, rollout.steps, ending.signal)
 
 
 def _run(
@@ -355,13 +355,13 @@ def _colored(job: JobVerdict) -> str:
 
 def _as_data(run: _CommandRun, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
     """The results of a run for JSON."""
-    found = run.statistics
+    statistics = run.statistics
     return {
         **as_data(verdict, reasons),
-        "interrupted": found is not None and found.interrupted is not None,
-        "simulated_time": None if found is None else found.simulated_time,
-        "steps": None if found is None else found.steps,
-        "wall_time": None if found is None else found.wall_time,
+        "interrupted": statistics is not None and statistics.interrupted is not None,
+        "simulated_time": None if statistics is None else statistics.simulated_time,
+        "steps": None if statistics is None else statistics.steps,
+        "wall_time": None if statistics is None else statistics.wall_time,
     }
 
 

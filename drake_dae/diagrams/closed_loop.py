@@ -142,11 +142,11 @@ class ClosedLoop:
         logged = Record.from_logs(self.loggers, context, after)
         if self.plant.functions:
             logged = completed(logged, self, context)
-        found = self.with_errors(logged, context).while_finite()
+        record = self.with_errors(logged, context).while_finite()
         begin = -np.inf if after is None else after
-        end = found.time[-1] if found.time.size else -np.inf
+        end = record.time[-1] if record.time.size else -np.inf
         events = self.plant.events(self.plant.GetMyContextFromRoot(context))
-        return replace(found, events=tuple(one for one in events if begin < one.time <= end))
+        return replace(record, events=tuple(event for event in events if begin < event.time <= end))
 
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
         """A record with the derived signals of its controller: `tracking_error` and others.
@@ -155,19 +155,15 @@ class ClosedLoop:
             record: The record.
             context: The diagram's context after the run, for controllers that need it.
         """
+        plant, controller, at_controller = self.plant, self.controller, None
         values = {name: recorded.values for name, recorded in record.signals.items()}
-        own = None
         if context is not None:
-            own, at_plant = (
-                block.GetMyContextFromRoot(context) for block in (self.controller, self.plant)
-            )
-            along = self.plant.parameters_along(at_plant, record.time)
-            values["parameters"] = self.controller.law.system.parameters_of(self.plant.dae, along)
-        derived = {
-            name: recorded_values(found, tuple(signals))
-            for name, (found, signals) in self.controller.derived(own, record.time, values).items()
-        }
-        return Record(record.time, {**record.signals, **derived})
+            at_controller = controller.GetMyContextFromRoot(context)
+            along = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+            values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
+        derived = controller.derived(at_controller, record.time, values)
+        added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
+        return Record(record.time, {**record.signals, **added})
 
     def predicted_error(self, record: Record) -> FloatArray:
         """The predicted error (30), (31) of a record, one column for each output."""

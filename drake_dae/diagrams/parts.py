@@ -112,23 +112,23 @@ def check_parts(
     missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}
     refused = {name: needs for name, source in missing.items() if source is None}
     refused |= controller.refused
-    given = {name: getattr(parts, name) for name in refused}
-    found = [
+    parts_given = {name: getattr(parts, name) for name in refused}
+    problems = [
         f"{name}: {refused[name]}"
-        for name, value in given.items()
+        for name, value in parts_given.items()
         if value is not None and not (name == "exogenous" and not value)
     ]
-    if found:
-        raise WiringError("; ".join(found))
+    if problems:
+        raise WiringError("; ".join(problems))
     sensor = parts.sensor
     if sensor is None:
         return
-    own, size = plant.dae, sensor.GetInputPort("force").size()
-    if size != own.num_constraints:
-        names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
+    dae, size = plant.dae, sensor.GetInputPort("force").size()
+    if size != dae.num_constraints:
+        names = ", ".join(signal.name for signal in dae.constraint_input_signals) or "none"
         raise WiringError(
-            f"the sensor measures {size} forces, the plant '{own.name}' has "
-            f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
+            f"the sensor measures {size} forces, the plant '{dae.name}' has "
+            f"{dae.num_constraints} ({names}); make it as ForceSensor({dae.num_constraints}, "
             "...)"
         )
     if not controller.HasInputPort("measured_force"):
@@ -260,13 +260,13 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
         return []
     law = controller.law
     inputs = law.measured_force.inputs if law.measured_force else {}
-    found = np.zeros((len(law.integral.outputs), len(plant.contacts)))
+    integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
     for row, output in enumerate(law.integral.outputs):
         for column, normal in enumerate(plant.normals):
-            found[row, column] = inputs.get(output) == normal
-    if not found.any():
+            integrates[row, column] = inputs.get(output) == normal
+    if not integrates.any():
         return []
-    system = AffineSystem(D=-found, y0=found.sum(axis=1))
+    system = AffineSystem(D=-integrates, y0=integrates.sum(axis=1))
     hold = builder.AddSystem(system)
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())

@@ -283,12 +283,12 @@ def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
 def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -> list[Reference]:
     """References in the order of the outputs, each smooth enough."""
     outputs = [signal.name for signal in law.system.output_signals]
-    found = []
+    smooth = []
     for name, reference in references.items():
         with at(f"references.{name}"):
-            found.append(assigned(name, reference, outputs, law.degrees))
+            smooth.append(assigned(name, reference, outputs, law.degrees))
     with at("references"):
-        return in_order(found, outputs)
+        return in_order(smooth, outputs)
 
 
 def exogenous_references(

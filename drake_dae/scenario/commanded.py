@@ -61,14 +61,14 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
     left_out = dict[str, str]()
     while True:
         try:
-            found = scenario
+            changed = scenario
             for name, add in parts.items():
-                added = add(found)
-                if isinstance(added, str):
-                    left_out[name] = f"{name}: {added}"
+                result = add(changed)
+                if isinstance(result, str):
+                    left_out[name] = f"{name}: {result}"
                 else:
-                    found = added
-            completed, loop = build_completed(found, commands=limits)
+                    changed = result
+            completed, loop = build_completed(changed, commands=limits)
             # At rest, where the scenario itself starts at rest.
             begun = replace(completed.scenario, exogenous=scenario.exogenous)
             context = start_scenario(begun, loop)

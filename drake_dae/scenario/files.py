@@ -107,8 +107,8 @@ def _check_no_robot(path: Path, text: str) -> None:
         ScenarioError: It is one; the message says how to make a scenario of it.
     """
     is_markup = text.lstrip().startswith("<")
-    found = _ROBOT.search(text) if is_markup or "directives" in text else None
-    if found is None or is_markup == found[0].startswith("directives"):
+    match = _ROBOT.search(text) if is_markup or "directives" in text else None
+    if match is None or is_markup == match[0].startswith("directives"):
         return
     problem = (
         f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, and "

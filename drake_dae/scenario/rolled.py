@@ -134,7 +134,7 @@ def roll_scenario(
     """
     start, parameters = start_values(loop, context)
     watched = _DivergenceWatch(scenario, loop, look)
-    (found,) = run_loop(
+    (rollout,) = run_loop(
         loop,
         start,
         parameters,
@@ -144,7 +144,7 @@ def roll_scenario(
         lasting=lasting,
         look=watched,
     )
-    return watched.judged(found)
+    return watched.judged(rollout)
 
 
 def roll_together(
@@ -172,7 +172,7 @@ def roll_together(
         first = scenarios[places[0]]
         starts, parameters = zip(*(start_values(loop, contexts[i]) for i in places), strict=True)
         with suppress(InconsistentStateError):  # That run says so itself.
-            found = run_together(
+            runs = run_together(
                 loop,
                 np.array(starts),
                 np.array(parameters),
@@ -181,7 +181,7 @@ def roll_together(
                 seeds=[_seeds(scenarios[i]) for i in places],
                 lasting=lasting,
             )
-            for index, run in zip(places, found, strict=True):
+            for index, run in zip(places, runs, strict=True):
                 if run is not None:
                     together[index] = _DivergenceWatch(scenarios[index], loop).judged(run)
     return together
@@ -189,12 +189,12 @@ def roll_together(
 
 def _seeds(scenario: Scenario) -> dict[str, int]:
     """The seed of each source of noise."""
-    found = {}
+    seeds = {}
     if scenario.force_feedback.is_measured:
-        found["force_noise"] = scenario.force_feedback.seed
+        seeds["force_noise"] = scenario.force_feedback.seed
     if scenario.encoders is not None:
-        found["encoder_noise"] = encoder_seed(scenario.encoders.seed)
-    return found
+        seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+    return seeds
 
 
 class _DivergenceWatch:
@@ -227,7 +227,7 @@ class _DivergenceWatch:
         except SimulationError as error:
             self._failure = error
 
-    def judged(self, found: Rollout) -> Rollout:
+    def judged(self, rollout: Rollout) -> Rollout:
         """A rollout up to where it diverges."""
-        self._see(found.record.after(self._time), is_last=found.failure is None)
-        return found if self._failure is None else found.ended(self._failure)
+        self._see(rollout.record.after(self._time), is_last=rollout.failure is None)
+        return rollout if self._failure is None else rollout.ended(self._failure)

@@ -119,11 +119,11 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     """The gains of a scenario; many runs of a study have those of the last one."""
-    key, (known, found) = repr(gains), loop.memory.get("gains", ("", None))
-    if known != key:
-        found = loop.controller.law.design(gains.design())
-        loop.memory["gains"] = key, found
-    return cast(FeedbackGains, found)
+    key, (last_key, design) = repr(gains), loop.memory.get("gains", ("", None))
+    if last_key != key:
+        design = loop.controller.law.design(gains.design())
+        loop.memory["gains"] = key, design
+    return cast(FeedbackGains, design)
 
 
 def _in_motion(
@@ -160,8 +160,8 @@ def _configuration(
 ) -> FloatArray:
     """q with given position outputs, on the constraints, without whole turns and within limits."""
     try:
-        found = model.configuration(positions, guess, parameters)
-        q = _unwound(model, positions, found, guess, parameters)
+        solution = model.configuration(positions, guess, parameters)
+        q = _unwound(model, positions, solution, guess, parameters)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -195,7 +195,7 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
 def _unwound(
     model: RobotModel,
     positions: FloatArray,
-    found: FloatArray,
+    solution: FloatArray,
     guess: FloatArray,
     parameters: FloatArray,
 ) -> FloatArray:
@@ -204,7 +204,7 @@ def _unwound(
     Newton's method may add whole turns to a joint. A turn is kept if an output, a constraint or a
     limit needs it.
     """
-    q, turn = found, 2 * np.pi
+    q, turn = solution, 2 * np.pi
     limits = model.links.position_limits
     is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
     for index in np.flatnonzero(~is_inside | (np.abs(q - guess) >= np.pi)):

@@ -79,8 +79,8 @@ class DivergenceWatch:
         times, shown = np.array([context.get_time()]), self._shown(context)
         state, control = shown("state")[None], shown("control")[None]
         if self._controls is not None and control.size:
-            found = self._controls.look(times, control, state)
-            _raise_first([found] if always else [])
+            error = self._controls.look(times, control, state)
+            _raise_first([error] if always else [])
         for controller, errors in self._errors:
             if (now := self._compared(controller, context)) is not None:
                 _raise_first([errors.look(times, now[0][None], now[1][None], state)])
@@ -159,16 +159,16 @@ class RecordWatch:
             )
         of_states, of_controls, of_errors = self._watched
         controls = of_controls.look(record.time, record["control"], states)
-        found = [
+        errors = [
             of_errors.look(record.time, outputs, record["desired_output"], states),
             of_states.look(record.time, states, states),
         ]
-        _raise_first([*found, controls] if is_last else found)
+        _raise_first([*errors, controls] if is_last else errors)
 
 
 def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
     """The largest numbers in each unit of a plant's signals."""
-    found: Sizes = {}
+    sizes: Sizes = {}
     dae = plant.dae
     for name, signals in (
         ("state", dae.state_signals),
@@ -176,8 +176,8 @@ def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
         ("constraint_force", dae.force_signals),
         ("control", dae.control_signals),
     ):
-        found = with_sizes(found, signals, shown(name))
-    return found
+        sizes = with_sizes(sizes, signals, shown(name))
+    return sizes
 
 
 def _least(plant: Plant) -> Sizes:
@@ -194,6 +194,6 @@ def _blocks(system: System) -> Iterator[System]:
         yield system
 
 
-def _raise_first(found: Sequence[SimulationError | None]) -> None:
-    if errors := [error for error in found if error is not None]:
+def _raise_first(candidates: Sequence[SimulationError | None]) -> None:
+    if errors := [error for error in candidates if error is not None]:
         raise min(errors, key=lambda error: error.time)

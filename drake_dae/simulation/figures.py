@@ -27,29 +27,29 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     """
     if not record.time.size:
         return {}
-    found = {}
+    figures = {}
     errors = record["tracking_error"]
-    figures = _each(
+    rows = _each(
         record, "tracking_error", _largest(errors), errors[-1], late_rms(record.time, errors)
     )
-    for signal, largest, final, late in figures:
-        found[_label("largest error of", signal)] = largest
-        found[_label("final error of", signal)] = final
-        found[_label("late error of", signal)] = late
+    for signal, largest, final, late in rows:
+        figures[_label("largest error of", signal)] = largest
+        figures[_label("final error of", signal)] = final
+        figures[_label("late error of", signal)] = late
     for signal, least, largest in _each(
         record, "constraint_force", *_extremes(record["constraint_force"])
     ):
-        found[_label("least", signal)] = least
-        found[_label("largest", signal)] = largest
+        figures[_label("least", signal)] = least
+        figures[_label("largest", signal)] = largest
     for signal, largest in _each(record, "control", _largest(record["control"])):
-        found[_label("largest", signal)] = largest
+        figures[_label("largest", signal)] = largest
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     return {
-        **found,
+        **figures,
         **{
             _label("margin of", signal): room
             for signal, room in margins(record, limits)
-            if _label("least", signal) not in found  # They are equal.
+            if _label("least", signal) not in figures  # They are equal.
         },
         "largest residual": float(residual),
         "end [s]": float(record.time[-1]),
@@ -62,23 +62,23 @@ def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
     The limit of a control is on |u|, that of a unilateral force is zero, and positions and
     velocities have a lower and an upper limit. A start may be on a limit, up to round-off.
     """
-    found = []
+    rooms = []
     for index, (signal, largest) in enumerate(
         _each(record, "control", _largest(record["control"]))
     ):
         limit = np.inf if limits.control is None else limits.control[index]
-        found.append((signal, float(limit - largest)))
+        rooms.append((signal, float(limit - largest)))
     forces = record["constraint_force"]
     for signal, least, _ in _each(record, "constraint_force", *_extremes(forces)):
         if not limits.can_pull(signal):
-            found.append((signal, least))
+            rooms.append((signal, least))
     for name, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and name in record.signals:
             extremes = _each(record, name, *_extremes(record[name]))
             for (signal, least, largest), low, high in zip(extremes, *bounds, strict=False):
                 room = float(min(least - low, high - largest))
-                found.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
-    return [(signal, room) for signal, room in found if np.isfinite(room)]
+                rooms.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
+    return [(signal, room) for signal, room in rooms if np.isfinite(room)]
 
 
 def exceeded(record: Record, limits: Limits) -> list[str]:

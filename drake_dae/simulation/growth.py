@@ -34,11 +34,11 @@ Sizes = dict[str, float]
 
 def with_sizes(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
     """Sizes together with those of some signals."""
-    found = dict(sizes)
+    merged = dict(sizes)
     for signal, value in zip(signals, values, strict=False):
         if np.isfinite(value):
-            found[signal.unit] = max(found.get(signal.unit, 0.0), abs(float(value)))
-    return found
+            merged[signal.unit] = max(merged.get(signal.unit, 0.0), abs(float(value)))
+    return merged
 
 
 class StateGrowth:
@@ -55,8 +55,8 @@ class StateGrowth:
     @classmethod
     def controls(cls, plant: Plant, time: float, sizes: Sizes) -> Self:
         """Those of its controls; of a unit in which nothing has a size none is watched."""
-        found = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
-        return cls(plant.dae.control_signals, time, np.array(found))
+        size = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
+        return cls(plant.dae.control_signals, time, np.array(size))
 
     def look(
         self, times: FloatArray, values: FloatArray, states: FloatArray
@@ -148,14 +148,14 @@ class ErrorGrowth:
 
     def _along(self, desired: FloatArray) -> FloatArray:
         """The sizes of all outputs at each time, from what was desired up to then."""
-        units, found = [signal.unit for signal in self._signals], np.zeros_like(desired)
+        units, along = [signal.unit for signal in self._signals], np.zeros_like(desired)
         for unit in dict.fromkeys(units):
-            own = np.array([each == unit for each in units])
-            largest = np.nan_to_num(np.abs(desired[:, own]), nan=0.0, posinf=0.0).max(axis=1)
+            columns = np.array([other == unit for other in units])
+            largest = np.nan_to_num(np.abs(desired[:, columns]), nan=0.0, posinf=0.0).max(axis=1)
             grown = np.maximum.accumulate(np.maximum(largest, self._sizes.get(unit, 0.0)))
             self._sizes[unit] = float(grown[-1])
-            found[:, own] = grown[:, None]
-        return found
+            along[:, columns] = grown[:, None]
+        return along
 
 
 def _quantity(value: float, signal: Signal) -> str:

@@ -244,11 +244,11 @@ def _qualities(
     if not error.size:
         return []
     signals = record.signals["tracking_error"].signals
-    sizes, rms, found = SHARE * _ranges(record, predicted), late_rms(record.time, error), []
+    sizes, rms, qualities = SHARE * _ranges(record, predicted), late_rms(record.time, error), []
     first = int(np.searchsorted(record.time, (record.time[0] + record.time[-1]) / 2.0))
     for i, signal in enumerate(signals):
         tolerance = tolerances.get(signal.name, float(sizes[i]))
-        found.append(
+        qualities.append(
             OutputQuality(
                 signal,
                 tolerance,
@@ -259,7 +259,7 @@ def _qualities(
                 float(rms[i]),
             )
         )
-    return found
+    return qualities
 
 
 def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
@@ -305,8 +305,8 @@ def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
         return np.abs(values[:, -1])
     before, after = values[:, first - 1], values[:, first]
     begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
-    found = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
+    courses = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
     steps = np.diff(np.concatenate([[middle], times[first:]]))
-    squares = (found[:, :-1] ** 2 + found[:, :-1] * found[:, 1:] + found[:, 1:] ** 2) / 3.0
+    squares = (courses[:, :-1] ** 2 + courses[:, :-1] * courses[:, 1:] + courses[:, 1:] ** 2) / 3.0
     sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
     return sizes

@@ -59,30 +59,30 @@ def limit_remarks(record: Record, limits: Limits) -> list[str]:
         record: A record with control and state.
         limits: The limits of the robot.
     """
-    found = []
+    remarks = []
     if limits.control is not None and np.isfinite(limits.control).any():
         shares = np.max(np.abs(record["control"]), axis=0) / limits.control
         place, signal = int(np.argmax(shares)), record.signals["control"].signals
         unit = f" {signal[place].unit}".rstrip()
-        found.append(
+        remarks.append(
             f"of the drives {signal[place].name} comes closest to its limit, with "
             f"{shares[place]:.0%} of {limits.control[place]:.4g}{unit}"
         )
     if limits.state is not None:
         lower, upper = limits.state
         values = record["state"][:, : lower.size]
-        left = np.minimum(values - lower, upper - values).min(axis=0)
+        room = np.minimum(values - lower, upper - values).min(axis=0)
         # A joint with one limit alone, or none, has no range to compare with.
         shares = np.full(lower.size, np.inf)
-        np.divide(left, upper - lower, out=shares, where=np.isfinite(upper - lower))
+        np.divide(room, upper - lower, out=shares, where=np.isfinite(upper - lower))
         place, signal = int(np.argmin(shares)), record.signals["state"].signals
         if np.isfinite(shares[place]):
             unit = f" {signal[place].unit}".rstrip()
-            found.append(
+            remarks.append(
                 f"of the joints {signal[place].name} comes closest to a limit, with "
-                f"{left[place]:.3g}{unit} left"
+                f"{room[place]:.3g}{unit} left"
             )
-    return found
+    return remarks
 
 
 def ball_remarks(radius: float | None) -> list[str]:

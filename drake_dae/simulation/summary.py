@@ -253,8 +253,8 @@ def _identified(record: Record) -> list[str]:
     """The friction identified by an observer at the end."""
     if "friction" not in record.signals:
         return []
-    found = record.signals["friction"]
-    pairs = zip(found.signals, found.values[-1], strict=True)
+    friction = record.signals["friction"]
+    pairs = zip(friction.signals, friction.values[-1], strict=True)
     text = ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
     return [f"identified           {text} at the end"]
 
@@ -288,14 +288,14 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
     ]
     over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
-    found = []
+    texts = []
     if pulling:
-        found.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
+        texts.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
     if beyond:
-        found.append(f"{', '.join(beyond)} would exceed the limits")
+        texts.append(f"{', '.join(beyond)} would exceed the limits")
     if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
-        found.append(f"{', '.join(joints)} would leave the joint limits")
-    return found
+        texts.append(f"{', '.join(joints)} would leave the joint limits")
+    return texts
 
 
 def _beyond(record: Record, limits: Limits) -> list[str]:
@@ -303,8 +303,8 @@ def _beyond(record: Record, limits: Limits) -> list[str]:
     rows: list[tuple[Signal, FloatArray, float, float]] = []
     for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and key in record.signals:
-            found = record.signals[key]
-            rows += zip(found.signals, found.values.T, *bounds, strict=False)
+            recorded = record.signals[key]
+            rows += zip(recorded.signals, recorded.values.T, *bounds, strict=False)
     return [
         f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
         f"its limits are {lower:.4g} and {upper:.4g}"

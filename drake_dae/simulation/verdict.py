@@ -58,13 +58,13 @@ def unit_sizes(record: Record) -> dict[str, float]:
     Args:
         record: A record with any of state, control, constraint_force and desired_output.
     """
-    found = {"": 1.0, "rad": 1.0}
+    sizes = {"": 1.0, "rad": 1.0}
     for name in ("state", "control", "constraint_force", "desired_output"):
         if name in record.signals:
             largest = np.max(np.abs(record[name]), axis=0, initial=0.0)
             for signal, size in zip(record.signals[name].signals, largest, strict=True):
-                found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
-    return found
+                sizes[signal.unit] = max(sizes.get(signal.unit, 0.0), float(size))
+    return sizes
 
 
 def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
@@ -82,13 +82,13 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     courses = np.vstack([record["desired_output"], predicted])
     largest = np.max(np.abs(courses), axis=0, initial=0.0)
     anything = unit_sizes(record)
-    found: dict[str, float] = {"": 1.0, "rad": 1.0}
+    sizes: dict[str, float] = {"": 1.0, "rad": 1.0}
     for signal, size in zip(signals, largest, strict=True):
-        found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
-    for unit, size in found.items():
+        sizes[signal.unit] = max(sizes.get(signal.unit, 0.0), float(size))
+    for unit, size in sizes.items():
         if size <= ROUND_OFF * anything.get(unit, 0.0):
-            found[unit] = anything[unit] or 1.0
-    return np.array([found[signal.unit] for signal in signals])
+            sizes[unit] = anything[unit] or 1.0
+    return np.array([sizes[signal.unit] for signal in signals])
 
 
 def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> RunVerdict:

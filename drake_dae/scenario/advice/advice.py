@@ -32,13 +32,16 @@ _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 
-def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> parts.Coefficients:
+def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
     """The gains of the free robot of a task, soft along the distance: see `TaskController`."""
     constraint = opening_contact(scenario, model)
     names = [signal.name for signal in model.dae.constraint_input_signals]
     place = names.index(constraint.force_signals[0].name)
-    distance, rate = model.dae.constraint_output_signals[place].name, found.position_rate / _SOFTER
-    gains = {signal.name: found.position_gains(2) for signal in model.position_signals}
+    distance, rate = (
+        model.dae.constraint_output_signals[place].name,
+        contact.position_rate / _SOFTER,
+    )
+    gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
     gains[distance] = [rate**2, 2.0 * rate]
     return parts.Coefficients(
         outputs={name: [rounded(gain) for gain in each] for name, each in gains.items()}
@@ -132,14 +135,14 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
     loop = None if scenario.law is None else scenario.law.loop()
     if loop is not None:
-        found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
+        contact = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
     elif scenario.encoders is None:
-        found = contact_gains(stiffness, mobility, period, late, NOISE)
+        contact = contact_gains(stiffness, mobility, period, late, NOISE)
     else:
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
         with at("gains"):
             best = advised_gains(sensed, largest_roughness(scenario, model))
-        found, fast = best.gains, best.state_rate
+        contact, fast = best.gains, best.state_rate
         known_by, outlook = "these encoders", f". {predicted(best)}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
@@ -151,28 +154,30 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if not force.is_measured:
         force = parts.MeasuredForce(sample_period=period)
     # A force of degree 0 has a gain only if it is integrated.
-    of_forces = {name: [rounded(found.force_gain)] for name in forces.tolist() if name in integral}
+    of_forces = {
+        name: [rounded(contact.force_gain)] for name in forces.tolist() if name in integral
+    }
     of_positions = {
-        name: [rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
+        name: [rounded(gain) for gain in contact.position_gains(3 if name in integral else 2)]
         for name in positions.tolist()
     }
     gains = parts.Coefficients(outputs=of_positions | of_forces)
     damping = scenario.constraint_damping
-    if damping is None and found.constraint_damping:
-        damping = parts.Poles(all=[-rounded(found.constraint_damping)])
+    if damping is None and contact.constraint_damping:
+        damping = parts.Poles(all=[-rounded(contact.constraint_damping)])
     observer = scenario.observer
     if observer is None:
         frictional = [c.name for c in model.constraints if c.friction_parameter]
         observer = parts.Observer(
-            rate=rounded(found.observer_rate),
-            force_rate=rounded(found.observer_force_rate),
-            friction_rate=rounded(found.friction_rate),
+            rate=rounded(contact.observer_rate),
+            force_rate=rounded(contact.observer_force_rate),
+            friction_rate=rounded(contact.friction_rate),
             identify_friction=frictional,
             state_rate=None if fast is None else rounded(fast),
         )
     task = scenario.task
     if task is not None and task.gains is None:
-        task = replace(task, gains=_free_gains(scenario, model, found))
+        task = replace(task, gains=_free_gains(scenario, model, contact))
     chosen = replace(
         scenario,
         task=task,
@@ -188,9 +193,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and {known_by}: Butterworth's poles of positions "
-        f"at {rounded(found.position_rate):g} 1/s, and of forces one at "
-        f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
-        f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"at {rounded(contact.position_rate):g} 1/s, and of forces one at "
+        f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
+        f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
         f"{loop_note(scenario)}{outlook}"
         f"{_touch_note(task, stiffness, mobility, period * (1 + late))}"

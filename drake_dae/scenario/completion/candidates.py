@@ -134,14 +134,14 @@ _JOINED = {
 
 def merged(forms: Iterable[Output]) -> list[Output]:
     """The same rows in fewer outputs: those that differ in what rows they have become one."""
-    found: list[Any] = []
+    outputs: list[Any] = []
     for form in forms:
         key = _JOINED[type(form)]
-        own = getattr(form, key)
-        if found and type(found[-1]) is type(form):
-            first = getattr(found[-1], key)
-            if replace(form, **{key: first}) == found[-1]:
-                found[-1] = replace(form, **{key: first + own})
+        rows = getattr(form, key)
+        if outputs and type(outputs[-1]) is type(form):
+            joined = getattr(outputs[-1], key)
+            if replace(form, **{key: joined}) == outputs[-1]:
+                outputs[-1] = replace(form, **{key: joined + rows})
                 continue
-        found.append(form)
-    return found
+        outputs.append(form)
+    return outputs

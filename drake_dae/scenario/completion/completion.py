@@ -127,8 +127,8 @@ def _with_start(
         if best is None:  # The start reports it.
             return Completed(scenario)
         return Completed(_started(scenario, referred, best), (_start_note(referred, best),))
-    found = _found(referred, postures, rows, wanted, guess)
-    return Completed(_started(scenario, referred, found), (_start_note(referred, found),))
+    posture = _found(referred, postures, rows, wanted, guess)
+    return Completed(_started(scenario, referred, posture), (_start_note(referred, posture),))
 
 
 def _with_outputs(
@@ -204,9 +204,9 @@ def _posture(
             if near is not None and near.independence(rows) > REGULAR:
                 return near, len(chosen) > len(rows)
     if candidates.tilts:
-        found = best_posture(postures, both, goal, [guess, *_guesses(referred, postures, guess)])
-        if found is not None:
-            return found, True
+        posture = best_posture(postures, both, goal, [guess, *_guesses(referred, postures, guess)])
+        if posture is not None:
+            return posture, True
     return _found(referred, postures, rows, wanted, guess), False
 
 
@@ -230,9 +230,9 @@ def _found(
         ScenarioError: There is none; the message has the remaining errors of the nearest.
     """
     guesses = [guess, *_guesses(referred, postures, guess)]
-    found = best_posture(postures, rows, wanted, guesses)
-    if found is not None:
-        return found
+    best = best_posture(postures, rows, wanted, guesses)
+    if best is not None:
+        return best
     nearest = nearest_posture(postures, rows, wanted, guesses)
     polished = near_posture(postures, rows, wanted, nearest.q)
     if polished is not None:

@@ -165,9 +165,9 @@ class Postures:
         self.size = float(np.max(np.ptp(points, axis=1))) or 1.0
 
     def _values(self, q: FloatArray) -> dict[str, FloatArray]:
-        found = self._function(q, self._parameters)
+        results = self._function(q, self._parameters)
         nq = q.size
-        values = dict(zip(self._function.output_names, found, strict=True))
+        values = dict(zip(self._function.output_names, results, strict=True))
         # A matrix of one row or column comes as a vector.
         for name in ("slopes", "constraint_slopes", "gradients", "constraints", "mass"):
             values[name] = values[name].reshape(-1, nq)
@@ -195,12 +195,12 @@ class Postures:
         chosen = list(rows)
 
         def residual(q: FloatArray) -> FloatArray:
-            found = self._values(q)
-            return np.concatenate([found["left"], found["rows"][chosen] - wanted])
+            values = self._values(q)
+            return np.concatenate([values["left"], values["rows"][chosen] - wanted])
 
         def linearize(q: FloatArray) -> NewtonModel | None:
-            found = self._values(q)
-            gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
+            values = self._values(q)
+            gradients = np.vstack([values["constraint_slopes"], values["slopes"][chosen]])
             return shortest_steps(gradients, residual)
 
         q = newton(guess, linearize, _NEWTON_STEPS)[0]
@@ -210,8 +210,8 @@ class Postures:
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
         """The residual of the constraints and of wanted values of rows, shape (k + len(rows),)."""
-        found = self._values(q)
-        return np.concatenate([found["left"], found["rows"][list(rows)] - wanted])
+        values = self._values(q)
+        return np.concatenate([values["left"], values["rows"][list(rows)] - wanted])
 
     def _turned_back(self, q: FloatArray) -> FloatArray:
         """The same configuration with as few whole turns as possible, within limits."""

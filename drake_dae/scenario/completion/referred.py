@@ -64,14 +64,14 @@ class ReferredRows:
 
     def _named(self, name: str) -> list[int | None]:
         """The rows of a key of the references; None for a force."""
-        key, found = f"references.{name}", list[int | None]()
+        key, rows = f"references.{name}", list[int | None]()
         for part in map(str.strip, name.split(",")):
-            found += self._meant(part, key)
+            rows += self._meant(part, key)
         reference = self.scenario.references[name]
-        if isinstance(reference, Reference) and reference.size != len(found):
-            text = f"{reference.size} values for {len(found)} outputs"
+        if isinstance(reference, Reference) and reference.size != len(rows):
+            text = f"{reference.size} values for {len(rows)} outputs"
             raise ScenarioError((key, text))
-        return found
+        return rows
 
     def _meant(self, name: str, key: str) -> Sequence[int | None]:
         signals = [signal.name for signal in self.candidates.signals]
@@ -99,8 +99,8 @@ class ReferredRows:
         """The values of the referred rows at a time in s, shape (referred,)."""
         values: dict[int | None, float] = {}
         for name, rows in self._meanings.items():
-            found = value_at(self.scenario.references[name], len(rows), time)
-            values.update(zip(rows, found.tolist(), strict=True))
+            r = value_at(self.scenario.references[name], len(rows), time)
+            values.update(zip(rows, r.tolist(), strict=True))
         return np.array([values[row] for row in self.rows])
 
     def times(self) -> FloatArray:

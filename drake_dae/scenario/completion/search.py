@@ -45,13 +45,13 @@ def best_posture(
         The one with the largest `quality`, the first of equal ones; None if the first `PATIENCE`
         guesses give none.
     """
-    found: list[Posture] = []
+    reached: list[Posture] = []
     for count, guess in enumerate(guesses):
-        if count == PATIENCE and not found:
+        if count == PATIENCE and not reached:
             break
         posture = near_posture(postures, rows, wanted, guess)
-        found += [posture] if posture is not None else []
-    return max(found, key=lambda one: postures.quality(one, rows), default=None)
+        reached += [posture] if posture is not None else []
+    return max(reached, key=lambda posture: postures.quality(posture, rows), default=None)
 
 
 def nearest_posture(
@@ -77,8 +77,8 @@ def nearest_posture(
         return np.vstack([_HARD * posture.constraint_slopes, posture.slopes[chosen]])
 
     tried = sorted(guesses, key=lambda q: float(np.sum(residual(np.clip(q, low, high)) ** 2)))
-    found = [
+    fits = [
         least_squares(residual, np.clip(q, low, high), gradient, (low, high), max_nfev=50)
         for q in tried[:_CLOSEST]
     ]
-    return postures.at(min(found, key=lambda one: float(one.cost)).x)
+    return postures.at(min(fits, key=lambda fit: float(fit.cost)).x)

@@ -26,16 +26,16 @@ def check_task(scenario: Scenario) -> None:
     """
     refused = {"references": "a task has the references of its phases; leave them out"}
     refused |= {key: TaskController.refused[name] for key, name in _SETTINGS.items()}
-    found = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
+    problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
         names = [name for name in task.made().signals if name not in task.signals]
-        found += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
+        problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
     if scenario.start.errors:
-        found.append(("start.errors", "a task begins at start.positions; leave them out"))
+        problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if not scenario.start.positions:
-        found.append(("start.positions", "needed: where the task begins, joint by joint"))
-    if found:
-        raise ScenarioError(*found)
+        problems.append(("start.positions", "needed: where the task begins, joint by joint"))
+    if problems:
+        raise ScenarioError(*problems)
 
 
 def task_controller(

@@ -147,11 +147,11 @@ def sample_times(
     while True:
         share = random.uniform(0.3, 0.7, times.size - 1)
         tried = times[:-1] + share * np.diff(times)
-        found = np.array([reference(time) for time in tried])
-        known = np.concatenate([values, found])
+        new_values = np.array([reference(time) for time in tried])
+        all_values = np.concatenate([values, new_values])
         # A constant varies by round-off.
-        allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
-        off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
+        allowed = _STRAIGHT * np.ptp(all_values, axis=0) + 1e-9 * np.abs(all_values).max(axis=0)
+        off = np.abs(new_values - values[:-1] - share[:, None] * np.diff(values, axis=0))
         is_long = np.diff(times) > _SHORTEST * (end - begin)  # The second derivative may jump.
         new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
         room = MOST_SAMPLES - times.size
@@ -159,7 +159,7 @@ def sample_times(
         if not is_resolved:
             new = np.sort(random.choice(new, room, replace=False))
         times = np.insert(times, new + 1, tried[new])
-        values = np.insert(values, new + 1, found[new], axis=0)
+        values = np.insert(values, new + 1, new_values[new], axis=0)
         if not (new.size and is_resolved):
             return times, is_resolved
 
@@ -178,7 +178,7 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
 
     highest, reactions = model.control_limits, dae.force_signals
     least = np.array([-np.inf if limits.can_pull(signal) else 0.0 for signal in reactions])
-    found = {
+    ranges_of = {
         "controls": ranges(dae.control_signals, motion.controls, -highest, highest),
         "constraint_forces": ranges(
             reactions, _forces(dae, motion), least, np.full(least.size, np.inf)
@@ -187,13 +187,13 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
     if model.joint_force is not None:
         effort = model.links.effort_limits
         forces = _along(model, model.joint_force, motion.states)
-        found["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
+        ranges_of["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
     if limits.state is not None:
         low, high = limits.state
         bounded = np.isfinite(low) | np.isfinite(high)
         chosen = [s for s, yes in zip(dae.state_signals, bounded, strict=False) if yes]
         values = motion.states[:, : low.size][:, bounded]
-        found["joints"] = ranges(chosen, values, low[bounded], high[bounded])
+        ranges_of["joints"] = ranges(chosen, values, low[bounded], high[bounded])
     if limits.loops is not None:
         low, high = limits.loops
         bounded = np.isfinite(low) | np.isfinite(high)
@@ -201,8 +201,8 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
         chosen = [s for s, yes in zip(loops.signals, bounded, strict=True) if yes]
         values = _along(model, loops.state, motion.states)[:, bounded]
         own = ranges(chosen, values, low[bounded], high[bounded])
-        found["joints"] = (*found.get("joints", ()), *own)
-    return found
+        ranges_of["joints"] = (*ranges_of.get("joints", ()), *own)
+    return ranges_of
 
 
 def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:

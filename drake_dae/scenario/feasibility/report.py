@@ -114,8 +114,8 @@ class Feasibility:
         )
 
     def __repr__(self) -> str:
-        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
-        return f"Feasibility('{self.analysis.system.name}': {found})"
+        text = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Feasibility('{self.analysis.system.name}': {text})"
 
     def __str__(self) -> str:
         return to_text(self._parts())

@@ -132,8 +132,8 @@ def _entries(
 
 def unit_of(text: str) -> str:
     """The unit in a text, "in N m" or "..., m, ..."; empty if there is none."""
-    found = _UNIT.search(text)
-    return (found[1] or found[2]) if found else ""
+    match = _UNIT.search(text)
+    return (match[1] or match[2]) if match else ""
 
 
 def _with(data: Any, path: tuple[str | int, ...], value: Any) -> Any:

@@ -82,11 +82,11 @@ def new_scenario(
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RobotFileWarning)  # The links are reported.
                 whole = complete_scenario(_scenario(robot, task, links)).scenario
-                found = find_feasibility(whole)
-            problems = found.problems
-            deeper = usable is not None and _depth(found) >= _depth(usable[2])
-            if not deeper and not set(problems) - {*_beside(found), *found.wrong_sides}:
-                usable = whole, task, found
+                report = find_feasibility(whole)
+            problems = report.problems
+            deeper = usable is not None and _depth(report) >= _depth(usable[2])
+            if not deeper and not set(problems) - {*_beside(report), *report.wrong_sides}:
+                usable = whole, task, report
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
@@ -95,10 +95,10 @@ def new_scenario(
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
     if usable is not None:
-        whole, task, found = usable
-        remarks = {"outputs": _BESIDE} if _beside(found) else {}
-        if found.wrong_sides:
-            remarks["constraints"] = "; ".join(map(str, found.behind))
+        whole, task, report = usable
+        remarks = {"outputs": _BESIDE} if _beside(report) else {}
+        if report.wrong_sides:
+            remarks["constraints"] = "; ".join(map(str, report.behind))
         robot = replace(robot, remarks={**robot.remarks, **remarks})
         return whole, scenario_text(whole, robot, task, Path(folder).resolve())
     raise ScenarioError(
@@ -111,14 +111,14 @@ def new_scenario(
     )
 
 
-def _depth(found: Feasibility) -> float:
+def _depth(report: Feasibility) -> float:
     """How far links are behind surfaces or in each other, all together, in m."""
-    return sum(one.depth for one in found.behind)
+    return sum(link.depth for link in report.behind)
 
 
-def _beside(found: Feasibility) -> tuple[str, ...]:
+def _beside(report: Feasibility) -> tuple[str, ...]:
     """The problems with states near the start but off the reference."""
-    analysis = found.analysis
+    analysis = report.analysis
     if analysis.structure is None or analysis.motion is None or analysis.motion.ending:
         return ()
     rank = (assumption for assumption in analysis.assumptions if assumption.number == 5)

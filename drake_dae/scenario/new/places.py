@@ -89,10 +89,12 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
         point: The point in it, m.
     """
     search = _PlaceSearch(links, tip, point)
-    found = [search.best(axis, sign) for axis, sign, _ in _NORMALS]
-    ranked = [(place, liked) for place, (_, _, liked) in zip(found, _NORMALS, strict=True) if place]
-    ranked.sort(key=lambda pair: -pair[0].quality * pair[0].directions * pair[1])
-    return [place for place, _ in ranked]
+    ranked = [
+        (place, place.quality * place.directions * preference)
+        for axis, sign, preference in _NORMALS
+        if (place := search.best(axis, sign)) is not None
+    ]
+    return [place for place, _ in sorted(ranked, key=lambda pair: -pair[1])]
 
 
 class _PlaceSearch:
@@ -140,10 +142,10 @@ class _PlaceSearch:
             posture = near_posture(self._postures, tilts, np.zeros(2), guess)
             aligned += [] if posture is None else [posture]
         slanted = [self._postures.at(guess) for guess in self._guesses]
-        found = [self._place(axis, sign, posture, 1.0) for posture in aligned]
-        found += [self._place(axis, sign, posture, _SLANTED) for posture in slanted]
-        good = [place for place in found if place is not None]
-        return max(good, key=lambda one: one.quality * one.directions, default=None)
+        places = [self._place(axis, sign, posture, 1.0) for posture in aligned]
+        places += [self._place(axis, sign, posture, _SLANTED) for posture in slanted]
+        reached = [place for place in places if place is not None]
+        return max(reached, key=lambda place: place.quality * place.directions, default=None)
 
     def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> TipPlace | None:
         """The place of a posture; None if the tip cannot move along the surface."""

@@ -116,9 +116,9 @@ def _short(value: Any) -> Any:
     if not isinstance(value, Mapping):
         return value
     unsaid: tuple[Any, ...] = ("", [], {}, None, [0.0, 0.0, 0.0], [0.0])
-    found = {key: _short(inner) for key, inner in value.items()}
+    entries = {key: _short(inner) for key, inner in value.items()}
     return {
-        key: inner for key, inner in found.items() if inner is not False and inner not in unsaid
+        key: inner for key, inner in entries.items() if inner is not False and inner not in unsaid
     }
 
 

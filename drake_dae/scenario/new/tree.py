@@ -37,11 +37,11 @@ class Tree:
 
     def path(self, body: RigidBody) -> list[Joint]:
         """The joints from the world to a body."""
-        found: list[Joint] = []
+        joints: list[Joint] = []
         while body.index() in self.above:
-            found.append(self.above[body.index()])
-            body = found[-1].parent_body()
-        return found[::-1]
+            joints.append(self.above[body.index()])
+            body = joints[-1].parent_body()
+        return joints[::-1]
 
     @property
     def works(self) -> list[Joint]:

@@ -12,7 +12,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
     Joint,
-    JointActuator,
     PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
@@ -25,6 +24,7 @@ from drake_dae.robots.constraints.plant_constraints import Coupling, couplings_o
 from drake_dae.robots.links.frames import joint_names, unique_names
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
+from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
 from drake_dae.scenario.robot_file.payloads import add_payloads
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
@@ -44,7 +44,7 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
         couplings = _read_couplings(robot)
-    with _told_by_drake():
+    with _drake_errors():
         if robot.base is not None:
             weld_base(robot.base, plant)
         if robot.locked:
@@ -61,12 +61,12 @@ def finalize(plant: MultibodyPlant) -> None:
     Raises:
         ModelError: Drake cannot finalize it.
     """
-    with _told_by_drake():
+    with _drake_errors():
         plant.Finalize()
 
 
 @contextmanager
-def _told_by_drake() -> Iterator[None]:
+def _drake_errors() -> Iterator[None]:
     """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
     try:
         yield
@@ -98,11 +98,10 @@ def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
     body = frame.body()
     if body.index() == plant.world_body().index():
         raise ModelError("the world needs no base; name a frame of the robot")
-    held = [joint.name() for joint in _joints(plant) if joint.child_body() is body]
-    if held:
+    if joint := _joints_to_parents(plant).get(body.index()):
         raise ModelError(
-            f"body '{body.name()}' is attached already, by joint '{held[0]}'; unattached bodies: "
-            f"{', '.join(_free_bodies(plant)) or 'none'}"
+            f"body '{body.name()}' is attached already, by joint '{joint.name()}'; unattached "
+            f"bodies: {', '.join(_free_bodies(plant)) or 'none'}"
         )
     rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
     plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
@@ -118,9 +117,8 @@ def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
     for name in bodies:
         try:
             body = GetScopedFrameByName(plant, name).body()
-            held = [j.name() for j in _joints(plant) if j.child_body().index() == body.index()]
-            if held:
-                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
+            if joint := _joints_to_parents(plant).get(body.index()):
+                raise ModelError(f"'{name}' is not free: joint '{joint.name()}' holds it")
             plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
         except RuntimeError as error:
             raise ModelError(f"'{name}' is no body that can be free: {error}") from None
@@ -150,19 +148,16 @@ def lock_joints(
     """
     joints = _movable(plant)
     positions = dict(locked)
-    _spread(positions, couplings)
+    _lock_coupled(positions, couplings)
     for name, value in positions.items():
-        if name not in joints:
-            raise ModelError(unknown_name("turning or sliding joint", name, joints))
-        joint = joints[name]
+        joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         # Round-off of a ratio must not put a finger outside.
         if not low - 1e-9 <= value <= high + 1e-9:
             unit = "m" if isinstance(joint, PrismaticJoint) else "rad"
-            given = "" if name in locked else ", as the joint that it is coupled to has it,"
+            why = "" if name in locked else ", as the joint that it is coupled to has it,"
             raise ModelError(
-                f"{name} = {value:g} {unit}{given} is outside its limits, {low:g} to {high:g} "
-                f"{unit}"
+                f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
     with _without_constraints(plant, couplings):
         for name, value in positions.items():
@@ -193,20 +188,21 @@ def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
 
 
-def _spread(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
-    """Adds the joints that are coupled to those with a position."""
+def _lock_coupled(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
+    """Adds the positions of joints that are coupled to locked ones."""
     for _ in couplings:  # As often as the longest chain needs.
-        for one in couplings:
-            if one.leader in positions:
-                wanted = one.ratio * positions[one.leader] + one.offset
-                value = positions.setdefault(one.follower, wanted)
-                if abs(value - wanted) > 1e-9:
+        for coupling in couplings:
+            leader, follower = coupling.leader, coupling.follower
+            if leader in positions:
+                coupled = coupling.ratio * positions[leader] + coupling.offset
+                value = positions.setdefault(follower, coupled)
+                if abs(value - coupled) > 1e-9:
                     raise ModelError(
-                        f"{one.follower} = {value:g}, but it is coupled to {one.leader} = "
-                        f"{positions[one.leader]:g}, which makes it {wanted:g}; lock one of them"
+                        f"{follower} = {value:g}, but it is coupled to {leader} = "
+                        f"{positions[leader]:g}, which makes it {coupled:g}; lock one of them"
                     )
-            elif one.follower in positions and one.ratio != 0.0:
-                positions[one.leader] = (positions[one.follower] - one.offset) / one.ratio
+            elif follower in positions and coupling.ratio != 0.0:
+                positions[leader] = (positions[follower] - coupling.offset) / coupling.ratio
 
 
 def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
@@ -216,7 +212,7 @@ def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
         pose = RigidTransform(position * joint.translation_axis())
     else:
         pose = RigidTransform(AngleAxis(position, joint.revolute_axis()), np.zeros(3))
-    for actuator in _actuators(plant):
+    for actuator in actuators_of(plant):
         if actuator.joint() is joint:
             plant.RemoveJointActuator(actuator)
     try:
@@ -252,29 +248,25 @@ def drive_joints(
         followers = {coupling.follower for coupling in couplings}
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
-    for name in limits:
-        if name not in joints:
-            raise ModelError(unknown_name("turning or sliding joint", name, joints))
-    chosen = {joints[name].index(): limit for name, limit in limits.items()}
-    names = {joints[name].index(): name for name in limits}
-    has: set[int] = set()
-    for actuator in _actuators(plant):
-        index = actuator.joint().index()
-        if index not in chosen:
+    names = {_named(name, joints).index(): name for name in limits}
+    kept = set()
+    for actuator in actuators_of(plant):
+        name = names.get(actuator.joint().index())
+        kept.add(name)
+        if name is None:
             plant.RemoveJointActuator(actuator)
-            continue
-        has.add(index)
-        if chosen[index] is not None:
-            actuator.set_effort_limit(chosen[index])
-    for index, limit in chosen.items():
-        if index not in has:
-            own = efforts.get(names[index], np.inf)
-            joint = joints[names[index]]
-            plant.AddJointActuator(joint.name(), joint, own if limit is None else limit)
+        elif (limit := limits[name]) is not None:
+            actuator.set_effort_limit(limit)
+    for name in (name for name in limits if name not in kept):
+        joint, limit = joints[name], limits[name]
+        effort = efforts.get(name, np.inf) if limit is None else limit
+        plant.AddJointActuator(joint.name(), joint, effort)
 
 
-def _joints(plant: MultibodyPlant) -> list[Joint]:
-    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
+    if name not in joints:
+        raise ModelError(unknown_name("turning or sliding joint", name, joints))
+    return joints[name]
 
 
 def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
@@ -286,12 +278,13 @@ def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
     }
 
 
-def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
-    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
+    """Index of a body -> the joint by which it is attached."""
+    return {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
 
 
 def _free_bodies(plant: MultibodyPlant) -> list[str]:
     """The names of the bodies without a joint, except the world."""
-    held = {joint.child_body().index() for joint in _joints(plant)}
+    attached = _joints_to_parents(plant)
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    return unique_names(plant, [body for body in bodies if body.index() not in held])
+    return unique_names(plant, [body for body in bodies if body.index() not in attached])

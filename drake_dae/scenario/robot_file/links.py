@@ -14,7 +14,7 @@ from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import change_robot, finalize
-from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
+from drake_dae.scenario.robot_file.loops import cut_loops, joints_of, loop_constraints
 from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
@@ -66,8 +66,7 @@ def robot_links(
     add_payloads("plant_payloads", payloads, plant)
     cuts = cut_loops(plant)
     finalize(plant)
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
+    for joint in joints_of(plant):
         if isinstance(joint, QuaternionFloatingJoint):
             name = joint.child_body().name()
             raise ModelError(
@@ -103,13 +102,13 @@ def _check_mass(plant: MultibodyPlant) -> None:
         null = modes[:, values <= _MASSLESS * values[-1]]
         if not null.size:
             return
-    found = {}
+    massless = {}
     for name, joint in joint_names(plant).items():
-        own = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
-        if np.any(np.abs(null[own]) > 0.1):
-            found[name] = joint.child_body().name()
+        velocities = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        if np.any(np.abs(null[velocities]) > 0.1):
+            massless[name] = joint.child_body().name()
     raise ModelError(
-        f"joints that move no mass: {', '.join(found)}. Links without it, which no force can move: "
-        f"{', '.join(found.values())}; give them <inertial> with mass and inertia, or lock the "
-        "joints by robot.locked"
+        f"joints that move no mass: {', '.join(massless)}. Links without it, which no force can "
+        f"move: {', '.join(massless.values())}; give them <inertial> with mass and inertia, or "
+        "lock the joints by robot.locked"
     )

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydrake.multibody.parsing import PackageMap
@@ -10,6 +10,7 @@ from pydrake.multibody.parsing import PackageMap
 from drake_dae.errors import ModelError
 from drake_dae.files import read_bytes
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.robot_file.readable.markup import without_comments
 from drake_dae.scenario.shipped import FOLDER
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
@@ -59,23 +60,23 @@ def find_packages(
         for name in _URL.findall(url):
             if not known.Contains(name) and name not in missing:
                 ros = ros or _ros_packages()
-                found = _beside(name, origin) if origin.name else None
-                if found is None and ros.Contains(name):
-                    found = Path(ros.GetPath(name))
-                if found is None:
-                    found = next((one / name for one in places if (one / name).is_dir()), None)
-                if found is None:
+                folder = _beside(name, origin) if origin.name else None
+                if folder is None and ros.Contains(name):
+                    folder = Path(ros.GetPath(name))
+                if folder is None:
+                    inside = (place / name for place in places)
+                    folder = next((path for path in inside if path.is_dir()), None)
+                if folder is None:
                     missing[name] = str(origin) if origin.name else ""
                     continue
-                known.Add(name, str(found))
-                folders.append(found)
+                known.Add(name, str(folder))
+                folders.append(folder)
         path = _path(url, known)
         if path is None or path in seen or path.suffix not in _MODEL or not path.is_file():
             continue
         seen.add(path)
-        text = path.read_text("utf-8", errors="replace")
-        text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-        waiting.extend((found[0], path) for found in _URL.finditer(text))
+        text = without_comments(path.read_text("utf-8", errors="replace"))
+        waiting.extend((match[0], path) for match in _URL.finditer(text))
     return folders, missing
 
 
@@ -108,19 +109,19 @@ def _beside(name: str, file: Path) -> Path | None:
     """The folder of a package in the folders above a file."""
     for above in file.resolve().parents:
         for folder in (above, above / name):
-            if name in _names(folder / "package.xml"):
+            if _package_name(folder / "package.xml") == name:
                 return folder
     return None
 
 
-def _names(package: Path) -> Iterator[str]:
-    """The name in a package.xml, if there is one."""
+def _package_name(file: Path) -> str:
+    """The name in a package.xml; empty if there is none."""
     try:
-        text = read_bytes(package).decode("utf-8", errors="replace")
+        text = without_comments(read_bytes(file).decode("utf-8", errors="replace"))
     except (OSError, ValueError):
-        return
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    yield from re.findall(r"<name>\s*([^<]*?)\s*</name>", text)[:1]
+        return ""
+    match = re.search(r"<name>\s*([^<]*?)\s*</name>", text)
+    return match[1] if match else ""
 
 
 def _ros_packages() -> PackageMap:

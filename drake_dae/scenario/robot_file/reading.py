@@ -19,7 +19,9 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.descriptions import find_description
 from drake_dae.scenario.robot_file.efforts import Efforts, limit_joints, read_efforts
 from drake_dae.scenario.robot_file.includes import check_includes
+from drake_dae.scenario.robot_file.loops import joints_of
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
+from drake_dae.scenario.robot_file.readable.markup import without_comments
 from drake_dae.scenario.robot_file.readable.meshes import DRAWN, ReadableCopies, add_models
 from drake_dae.scenario.robot_file.readable.placing import add_floating_joints
 from drake_dae.scenario.robot_file.resources import check_resources, package_folder
@@ -172,9 +174,8 @@ def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
         plant: The robot, not finalized; changed.
         of_positions: Whether position limits are removed.
     """
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
-        unlimited = np.full(1, np.inf)
+    unlimited = np.full(1, np.inf)
+    for joint in joints_of(plant):
         if joint.num_positions() != 1:
             continue
         if of_positions and joint.position_lower_limits() == joint.position_upper_limits():
@@ -291,7 +292,7 @@ def _check_text(file: Path) -> None:
     """Refuses text that Drake ignores: a second robot in a URDF, and digits after a comma."""
     if file.suffix not in (".urdf", ".sdf", ".xml"):
         return
-    text = re.sub(r"<!--.*?-->", _lines, file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    text = without_comments(file.read_text("utf-8", errors="replace"))
     if comma := _WITH_COMMA.search(text):
         line = text.count("\n", 0, comma.start(1)) + 1
         raise ModelError(
@@ -303,11 +304,6 @@ def _check_text(file: Path) -> None:
     names = re.findall(r"<robot\b[^>]*", text)
     if len(names) > 1:
         raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
-
-
-def _lines(found: re.Match[str]) -> str:
-    """The line breaks of the text."""
-    return "\n" * found[0].count("\n")
 
 
 def _is_file(name: str) -> bool:

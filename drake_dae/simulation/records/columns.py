@@ -59,14 +59,14 @@ def read_csv(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)
-            found = _columns(path, next(lines, []), columns)
-            rows = list(_numbers(path, lines, [place for place, *_ in found]))
+            chosen = _columns(path, next(lines, []), columns)
+            rows = list(_numbers(path, lines, [place for place, *_ in chosen]))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ModelError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
-    values = np.array(rows).reshape(-1, len(found))
+    values = np.array(rows).reshape(-1, len(chosen))
     labels = dict[str, list[tuple[int, Signal]]]()
     time = values[:, 0]
-    for number, (_, name, unit) in enumerate(found):
+    for number, (_, name, unit) in enumerate(chosen):
         signal, dot, entry = name.partition(".")
         if name == TIME:
             time = values[:, number]
@@ -127,9 +127,9 @@ def _numbers(
     for count, line in enumerate(lines, 2):
         if not line:
             continue
-        found = [number_in(line[place]) if place < len(line) else None for place in places]
-        if None in found:
-            place = places[found.index(None)]
+        numbers = [number_in(line[place]) if place < len(line) else None for place in places]
+        if None in numbers:
+            place = places[numbers.index(None)]
             entry = brief(line[place]) if place < len(line) else "nothing"
             raise ModelError(f"{path}: line {count} has {entry} where a number is needed")
-        yield [each for each in found if each is not None]
+        yield [number for number in numbers if number is not None]

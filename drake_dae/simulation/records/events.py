@@ -45,13 +45,13 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
         return ()
     names = [str(name) for name in arrays["events.contacts"]]
     columns = ("time", "kind", "happened", "closed", "impulses", "energy_lost", "rest_time")
-    found = []
+    events = []
     for time, kind, happened, closed, impulses, lost, rest in zip(
         *(arrays[f"events.{column}"] for column in columns), strict=True
     ):
         change = ContactChange(str(kind))
         is_impact = change in (ContactChange.IMPACT, ContactChange.REST)
-        found.append(
+        events.append(
             ContactEvent(
                 time=float(time),
                 kind=change,
@@ -62,7 +62,7 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
                 rest_time=None if np.isnan(rest) else float(rest),
             )
         )
-    return tuple(found)
+    return tuple(events)
 
 
 def _chosen(names: Sequence[str], which: np.ndarray) -> tuple[str, ...]:
@@ -100,14 +100,14 @@ def flashes(events: Sequence[ContactEvent], names: Sequence[str], times: FloatAr
     Returns:
         0 to 1, one row for each moment.
     """
-    found = np.zeros((times.size, len(names)))
+    brightness = np.zeros((times.size, len(names)))
     largest = max((max(event.impulses) for event in impacts(events)), default=1.0)
     for event in impacts(events):
         since = times - event.time
         fading = np.where((since >= 0.0) & (since < FLASH), 1.0 - since / FLASH, 0.0)
         for name, impulse in zip(event.contacts, event.impulses, strict=True):
             if name in names:
-                column = found[:, list(names).index(name)]
+                column = brightness[:, list(names).index(name)]
                 # The size of a ball of that volume.
                 np.maximum(column, np.cbrt(impulse / largest) * fading, out=column)
-    return found
+    return brightness

@@ -111,10 +111,10 @@ def _table(
     ticks = np.unique(stamps[used[0]])
     ticks = ticks[ticks >= max(stamps[topic][0] for topic in used)]
     rows = {topic: np.searchsorted(stamps[topic], ticks, side="right") - 1 for topic in used}
-    found = dict[str, list[tuple[Signal, FloatArray]]]()
+    signals = dict[str, list[tuple[Signal, FloatArray]]]()
     for name, meant in columns.items():
-        signal, dot, entry = name_and_unit(meant)[0].partition(".")
-        if not dot or signal == TIME:
+        group, dot, entry = name_and_unit(meant)[0].partition(".")
+        if not dot or group == TIME:
             raise ModelError(
                 f"{path}: '{name}' must become '<signal>.<name>', such as 'control.joint1_motor', "
                 f"got '{meant}'; times are those of the messages"
@@ -122,10 +122,10 @@ def _table(
         own = messages[_topic(name)]
         values = np.array([own[row][1].get(name, np.nan) for row in rows[_topic(name)].tolist()])
         one = Signal(entry, name_and_unit(meant)[1] or units.get(name, ""))
-        found.setdefault(signal, []).append((one, values))
+        signals.setdefault(group, []).append((one, values))
     return ticks * NANO, {
-        signal: (np.column_stack([v for _, v in own]), tuple(one for one, _ in own))
-        for signal, own in found.items()
+        group: (np.column_stack([v for _, v in own]), tuple(one for one, _ in own))
+        for group, own in signals.items()
     }
 
 

@@ -40,9 +40,9 @@ class Recorded:
 
 def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
     """What the library itself has recorded, without the checks of what a user gives."""
-    found = object.__new__(Recorded)
-    vars(found).update(values=values, signals=signals)
-    return found
+    recorded = object.__new__(Recorded)
+    vars(recorded).update(values=values, signals=signals)
+    return recorded
 
 
 @checked(ModelError)
@@ -75,8 +75,8 @@ class Record:
             name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
         }
         if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
-            found = ", ".join(f"{name} {size}" for name, size in lengths.items())
-            raise ModelError(f"a record has one sample of each signal at each time, got {found}")
+            text = ", ".join(f"{name} {size}" for name, size in lengths.items())
+            raise ModelError(f"a record has one sample of each signal at each time, got {text}")
         if np.any(np.diff(self.time) <= 0.0):
             raise ModelError("the times of a record must be strictly increasing")
         for name, (values, signals) in (
@@ -102,8 +102,8 @@ class Record:
         return name in self.signals
 
     def __repr__(self) -> str:
-        found = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
-        return f"Record({self._extent()}, signals={found})"
+        text = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
+        return f"Record({self._extent()}, signals={text})"
 
     def _repr_html_(self) -> str:
         """A table of the signals, as a notebook shows it."""

@@ -48,10 +48,10 @@ def as_gltf(mesh: Path) -> Path | None:
 
 def _copy(mesh: Path, kind: str) -> Path | None:
     try:
-        found = mesh.resolve().stat()
+        status = mesh.resolve().stat()
     except (OSError, ValueError):
         return None
-    return _converted(mesh.resolve(), kind, found.st_mtime_ns, found.st_size)
+    return _converted(mesh.resolve(), kind, status.st_mtime_ns, status.st_size)
 
 
 @cache

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file.readable.converted import as_obj
+from drake_dae.scenario.robot_file.readable.markup import blank, parsed
 
 _MESH = re.compile(r"<mesh\b([^>]*?)(?:/>|>\s*</mesh\s*>)")
 _GEOM = re.compile(r"<geom\b([^>]*?)(?:/>|>\s*</geom\s*>|>)")
@@ -30,10 +31,7 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
     Raises:
         ModelError: A body that can move has its mass from such a mesh.
     """
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return text, []  # The error is left to Drake.
+    root = parsed(text)
     whole, text = text, _without_mass(text, root)
     folder = file.resolve().parent
     for compiler in root.iter("compiler"):
@@ -49,18 +47,15 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         return text, []
     _check_masses(root, refused)
 
-    def asset(found: re.Match[str]) -> str:
-        name = _attribute(found[1], "file")
+    def asset(match: re.Match[str]) -> str:
+        name = _attribute(match[1], "file")
         if name is None:
-            return found[0]
-        place = copies.get(folder / name, folder / name)
-        if place is None:
-            return "\n" * found[0].count("\n")
-        return found[0].replace(name, str(place))
+            return match[0]
+        mesh = copies.get(folder / name, folder / name)
+        return blank(match) if mesh is None else match[0].replace(name, str(mesh))
 
-    def geometry(found: re.Match[str]) -> str:
-        is_gone = _attribute(found[1], "mesh") in refused
-        return "\n" * found[0].count("\n") if is_gone else found[0]
+    def geometry(match: re.Match[str]) -> str:
+        return blank(match) if _attribute(match[1], "mesh") in refused else match[0]
 
     return _GEOM.sub(geometry, _MESH.sub(asset, text)), list(refused.values())
 
@@ -78,13 +73,13 @@ def _without_mass(text: str, root: ElementTree.Element) -> str:
     }
     inertials, geoms = root.iter("inertial"), root.iter("geom")
 
-    def inertial(found: re.Match[str]) -> str:
-        return "\n" * found[0].count("\n") if next(inertials) in empty else found[0]
+    def inertial(match: re.Match[str]) -> str:
+        return blank(match) if next(inertials) in empty else match[0]
 
-    def geom(found: re.Match[str]) -> str:
+    def geom(match: re.Match[str]) -> str:
         if next(geoms) not in empty:
-            return found[0]
-        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", found[0]).replace(
+            return match[0]
+        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", match[0]).replace(
             "<geom", '<geom mass="0"', 1
         )
 
@@ -93,7 +88,7 @@ def _without_mass(text: str, root: ElementTree.Element) -> str:
 
 def _takes_geometry(root: ElementTree.Element) -> bool:
     """Whether masses are computed from the geometry even if there is an <inertial>."""
-    return any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
+    return any(element.get("inertiafromgeom") == "true" for element in root.iter("compiler"))
 
 
 def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
@@ -106,10 +101,10 @@ def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
 def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
     """The bodies in an element that are moved by joints."""
     for child in body.iterfind("body"):
-        own = moves or child.find("joint") is not None or child.find("freejoint") is not None
-        if own:
+        has_joint = child.find("joint") is not None or child.find("freejoint") is not None
+        if moves or has_joint:
             yield child
-        yield from _moving(child, own)
+        yield from _moving(child, moves or has_joint)
 
 
 def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
@@ -130,5 +125,5 @@ def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
 
 
 def _attribute(attributes: str, name: str) -> str | None:
-    found = re.search(rf"\b{name}\s*=\s*[\"']([^\"']*)", attributes)
-    return found and found[1]
+    match = re.search(rf"\b{name}\s*=\s*[\"']([^\"']*)", attributes)
+    return match and match[1]

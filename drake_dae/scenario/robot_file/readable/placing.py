@@ -10,18 +10,17 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RpyFloatingJoint
 
 from drake_dae.errors import ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file.readable.urdf import blank
+from drake_dae.scenario.robot_file.readable.markup import blank, parsed
 
 _JOINT = re.compile(r"<joint\b[^>]*(?<!/)>.*?</joint\s*>", re.DOTALL)
 _BODY = re.compile(r"<body\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*(?<!/)>")
-_HOLDING = ("fixed", "floating")
+_RELEASABLE = ("fixed", "floating")
 """Kinds of joints to the world that can be replaced."""
 
 
@@ -33,9 +32,9 @@ def world_links(text: str, file: Path) -> list[str]:
         file: Its suffix determines which.
     """
     if file.suffix == ".xml":
-        return [body.get("name", "") for body in _fixed_bodies(text)]
-    held = (_held(joint[0]) for joint in _JOINT.finditer(text))
-    return [link for kind, link in held if kind == "fixed"]
+        return _fixed_bodies(text)
+    world_joints = (_world_joint(joint[0]) for joint in _JOINT.finditer(text))
+    return [link for kind, link in world_joints if kind == "fixed"]
 
 
 def released(text: str, file: Path, links: Collection[str]) -> str:
@@ -46,14 +45,14 @@ def released(text: str, file: Path, links: Collection[str]) -> str:
     if not links:
         return text
     if file.suffix == ".xml":
-        fixed = {body.get("name", "") for body in _fixed_bodies(text)} & set(links)
+        fixed = set(_fixed_bodies(text)) & set(links)
         return _BODY.sub(lambda b: b[0] + "<freejoint/>" * (b[1] in fixed), text)
 
-    def kept(joint: re.Match[str]) -> str:
-        kind, link = _held(joint[0])
-        return blank(joint) if kind in _HOLDING and link in links else joint[0]
+    def without_released(joint: re.Match[str]) -> str:
+        kind, link = _world_joint(joint[0])
+        return blank(joint) if kind in _RELEASABLE and link in links else joint[0]
 
-    return _JOINT.sub(kept, text)
+    return _JOINT.sub(without_released, text)
 
 
 @dataclass(frozen=True)
@@ -83,19 +82,19 @@ def floating_joints(text: str, file: Path) -> tuple[str, list[FloatingJoint]]:
     """
     if file.suffix == ".xml":
         return text, list(_free_joints(text))
-    found: list[FloatingJoint] = []
+    floating: list[FloatingJoint] = []
 
-    def kept(joint: re.Match[str]) -> str:
+    def without_floating(joint: re.Match[str]) -> str:
         kind, child, parent, name = _ends(joint[0])
         if kind != "floating":
             return joint[0]
-        origin = ElementTree.fromstring(joint[0]).find("origin")
-        given = {} if origin is None else origin.attrib
-        pose = _triple(given.get("xyz", ""), name), _triple(given.get("rpy", ""), name)
-        found.append(FloatingJoint(name, parent, child, pose))
+        origin = parsed(joint[0]).find("origin")
+        attributes = {} if origin is None else origin.attrib
+        pose = _triple(attributes.get("xyz", ""), name), _triple(attributes.get("rpy", ""), name)
+        floating.append(FloatingJoint(name, parent, child, pose))
         return blank(joint)
 
-    return _JOINT.sub(kept, text), found
+    return _JOINT.sub(without_floating, text), floating
 
 
 def _triple(text: str, name: str) -> tuple[float, ...]:
@@ -109,11 +108,7 @@ def _triple(text: str, name: str) -> tuple[float, ...]:
 
 
 def _free_joints(text: str) -> Iterator[FloatingJoint]:
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return  # The error is left to Drake.
-    for body in root.iterfind("worldbody/body"):
+    for body in parsed(text).iterfind("worldbody/body"):
         joints = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
         for joint in joints[:1]:
             child = body.get("name", "")
@@ -155,18 +150,15 @@ def add_floating_joints(
         )
 
 
-def _held(joint: str) -> tuple[str, str]:
-    """The kind of a joint from the world and the link that it fixes; empty for other joints."""
+def _world_joint(joint: str) -> tuple[str, str]:
+    """The kind and the child of a joint whose parent is the world; empty for other joints."""
     kind, child, parent, _ = _ends(joint)
     return (kind, child) if parent == "world" else ("", "")
 
 
 def _ends(joint: str) -> tuple[str, str, str, str]:
     """The kind of a joint, its child, its parent and its name; empty if it cannot be read."""
-    try:
-        element = ElementTree.fromstring(joint)
-    except ElementTree.ParseError:
-        return "", "", "", ""
+    element = parsed(joint)
     parent, child = (
         "" if end is None else end.get("link", (end.text or "").strip())
         for end in (element.find("parent"), element.find("child"))
@@ -174,12 +166,10 @@ def _ends(joint: str) -> tuple[str, str, str, str]:
     return element.get("type", ""), child, parent, element.get("name", "")
 
 
-def _fixed_bodies(text: str) -> Iterator[ElementTree.Element]:
-    """The bodies in the world of an MJCF file without a joint."""
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return  # The error is left to Drake.
-    for body in root.iterfind("worldbody/body"):
-        if body.find("joint") is None and body.find("freejoint") is None:
-            yield body
+def _fixed_bodies(text: str) -> list[str]:
+    """The names of the bodies in the world of an MJCF file that have no joint."""
+    return [
+        body.get("name", "")
+        for body in parsed(text).iterfind("worldbody/body")
+        if body.find("joint") is None and body.find("freejoint") is None
+    ]

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.markup import blank
 
 _JOINT = re.compile(
     r"<joint\b(?=[^>]*\bname\s*=\s*[\"']([^\"']*))(?=[^>]*\btype\s*=\s*[\"']([^\"']*))[^>]*"
@@ -123,8 +124,3 @@ def _with_names_of_their_own(text: str) -> str:
         return f"{head}{name}_{number}"
 
     return _ACTUATOR.sub(named, text)
-
-
-def blank(found: re.Match[str]) -> str:
-    """The line breaks of a text, so that line numbers in messages remain right."""
-    return "\n" * found[0].count("\n")
