@@ -5,8 +5,10 @@ import fcntl
 import os
 import shutil
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -40,9 +42,9 @@ _STAGE = ".unfinished-"
 def run_folder(folder: Path) -> Iterator[Path | None]:
     """Makes the folder of a run, and locks it against other runs for the duration of the block.
 
-    The files of an earlier run are moved to a folder "<folder>-1", "<folder>-2", ...; others
-    remain. The scenario file is created empty and carries the lock; no file is written through a
-    symbolic link.
+    The files of an earlier run are moved to a folder "<folder>-1", "<folder>-2", ...; other files
+    remain. The scenario's file is created empty, and is the file that is locked. No file is
+    written through a symbolic link.
 
     Yields:
         The folder to which the earlier run was moved; None if there was none.
@@ -58,7 +60,7 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise ModelError(f"'{folder}' is a file; name a folder")
-        lock, kept = _prepare(folder)
+        lock, moved_to = _prepare(folder)
     except ModelError:
         raise
     except (OSError, ValueError) as error:  # The latter for text of another encoding.
@@ -66,7 +68,7 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
         where = f" ({path})" if path and Path(path) != folder else ""
         raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None
     try:
-        yield kept
+        yield moved_to
     finally:
         os.close(lock)
 
@@ -88,10 +90,16 @@ def load_run(path: Path) -> Record:
     raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
 
 
-def run_label(path: Path, paths: Sequence[Path]) -> str:
-    """The name of a run among others: that of its folder if no other one is named alike."""
-    alike = [other for other in paths if other.name == path.name]
-    return path.name if len(alike) == 1 and path.name else str(path)
+def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:
+    """Name -> path of several runs; the whole path is the name where the last part is ambiguous.
+
+    Raises:
+        ModelError: A run is named twice.
+    """
+    if len(set(paths)) < len(paths):
+        raise ModelError("a run is named twice; name each run once")
+    names = Counter(path.name for path in paths)
+    return {path.name if path.name and names[path.name] == 1 else str(path): path for path in paths}
 
 
 def _prepare(folder: Path) -> tuple[int, Path | None]:
@@ -102,7 +110,7 @@ def _prepare(folder: Path) -> tuple[int, Path | None]:
     try:
         _lock(lock, folder)
         _check(folder, (folder / SCENARIO).read_text("utf-8"))
-        kept = _keep(folder, _present(folder)[1:])
+        moved_to = _move_beside(folder, _present(folder)[1:])
         for stale in folder.glob(f"{_STAGE}*"):
             if stale.is_dir() and not stale.is_symlink():
                 shutil.rmtree(stale)
@@ -110,29 +118,32 @@ def _prepare(folder: Path) -> tuple[int, Path | None]:
     except BaseException:
         os.close(lock)
         raise
-    return lock, kept
+    return lock, moved_to
 
 
-def _keep(folder: Path, files: Sequence[Path]) -> Path | None:
+def _move_beside(folder: Path, files: Sequence[Path]) -> Path | None:
     """Moves the files of an earlier run beside its folder, with a copy of its scenario."""
     if not files:
         return None
     for file in files:
         if file.is_dir() and not file.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
-    here, number = folder.absolute(), 1
-    while True:
-        kept = here.with_name(f"{here.name}-{number}")
-        try:
-            kept.mkdir()
-            break
-        except FileExistsError:
-            number += 1
+    here = folder.absolute()
+    target = new_folder(here.with_name(f"{here.name}-{number}") for number in count(1))
     # The copy first: it identifies a folder of a run.
-    shutil.copyfile(folder / SCENARIO, kept / SCENARIO)
+    shutil.copyfile(folder / SCENARIO, target / SCENARIO)
     for file in files:
-        file.rename(kept / file.name)
-    return folder.with_name(kept.name) if folder.name else kept
+        file.rename(target / file.name)
+    return folder.with_name(target.name) if folder.name else target
+
+
+def new_folder(paths: Iterator[Path]) -> Path:
+    """Makes and returns the first of some folders that does not exist."""
+    while True:
+        with suppress(FileExistsError):
+            path = next(paths)
+            path.mkdir()
+            return path
 
 
 def _present(folder: Path) -> list[Path]:

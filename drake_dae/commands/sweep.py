@@ -30,22 +30,18 @@ def run_command(options: argparse.Namespace) -> int:
     return code
 
 
-def _again(options: argparse.Namespace, folder: Path, variations: Sequence[Variation]) -> list[str]:
+def _commands(
+    options: argparse.Namespace, folder: Path, variations: Sequence[Variation]
+) -> list[str]:
     """For each run the command that makes its record, plots and animation."""
-    first = ["drake-dae", "simulate", str(options.scenario)]
-    first += ["--rollout"] if options.rollout else []
-    given = [part for text in options.settings for part in ("--set", text)]
-    return [
-        shlex.join(
-            [
-                *first,
-                *given,
-                *(part for item in changes.items() for part in ("--set", setting(*item))),
-                *("--out", str(folder / f"run{number}")),
-            ]
-        )
-        for number, changes in enumerate(variations)
-    ]
+    simulate = ["drake-dae", "simulate", str(options.scenario)]
+    simulate += ["--rollout"] if options.rollout else []
+    commands = []
+    for number, changes in enumerate(variations):
+        settings = [*options.settings, *(setting(*change) for change in changes.items())]
+        sets = [part for text in settings for part in ("--set", text)]
+        commands.append(shlex.join([*simulate, *sets, "--out", str(folder / f"run{number}")]))
+    return commands
 
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -77,8 +73,8 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
         raise
     title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
-    again = _again(options, folder, variations)
-    files = study.save(folder, title, again, scenario.duration)
+    commands = _commands(options, folder, variations)
+    files = study.save(folder, title, commands, scenario.duration)
     names = ", ".join([file.name, *(written.name for written in files)])
     print(f"{study}\nwritten to {folder}/: {names}", flush=True)
     unfinished = [result for result in study.results if result.outcome is not Outcome.FINISHED]
@@ -88,14 +84,15 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         "runs": len(study.results),
         "outcomes": Counter(str(result.outcome) for result in study.results),
         "not_finished": [
-            {"run": one.run, "outcome": str(one.outcome), "reason": one.reason}
-            for one in unfinished
+            {"run": result.run, "outcome": str(result.outcome), "reason": result.reason}
+            for result in unfinished
         ],
         "figures": study.extent(),
         "files": names.split(", "),
     }
-    if again := [str(one.run) for one in unfinished if not one.outcome.is_final]:
-        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
-        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
+    if repeated := [str(result.run) for result in unfinished if not result.outcome.is_final]:
+        count = count_of(len(repeated), "run")
+        text = f"{count} died or took too long; the same command tries again"
+        print(f"error: {text}: {', '.join(repeated[:10])}", file=sys.stderr)
         return 1, report
     return 2 if unfinished and options.check else 0, report
