@@ -13,8 +13,8 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.diagrams.force_feedback import seed_noise
 from drake_dae.diagrams.observing import Observer
+from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.pictures.diagram import diagram_svg
@@ -96,7 +96,7 @@ class ClosedLoop:
         return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Chooses the noise of the sensor; without a call it is the same in every run.
+        """Sets the seed of the force sensor's noise; the default is the same in every run.
 
         Args:
             context: The diagram's context.
@@ -105,11 +105,11 @@ class ClosedLoop:
         seed_noise(self.noise, context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state of the plant, shape (n,), as given.
+        """Sets the state x of the plant, without a projection onto the constraints.
 
         Args:
             context: The diagram's context.
-            state: x.
+            state: x, shape (n,).
 
         Raises:
             ModelError: The shape is wrong.

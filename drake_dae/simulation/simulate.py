@@ -138,10 +138,9 @@ def simulate(
             simulator.Initialize()
             began = time.perf_counter()
             if not may_diverge:
-                found = DivergenceWatch(diagram, context, duration)
-                watch = found if found.sees else None
+                watch = DivergenceWatch(diagram, context, duration)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            is_needed = progress or watch is not None or after_step is not None
+            is_needed = progress or after_step is not None or (watch is not None and watch.sees)
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
             simulator.AdvanceTo(start + duration)
@@ -154,7 +153,7 @@ def simulate(
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
             if watch is not None:
-                watch.look_at_states(context)  # Those of a few steps may have grown so fast.
+                watch.look_at_states(context)  # They may diverge within a few steps.
             if not isinstance(error, InconsistentStateError | RuntimeError):
                 raise
             state = context.get_continuous_state_vector().CopyToVector()
@@ -321,7 +320,8 @@ class _StepMonitor:
 def default_size() -> dict[str, int]:
     """The size for tqdm if the terminal reports no columns, as in some containers."""
     try:
-        known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
+        if os.get_terminal_size(sys.stderr.fileno()).columns > 0:
+            return {}
     except OSError:
-        known = False
-    return {} if known else {"ncols": 79, "nrows": 24}
+        pass
+    return {"ncols": 79, "nrows": 24}

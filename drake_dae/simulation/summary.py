@@ -131,44 +131,24 @@ def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> 
         return []
     sizes = unit_sizes(record)
     errors = record["tracking_error"].T
-    columns = zip(
-        signals, errors, predicted.T, late_rms(record.time, record["tracking_error"]), strict=True
-    )
-    added = [[] if bound is None else [f"{number:.2g}"] for number in _numbers(bound, len(signals))]
-    more = [] if bound is None else ["springs add"]
-    about = [] if bound is None else [_ADDED]
-    return [
-        *Table(
-            [
-                "tracking error",
-                "unit",
-                "start",
-                "largest",
-                "final",
-                "late rms",
-                "off prediction by",
-                *more,
-            ],
-            [
-                [
-                    signal.name,
-                    signal.unit or "1",
-                    _number(error[0], sizes[signal.unit], 3),
-                    _number(np.max(np.abs(error)), sizes[signal.unit], 3),
-                    _number(error[-1], sizes[signal.unit], 3),
-                    _number(rms, sizes[signal.unit], 2),
-                    _number(np.max(np.abs(error - theory)), sizes[signal.unit], 2),
-                    *own,
-                ]
-                for (signal, error, theory, rms), own in zip(columns, added, strict=True)
-            ],
-            left=2,
-        ).lines(),
+    late = late_rms(record.time, record["tracking_error"])
+    head = ["tracking error", "unit", "start", "largest", "final", "late rms", "off prediction by"]
+    rows = []
+    for signal, error, theory, rms in zip(signals, errors, predicted.T, late, strict=True):
+        size, off = sizes[signal.unit], np.max(np.abs(error - theory))
+        courses = (error[0], np.max(np.abs(error)), error[-1])
+        numbers = [*(_number(e, size, 3) for e in courses), _number(rms, size, 2)]
+        rows.append([signal.name, signal.unit or "1", *numbers, _number(off, size, 2)])
+    notes = [
         "late rms: the root mean square in the second half of the run",
         "off prediction by: the largest deviation from the predicted error, which decays",
         "from its initial value by the gains alone",
-        *about,
     ]
+    if bound is not None:
+        head.append("springs add")
+        rows = [[*row, f"{number:.2g}"] for row, number in zip(rows, bound.tolist(), strict=True)]
+        notes.append(_ADDED)
+    return [*Table(head, rows, left=2).lines(), *notes]
 
 
 def _phases(record: Record) -> list[str]:
@@ -193,60 +173,43 @@ def _phases(record: Record) -> list[str]:
     ]
 
 
-def _numbers(bound: FloatArray | None, count: int) -> list[float]:
-    return [0.0] * count if bound is None else bound.tolist()
+def _extremes(record: Record, name: str) -> list[list[str]]:
+    """Name, unit, least and largest value of each entry of a signal."""
+    recorded, sizes = record.signals[name], unit_sizes(record)
+    return [
+        [s.name, s.unit or "1", *(_number(f(v), sizes[s.unit], 4) for f in (np.min, np.max))]
+        for s, v in zip(recorded.signals, recorded.values.T, strict=True)
+    ]
 
 
 def _forces(record: Record, limits: Limits) -> list[str]:
     forces = record.signals["constraint_force"]
     if not forces.signals:
         return []
-    sizes = unit_sizes(record)
-    return Table(
-        ["constraint force", "unit", "least", "largest", ""],
-        [
-            [
-                signal.name,
-                signal.unit or "1",
-                _number(np.min(values), sizes[signal.unit], 4),
-                _number(np.max(values), sizes[signal.unit], 4),
-                "pulls: a real contact would open" if _pulls(signal, values, limits) else "",
-            ]
-            for signal, values in zip(forces.signals, forces.values.T, strict=True)
-        ],
-        left=2,
-    ).lines()
+    pulls = [
+        "pulls: a real contact would open" if _pulls(signal, values, limits) else ""
+        for signal, values in zip(forces.signals, forces.values.T, strict=True)
+    ]
+    rows = zip(_extremes(record, "constraint_force"), pulls, strict=True)
+    head = ["constraint force", "unit", "least", "largest", ""]
+    return Table(head, [[*row, text] for row, text in rows], left=2).lines()
 
 
 def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
     if not controls.signals:
         return []
-    sizes = unit_sizes(record)
     largest = _largest_controls(record, limits)
     # A sample describes the step before it.
-    excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
+    excess = record["excess"] if "excess" in record else np.zeros_like(controls.values)
     cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
-    columns = zip(controls.signals, controls.values.T, largest, cut_off, strict=True)
-    return Table(
-        ["control", "unit", "least", "largest", "limit", ""],
-        [
-            [
-                signal.name,
-                signal.unit or "1",
-                _number(np.min(values), sizes[signal.unit], 4),
-                _number(np.max(values), sizes[signal.unit], 4),
-                f"{limit:.4g}" if np.isfinite(limit) else "none",
-                f"cut off for {time:.3g} s"
-                if time
-                else "over its limit"
-                if np.max(np.abs(values)) > limit
-                else "",
-            ]
-            for signal, values, limit, time in columns
-        ],
-        left=2,
-    ).lines()
+    rows = []
+    columns = zip(controls.values.T, largest, cut_off, strict=True)
+    for row, (values, limit, time) in zip(_extremes(record, "control"), columns, strict=True):
+        remark = "over its limit" if np.max(np.abs(values)) > limit else ""
+        remark = f"cut off for {time:.3g} s" if time else remark
+        rows.append([*row, f"{limit:.4g}" if np.isfinite(limit) else "none", remark])
+    return Table(["control", "unit", "least", "largest", "limit", ""], rows, left=2).lines()
 
 
 def _identified(record: Record) -> list[str]:

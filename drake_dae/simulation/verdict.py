@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.growth import with_sizes
 from drake_dae.simulation.records.record import Record
 
 ROUND_OFF = 1e-13
@@ -60,10 +61,9 @@ def unit_sizes(record: Record) -> dict[str, float]:
     """
     sizes = {"": 1.0, "rad": 1.0}
     for name in ("state", "control", "constraint_force", "desired_output"):
-        if name in record.signals:
+        if name in record:
             largest = np.max(np.abs(record[name]), axis=0, initial=0.0)
-            for signal, size in zip(record.signals[name].signals, largest, strict=True):
-                sizes[signal.unit] = max(sizes.get(signal.unit, 0.0), float(size))
+            sizes = with_sizes(sizes, record.signals[name].signals, largest)
     return sizes
 
 
@@ -81,13 +81,11 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     signals = record.signals["desired_output"].signals
     courses = np.vstack([record["desired_output"], predicted])
     largest = np.max(np.abs(courses), axis=0, initial=0.0)
-    anything = unit_sizes(record)
-    sizes: dict[str, float] = {"": 1.0, "rad": 1.0}
-    for signal, size in zip(signals, largest, strict=True):
-        sizes[signal.unit] = max(sizes.get(signal.unit, 0.0), float(size))
+    of_all = unit_sizes(record)
+    sizes = with_sizes({"": 1.0, "rad": 1.0}, signals, largest)
     for unit, size in sizes.items():
-        if size <= ROUND_OFF * anything.get(unit, 0.0):
-            sizes[unit] = anything[unit] or 1.0
+        if size <= ROUND_OFF * of_all.get(unit, 0.0):
+            sizes[unit] = of_all[unit] or 1.0
     return np.array([sizes[signal.unit] for signal in signals])
 
 
