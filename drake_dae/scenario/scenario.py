@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
+from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -48,13 +49,13 @@ T = TypeVar("T")
 
 
 def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
-    """A check that passes the value on."""
+    """The check as a function that returns its argument, as pydantic needs it."""
 
-    def passed_on(value: T) -> T:
+    def checked(value: T) -> T:
         check(value)
         return value
 
-    return passed_on
+    return checked
 
 
 _INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
@@ -210,6 +211,11 @@ class Scenario:
         if self.law is not None:
             return self.law.is_cascade
         return self.is_advised and any(stage.is_spring for stage in self.actuation)
+
+    @property
+    def spring_loop(self) -> SpringLoop | None:
+        """The loop around the springs of a cascade, if all of its numbers are known; else None."""
+        return None if self.law is None else self.law.loop()
 
     @property
     def is_advised(self) -> bool:

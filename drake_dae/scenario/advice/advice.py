@@ -56,7 +56,7 @@ def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, la
     reacts.
     """
     peaks = []
-    for phase in () if task is None else task.made().phases:
+    for phase in () if task is None else task.make().phases:
         if task is not None and (speed := phase.speed_of_approach):
             added = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
             peaks.append((phase.felt(task.contact_force) + added, speed, phase.name))
@@ -133,7 +133,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     stiffness = material.stiffness_at(_FORCE)
     fast, noise = None, velocity_noise(scenario, period)
     known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
-    loop = None if scenario.law is None else scenario.law.loop()
+    loop = scenario.spring_loop
     if loop is not None:
         contact = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
     elif scenario.encoders is None:

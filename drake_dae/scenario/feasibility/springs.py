@@ -132,8 +132,7 @@ def spring_laws(
     swing = float(np.sqrt(np.max(np.linalg.eigvals((np.linalg.inv(B) + mobilities[0]) @ K).real)))
     pole = swing**2 * late / 20.0
     used = max(pole, _USUAL)
-    loop = None if scenario.law is None else scenario.law.loop()
-    loop = loop or spring_loop(sampling.period, sampling.late_samples)
+    loop = scenario.spring_loop or spring_loop(sampling.period, sampling.late_samples)
     w, zeta = loop.rate, loop.damping
     shaped = B @ np.linalg.inv(K)
     limits = np.where(np.isfinite(links.control_limits), links.control_limits, np.inf)

@@ -179,8 +179,9 @@ def _members(hint: Any) -> set[Any]:
 class Choice:
     """Annotates a Union of dataclasses: a tag chooses one, by default the first.
 
-    The tag is the name of the class. A member that is annotated with a `Form` has its tag and its
-    defaults. Members `str` and `float` are plain text and a number.
+    The tag is "!" and the name of the class, without a "Form" at its end. A member annotated with a
+    `Form` has the tag and the defaults of that `Form`. Members `str` and `float` are plain text and
+    a number.
 
     Attributes:
         written: The types that stand for others in data, as in `Form`, for all members.
@@ -194,9 +195,9 @@ class Choice:
         forms: dict[type[Any], Form] = {}
         members = get_args(source)
         for member in (member for member in members if member not in PLAIN):
-            cls, own = get_args(member) or (member, Form())
-            tag = own.tag or f"!{cls.__name__}"
-            forms[cls] = replace(own, written=self.written, tag=tag, needs_tag=bool(forms))
+            cls, form = get_args(member) or (member, Form())
+            tag = form.tag or f"!{cls.__name__.removesuffix('Form')}"
+            forms[cls] = replace(form, written=self.written, tag=tag, needs_tag=bool(forms))
         first = next(iter(forms.values())).tag
 
         def chosen(value: Any) -> str | None:

@@ -121,7 +121,7 @@ class Adaptive:
 
 
 @dataclass(frozen=True)
-class SpringCascade:
+class SpringCascadeForm:
     """The tracking law of the links alone, and a loop around the springs of the joints.
 
     It is a `systems.cascade.SpringCascade`, and needs `sampling`, and FlexibleJoints in
@@ -148,12 +148,12 @@ class SpringCascade:
         rate, *others = [1.0 if number is None else number for number in given]
         SpringLoop(rate, self.damping, *others)
 
-    def filled(self, numbers: SpringLoop) -> "SpringCascade":
+    def filled(self, numbers: SpringLoop) -> "SpringCascadeForm":
         """The same with recommended numbers where they are left out."""
         rate = numbers.rate if self.rate is None else self.rate
         motor_rate = rate if self.motor_rate is None else self.motor_rate
         current_rate = numbers.current_rate if self.current_rate is None else self.current_rate
-        return SpringCascade(rate, self.damping, motor_rate, current_rate)
+        return SpringCascadeForm(rate, self.damping, motor_rate, current_rate)
 
     def loop(self) -> SpringLoop | None:
         """The numbers of the loop; None if one is left out."""

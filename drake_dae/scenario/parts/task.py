@@ -46,14 +46,14 @@ class ScenarioTask:
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
-        task = self.made()
+        known = self.make().signals
         for name in self.signals:
-            if name not in task.signals:
-                text = unknown_name("phase that waits for the signal", name, task.signals)
+            if name not in known:
+                text = unknown_name("phase that waits for the signal", name, known)
                 raise ModelError(f"signals: {text}")
 
-    def made(self, force_noise: float = 0.0) -> Task:
-        """The task.
+    def make(self, force_noise: float = 0.0) -> Task:
+        """Makes the `Task` of these phases.
 
         Args:
             force_noise: The standard deviation of the force sensor's noise in N.
