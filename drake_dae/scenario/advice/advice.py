@@ -94,13 +94,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     is_advised = material is not None and scenario.is_advised
     if scenario.largest_roughness is not None:
         if not is_advised or scenario.encoders is None or scenario.is_cascade:
-            raise ScenarioError(
-                (
-                    "largest_roughness",
-                    "it limits gains that are computed for rigid joints and the noise of encoders "
-                    "in Drake's contact; leave it out, or leave the gains out and give encoders",
-                )
+            text = (
+                "it limits gains that are computed for rigid joints and the noise of encoders "
+                "in Drake's contact; leave it out, or leave the gains out and give encoders"
             )
+            raise ScenarioError(("largest_roughness", text))
         if not scenario.largest_roughness > 0.0:
             value = f"must be positive, got {scenario.largest_roughness:g} N m"
             raise ScenarioError(("largest_roughness", value))
@@ -110,24 +108,20 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if material is None or not is_advised:
         return Completed(scenario)
     if model.stages:
-        raise ScenarioError(
-            (
-                "gains",
-                "for Drake's own contact no gains are recommended with motors or valves, or with "
-                "the tracking law and springs; give them, with integral and observer, as in the "
-                "scenario wall_flexible_contact, or for springs leave `law` out",
-            )
+        text = (
+            "for Drake's own contact no gains are recommended with motors or valves, or with "
+            "the tracking law and springs; give them, with integral and observer, as in the "
+            "scenario wall_flexible_contact, or for springs leave `law` out"
         )
+        raise ScenarioError(("gains", text))
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
     if not period:
-        raise ScenarioError(
-            (
-                "gains",
-                "for a continuous compliant plant without `sampling` no gains are recommended; "
-                "give some, or a sampling",
-            )
+        text = (
+            "for a continuous compliant plant without `sampling` no gains are recommended; "
+            "give some, or a sampling"
         )
+        raise ScenarioError(("gains", text))
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_at(_FORCE)

@@ -160,13 +160,11 @@ def _with_outputs(
         if why is not None:
             raise ScenarioError(why)
         names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
-        raise ScenarioError(
-            (
-                "outputs",
-                f"{referred.missing} are missing, and no positions of joints beside {names} leave "
-                "B(x) regular; name others under outputs",
-            )
+        text = (
+            f"{referred.missing} are missing, and no positions of joints beside {names} leave "
+            "B(x) regular; name others under outputs"
         )
+        raise ScenarioError(("outputs", text))
     resting = [*along, *directions, *joints]
     chosen = [*named[referred.given :], *resting]
     values = _rounded(posture.rows)
@@ -249,14 +247,12 @@ def _search(
     residual = float(np.max(np.abs(nearest.left), initial=0.0))
     if residual > 1e-6:
         missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
-    raise ScenarioError(
-        (
-            "references" if len(rows) else "constraints",
-            "the robot cannot start there within its joint limits; the nearest start found has: "
-            f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
-            "references, start.errors or the surface's place, or give start.positions",
-        )
+    text = (
+        "the robot cannot start there within its joint limits; the nearest start found has: "
+        f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
+        "references, start.errors or the surface's place, or give start.positions"
     )
+    raise ScenarioError(("references" if len(rows) else "constraints", text))
 
 
 def _started(scenario: Scenario, referred: ReferredRows, posture: Posture) -> Scenario:

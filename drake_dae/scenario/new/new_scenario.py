@@ -101,14 +101,12 @@ def new_scenario(
             remarks["constraints"] = "; ".join(map(str, report.behind))
         robot = replace(robot, remarks={**robot.remarks, **remarks})
         return whole, scenario_text(whole, robot, task, Path(folder).resolve())
-    raise ScenarioError(
-        (
-            "robot",
-            f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
-            + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
-            + ". Give another tip, or copy a shipped scenario",
-        )
+    text = (
+        f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
+        + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
+        + ". Give another tip, or copy a shipped scenario"
     )
+    raise ScenarioError(("robot", text))
 
 
 def _depth(report: Feasibility) -> float:
