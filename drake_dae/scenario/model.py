@@ -34,7 +34,7 @@ from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0
-"""A surface from a file that is larger than the robot by this factor is probably in millimetres."""
+"""The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -52,26 +52,26 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
 @checked(lambda text: ScenarioError(("", text)))
 def complete_scenario(scenario: Scenario) -> Completed:
-    """The scenario with all outputs and a start.
+    """Adds missing outputs and a start to a scenario.
 
-    Outputs may be left out, or be fewer than the actuators minus the force outputs. They are
-    completed, in this order and only by independent ones, with: the world coordinates along the
-    surface of each contact point; the directions of the tool's axis by `tool_axis`; and positions
-    of joints, chosen such that B(x) (16) is best conditioned and joints are away from their limits
-    along the reference. Outputs without a reference keep their initial value.
+    Outputs are missing if there are fewer than actuators minus force outputs. Independent outputs
+    are added, in this order: the world coordinates along the surface of each contact point; the
+    directions of the tool's axis by `tool_axis`; and positions of joints, chosen so that B(x) of
+    (16) is best conditioned and joints are away from their limits along the reference. Outputs
+    without a reference keep their initial value.
 
-    If start.positions are left out and the default configuration does not lead to a regular start,
-    a start is searched with the first values of the references.
+    If start.positions are left out and Newton's method finds no regular start from the default
+    configuration, a start with the first values of the references is searched.
 
     Args:
         scenario: What `load_scenario` returns.
 
     Returns:
-        The scenario, unchanged if nothing was left out, and the choices in words.
+        The scenario, unchanged if nothing is missing, and the choices in words.
 
     Raises:
-        ScenarioError: Something does not fit, the start cannot be reached, or no outputs complete
-            those that are given; the message names the key.
+        ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
+            are independent of those in the scenario; the message names the key.
     """
     return _read(scenario, SceneGraph()).completed
 

@@ -26,14 +26,14 @@ from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 
 _SOFTER = 5.0
-"""A free robot's poles of positions are so many times as fast as those of the distance."""
+"""The ratio of the poles of positions to those of the distance, of a robot without contact."""
 
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 
 def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
-    """The gains of the free robot of a task, soft along the distance: see `TaskController`."""
+    """The gains of a task without contact, soft along the distance: see `TaskController`."""
     constraint = opening_contact(scenario, model)
     names = [signal.name for signal in model.dae.constraint_input_signals]
     place = names.index(constraint.force_signals[0].name)
@@ -49,11 +49,10 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
 
 
 def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """The force of the hardest touch, F + v (sqrt(k / A) + k t), also where it is tried again.
+    """A note on the largest force when contact is made, F + v (sqrt(k / A) + k t).
 
-    The law pushes with the force F that ends the phase from when it is felt; the root stops the
-    mass 1 / A at the tool, and the last term is how far the tool goes in the time t until the law
-    reacts.
+    F is the force that ends the phase. The contact of stiffness k stops the effective mass 1 / A of
+    the tool from the speed v, and in the time t until the law reacts the tool moves on by v t.
     """
     peaks = []
     for phase in () if task is None else task.make().phases:
@@ -68,15 +67,13 @@ def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, la
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """The scenario with gains by `advised_gains`, or `contact_gains`, where they are left out.
+    """Computes gains and other settings that a scenario in Drake's own contact leaves out.
 
-    With encoders and rigid joints the gains are those for their noise, with an estimate of the
-    state; otherwise those of `contact_gains`, and of `contact_gains_behind` for a cascade.
-
-    Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
-    and of points, constraint damping, an observer of disturbance and friction, and measured force
-    are set, each if it is left out. A task also gets gains of its free robot, soft along the
-    distance.
+    It computes gains, integrals of forces and of points, constraint damping, an observer of
+    disturbance and friction, and measured force, each if it is left out; and for a task the gains
+    without contact, soft along the distance. With encoders and rigid joints the gains are those of
+    `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`, or for a
+    cascade of `contact_gains_behind`. A scenario with `gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -84,11 +81,11 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         structure: The structure of the model's system.
 
     Returns:
-        The scenario, unchanged if nothing is left out, and the choices in words.
+        The scenario, and the choices in words.
 
     Raises:
-        ScenarioError: There are no default gains with a task, or with stages of actuation, or none
-            are smooth and stable enough; or a roughness is given that nothing uses.
+        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
+            enough; or `largest_roughness` is given and not used.
     """
     material = scenario.plant.material
     is_advised = material is not None and scenario.is_advised

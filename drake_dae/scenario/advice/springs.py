@@ -1,4 +1,4 @@
-"""The numbers of a cascade for springs where a scenario leaves them out."""
+"""The numbers of a cascade for springs that a scenario leaves out."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _DIGITS = 3
 
 
 def rounded(value: float) -> float:
-    """A recommended number, as it is written."""
+    """A recommended number, rounded to three digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
@@ -39,7 +39,7 @@ def loop_note(scenario: Scenario) -> str:
 
 
 def with_loop(scenario: Scenario) -> Scenario:
-    """The scenario with all numbers of the loop around its springs."""
+    """Computes the numbers of the loop around springs that a scenario leaves out."""
     law, sampling = scenario.law, scenario.sampling
     if not isinstance(law, parts.SpringCascadeForm):
         law = parts.SpringCascadeForm()

@@ -1,4 +1,4 @@
-"""The outputs, given or still to be chosen, of the references of a scenario."""
+"""The outputs to which the references of a scenario refer."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,9 @@ class ReferredRows:
 
     Attributes:
         scenario, candidates: The arguments.
-        given: The number of given rows.
-        missing: How many are missing.
-        rows: The rows with references: given ones, then completing ones that references name.
+        given: The number of rows of the scenario's outputs.
+        missing: The number of missing rows.
+        rows: The rows of the scenario's outputs, then completing rows that references name.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class ReferredRows:
         Args:
             scenario: The scenario.
             candidates: Its rows.
-            given: The number of given rows.
-            missing: How many are missing.
+            given: The number of rows of the scenario's outputs.
+            missing: The number of missing rows.
             forces: The names of the force outputs.
             along: The rows along the surfaces, near the start.
 
@@ -84,16 +84,16 @@ class ReferredRows:
                 raise ScenarioError((key, str(error))) from None
         else:
             return [place if place < self.given else None for place in places]
-        # Not yet an output: one of the rows that may complete them.
+        # Not yet an output: one of the rows that may complete the outputs.
         along = [signals[row] for row in self._along]
-        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
-        own = [one for one in along if one.rpartition(".")[0] == name]
+        others = [*along, *(signal for signal in signals[self.given :] if signal not in along)]
+        of_point = [signal for signal in along if signal.rpartition(".")[0] == name]
         try:
-            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
+            chosen = of_point or [others[k] for k in meant(name, others, [2] * len(others))]
         except ReferenceSignalError:
-            text = unknown_name("output", name, [*known, *beside])
+            text = unknown_name("output", name, [*known, *others])
             raise ScenarioError((key, text)) from None
-        return [signals.index(one) for one in chosen]
+        return [signals.index(signal) for signal in chosen]
 
     def wanted(self, time: float) -> FloatArray:
         """The values of the referred rows at a time in s, shape (referred,)."""

@@ -1,4 +1,4 @@
-"""Changes of a scenario to the robot of its file: base, locked joints, actuators, payloads."""
+"""The changes that a scenario makes to its robot: base, locked joints, actuators, payloads."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -36,10 +36,10 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     Args:
         robot: The key `robot` of the scenario.
         plant: The robot of that file, not finalized.
-        efforts: The effort limits of the file, for actuators that it does not declare.
+        efforts: The effort limits of the file, for new actuators.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: A change does not fit the robot; the message names its key.
     """
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
@@ -77,7 +77,7 @@ def _drake_errors() -> Iterator[None]:
 
 
 def _read_couplings(robot: Robot) -> Sequence[Coupling]:
-    """The couplings of the file, read from a separate plant: only a finalized plant has them."""
+    """Reads the couplings of the file from a second plant, since the plant must be finalized."""
     plant, _ = read_robot(robot)
     finalize(plant)
     return couplings_of(plant)
@@ -109,7 +109,7 @@ def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
 
 @at("robot.free")
 def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
-    """Gives bodies without a joint a floating joint in roll, pitch and yaw.
+    """Adds floating joints in roll, pitch and yaw to bodies without a joint.
 
     Raises:
         ScenarioError: There is no such body, or it has a joint.
@@ -130,21 +130,20 @@ def lock_joints(
 ) -> None:
     """Replaces joints by welds at given positions.
 
-    Drake locks joints in discrete time only. A weld has the same motion: X_FM(q) of the joint, from
-    its frame on the parent to that on the child, at the constant q. The torque in the joint becomes
-    internal to a body; the actuator, damping and rotor of the joint are removed.
+    Drake supports locked joints only in discrete time. The weld has the constant pose X_FM(q) of
+    the joint, from its frame on the parent to its frame on the child. The actuator, the damping and
+    the rotor of the joint are removed.
 
-    Joints coupled to a locked one, q_f = ratio q_l + offset, are locked with it, followers and
-    leaders.
+    Joints that are coupled to a locked one by q_f = ratio q_l + offset are locked as well.
 
     Args:
         locked: Name -> position, in rad or m.
         plant: The robot, not finalized; changed.
-        couplings: Those of the plant.
+        couplings: The couplings of the plant.
 
     Raises:
         ScenarioError: There is no such joint, its position is outside of its limits or
-            contradicts a coupling, or the file has other constraints.
+            contradicts a coupling, or the file has constraints other than couplings.
     """
     joints = _movable(plant)
     positions = dict(locked)
@@ -229,16 +228,16 @@ def drive_joints(
     couplings: Sequence[Coupling],
     efforts: Mapping[str, float],
 ) -> None:
-    """Gives actuators to the joints that a scenario names, and removes those of all others.
+    """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
-    An actuator of the file is kept, with its gear ratio and its rotor.
+    Actuators of the file remain, with their gear ratios and rotors.
 
     Args:
         driven: Names of joints, or name -> effort limit in N m or N; or "all", the revolute and
             prismatic joints that mimic no other.
         plant: The robot, not finalized; changed.
-        couplings: Those of the plant.
-        efforts: Name -> effort limit of the file, for actuators that are new and have none.
+        couplings: The couplings of the plant.
+        efforts: Name -> effort limit of the file, for new actuators without a limit.
 
     Raises:
         ScenarioError: There is no such joint, or it has several positions.
@@ -270,7 +269,7 @@ def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
 
 
 def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
-    """Name -> joint, of those with one position."""
+    """Name -> joint, for revolute and prismatic joints."""
     return {
         name: joint
         for name, joint in joint_names(plant).items()

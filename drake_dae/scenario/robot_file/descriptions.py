@@ -22,10 +22,11 @@ class Description(NamedTuple):
 
 
 def find_description(name: str) -> Description:
-    """The robot with a name such as "panda_description"; downloaded if necessary.
+    """Finds the robot with a name such as "panda_description"; clones it if necessary.
 
     Raises:
-        ModelError: There is none, it cannot be downloaded, or the package is not installed.
+        ModelError: There is no such robot, it cannot be cloned, or robot_descriptions is not
+            installed.
     """
     try:
         names = import_module("robot_descriptions").DESCRIPTIONS

@@ -1,4 +1,4 @@
-"""Files of a robot that include themselves, on which Drake's parser would not end."""
+"""A check for files that include themselves, with which Drake's parser would not terminate."""
 
 import re
 from collections.abc import Iterator
@@ -16,21 +16,21 @@ _INCLUDED = {
     ".yaml": re.compile(r"\bfile:\s*[\"']?([^\"'\s,}\]]+)"),
 }
 _INCLUDED[".yml"] = _INCLUDED[".yaml"]
-"""Per kind of file: what it includes."""
+"""Suffix of a file -> the pattern of the files that it includes."""
 
 MOST = 1000
 """The largest number of files of a robot, each counted as often as it is included."""
 
 
 def check_includes(file: Path, packages: PackageMap) -> None:
-    """Refuses a file that includes itself, or more than `MOST` files.
+    """Checks that a file does not include itself, and not more than `MOST` files.
 
     Args:
-        file: MJCF, SDFormat or model directives; others include nothing.
-        packages: The packages that URLs name.
+        file: MJCF, SDFormat or model directives; other files include nothing.
+        packages: The packages for URLs.
 
     Raises:
-        ModelError: It does; the message has the chain of includes.
+        ModelError: The file includes itself, or too many files.
     """
     waiting: list[tuple[Path, ...]] = [(file.resolve(),)]
     count = 0
@@ -47,7 +47,7 @@ def check_includes(file: Path, packages: PackageMap) -> None:
 
 
 def _included(file: Path, first: Path, packages: PackageMap) -> Iterator[Path]:
-    """The files that a file includes; missing ones are left to Drake's message."""
+    """The files that a file includes, without missing ones, which Drake reports."""
     pattern = _INCLUDED.get(file.suffix)
     if pattern is None or not file.is_file():
         return

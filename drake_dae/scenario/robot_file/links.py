@@ -1,4 +1,4 @@
-"""The links of a scenario's robot, and the same robot for a plant of Drake's."""
+"""The robot of a scenario as links for the library, and in a MultibodyPlant of Drake's."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
 _MASSLESS = 1e-12
-"""An eigenvalue of M(q) below it, relative to the largest, is zero up to round-off."""
+"""An eigenvalue of M(q) below this fraction of the largest one is zero up to round-off."""
 
 
 @at("robot.file")
@@ -55,11 +55,11 @@ def robot_links(
 
     Args:
         robot: The key `robot` of the scenario.
-        scene_graph: Where its geometry is registered.
+        scene_graph: The scene graph for its geometry.
         payloads: The key `plant_payloads` of the scenario, for the links of the plant.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: The file cannot be read or a change does not fit; the message names the key.
     """
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
@@ -87,10 +87,10 @@ def robot_links(
 
 
 def _check_mass(plant: MultibodyPlant) -> None:
-    """Refuses joints that move no mass: their acceleration is not determined.
+    """Checks that each joint moves a mass; otherwise its acceleration is not determined.
 
     Raises:
-        ModelError: M(q) is singular in the default configuration, and in others.
+        ModelError: M(q) is singular in the default and in three random configurations.
     """
     context = plant.CreateDefaultContext()
     default = plant.GetPositions(context)

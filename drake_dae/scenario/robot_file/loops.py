@@ -1,4 +1,4 @@
-"""Joints of a robot's file that close loops: removed from the tree and converted to constraints."""
+"""Joints of a robot's file that close loops: they are replaced by constraints."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from drake_dae.robots.surfaces.surface import axes_along, triple
 
 @dataclass(frozen=True)
 class CutJoint:
-    """A joint that closes a loop, as read from the plant.
+    """A joint that closes a loop and was removed from the plant.
 
     Attributes:
         name: Its name.
@@ -27,7 +27,7 @@ class CutJoint:
         bodies: The indices of parent and child.
         poses: The poses of its frames on parent and child.
         axis: Its axis in these frames, shape (3,).
-        options: Its damping, limits and motor, as arguments of the constraint.
+        options: Its name, damping, limits and motor, as arguments of the constraint.
     """
 
     name: str
@@ -39,7 +39,7 @@ class CutJoint:
 
 
 def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
-    """Removes joints of a plant until the others form a tree; driven ones only if necessary.
+    """Removes joints until the others form a tree; driven joints only if necessary.
 
     Args:
         plant: Not finalized; changed.
@@ -56,7 +56,7 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
 
 
 def closing_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The loop-closing joints of a plant that is not finalized: the others form a tree."""
+    """The joints that close loops, so that the others form a tree; if possible without motors."""
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
     joints = sorted(
         joints_of(plant),
@@ -138,8 +138,8 @@ def _cut(
 def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Constraint]:
     """The constraints that replace cut joints.
 
-    If all joints of a loop move in one plane, the constraint is planar: a spatial one would be
-    redundant.
+    If all joints of a loop move in one plane, the constraint is planar, since a spatial constraint
+    would be redundant.
 
     Args:
         cuts: The result of `cut_loops`.
@@ -187,7 +187,7 @@ def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArra
 
 
 def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArray]]:
-    """The joints between two bodies: whether each is prismatic, and its axis in the world."""
+    """The other joints of a loop: whether each is prismatic, and its axis in the world."""
     context = plant.CreateDefaultContext()
     above = {int(joint.child_body().index()): joint for joint in joints_of(plant)}
     lines: list[dict[int, Joint]] = []

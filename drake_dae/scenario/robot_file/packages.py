@@ -1,4 +1,4 @@
-"""The packages that a robot's files name, "package://<name>/...", found as ROS finds them."""
+"""Finds the packages that a robot's files name, "package://<name>/...", as ROS finds them."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from drake_dae.scenario.shipped import FOLDER
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
 _MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
-"""The suffixes of files that may name packages themselves."""
+"""The suffixes of files that may contain names of packages."""
 
 
 def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
@@ -36,20 +36,20 @@ def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
 def find_packages(
     file: str, known: PackageMap, places: Sequence[Path] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Adds the packages that a file names, and those named by the files that it includes.
+    """Adds the packages that a file names, and those that its included files name.
 
-    A package is searched near the file that names it: each folder above that file, and each
-    subfolder of the package's name in one of these, if it has a package.xml with the name. Then it
-    is searched in ROS_PACKAGE_PATH, and then in places.
+    A package is searched near the file that names it: a folder above the file, or a subfolder of
+    the package's name in such a folder, that has a package.xml with the name. Then it is searched
+    in ROS_PACKAGE_PATH, and last as a subfolder of `places`.
 
     Args:
         file: A path, or a URL of a package.
-        known: The packages found already; new ones are added.
+        known: The known packages; the packages that are found are added.
         places: Folders with packages as subfolders of their names.
 
     Returns:
-        The folders of the added packages, and the packages not found: name -> a file that names it,
-        or "" for `file` itself.
+        The folders of the added packages; and the packages that are not found: name -> a file that
+        names it, or "" for `file` itself.
     """
     folders: list[Path] = []
     missing: dict[str, str] = {}
@@ -81,7 +81,7 @@ def find_packages(
 
 
 def explained(missing: Mapping[str, str]) -> str:
-    """The remedy for packages that are not found, as text."""
+    """The error message for packages that are not found."""
     name, origin = next(iter(missing.items()))
     where = (
         f", which '{Path(origin).name}' names, is neither beside it" if origin else " is neither"
@@ -96,7 +96,7 @@ def explained(missing: Mapping[str, str]) -> str:
 
 
 def _path(url: str, known: PackageMap) -> Path | None:
-    """The file of a path or a URL; None if there is none."""
+    """The file of a path or a URL; None if the package is unknown."""
     if "://" not in url:
         return Path(url)
     try:
@@ -106,7 +106,7 @@ def _path(url: str, known: PackageMap) -> Path | None:
 
 
 def _beside(name: str, file: Path) -> Path | None:
-    """The folder of a package in the folders above a file."""
+    """The folder of a package above a file, or beside a folder above it; None if there is none."""
     for above in file.resolve().parents:
         for folder in (above, above / name):
             if _package_name(folder / "package.xml") == name:

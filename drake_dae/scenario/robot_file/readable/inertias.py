@@ -23,12 +23,12 @@ _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 _LEAST = 1e-9
-"""The least second moment relative to their sum, so that none is negative by round-off."""
+"""The least second moment relative to the sum of all, so that none is negative by round-off."""
 
 
 @dataclass(frozen=True)
 class RepairedInertia:
-    """A physically impossible inertia.
+    """A physically impossible inertia and the nearest possible one.
 
     Attributes:
         owner: The file with the line, and the link or body.
@@ -64,14 +64,17 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
 
 
 def possible_inertias(text: str, file: Path) -> tuple[str, list[RepairedInertia]]:
-    """A file's text with possible inertias, line by line as before, and the changed inertias.
+    """Replaces impossible inertias in a text by the nearest possible ones; lines stay the same.
 
     Args:
-        text: A URDF, SDFormat or MJCF file without comments.
-        file: Its suffix determines which.
+        text: The text of a URDF, SDFormat or MJCF file without comments.
+        file: The file; its suffix determines the format.
+
+    Returns:
+        The text, and the replaced inertias.
 
     Raises:
-        ModelError: A mass is negative, or there is no possible inertia near one.
+        ModelError: A mass is negative, or no possible inertia is near one.
     """
     root, form = parsed(text), _FORMS[file.suffix]
     inertials = root.iter("inertial")
@@ -121,7 +124,7 @@ _Read = tuple[float, FloatArray] | None
 
 @dataclass(frozen=True)
 class _InertiaForm:
-    """The way in which a kind of file writes an inertia."""
+    """How a format writes an inertia: functions that read and that replace it."""
 
     read: Callable[[ElementTree.Element], _Read]
     write: Callable[[str, FloatArray], str]

@@ -1,8 +1,7 @@
-"""A robot's files made readable for Drake: without some meshes, with possible inertias.
+"""Copies of a robot's files that Drake can read: without some meshes, with possible inertias.
 
-Vendors use .stl or .dae for collision geometry, which a MultibodyPlant with a SceneGraph refuses,
-and MJCF uses .stl for all meshes. The equations need no meshes: the readable ones are read and
-drawn.
+Vendors use .stl or .dae for collision geometry, which a MultibodyPlant with a SceneGraph rejects,
+and MJCF uses .stl for all meshes. The equations need no meshes, so unreadable meshes are left out.
 """
 
 import re
@@ -37,29 +36,29 @@ _FILE = {
     ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
 }
-"""Per kind of file: the text before a mesh's name, the name, and the text after it."""
+"""Suffix of a file -> pattern of the text before a file's name, the name, and the text after it."""
 
 _MESH = {
     ".urdf": re.compile(r"(<mesh\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<mesh\b[^>]*>(?:(?!</mesh).)*?<uri>\s*)([^<]*?)(\s*</uri>)", re.DOTALL),
 }
-"""The same, for meshes only."""
+"""Suffix of a file -> the same pattern, for meshes only."""
 
 DRAWN = (".obj", ".gltf", ".dae")
-"""The kinds of mesh that Drake's Meshcat draws; its films draw the first two."""
+"""The kinds of mesh that Drake's Meshcat draws; its renderer draws the first two."""
 
 
 @dataclass(frozen=True)
 class ReadableCopies:
-    """Copies of the user's files that Drake reads instead.
+    """Copies of the user's files, which Drake reads instead of these.
 
     Attributes:
         leave_out: The key `leave_out` of the scenario.
         placed: The links that the scenario welds or makes free, "base" or "left::base".
         originals: A copy -> its original, with the same lines.
         left_out: The omitted meshes.
-        repaired: The impossible inertias.
-        floating: Model instance, or "", -> the floating joints of its file.
+        repaired: The replaced inertias.
+        floating: Model instance, or "" for a single file -> its floating joints.
     """
 
     leave_out: Collection[str]
@@ -70,7 +69,7 @@ class ReadableCopies:
     floating: dict[str, list[FloatingJoint]] = field(default_factory=dict)
 
     def named(self, text: str) -> str:
-        """A message of Drake's parser, with the names of the user's files."""
+        """Replaces the names of copies in a message of Drake's parser by those of the originals."""
         for copy, original in self.originals.items():
             text = text.replace(str(copy), str(original))
         return text
@@ -83,14 +82,14 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: ReadableCopies)
         file: A file that Drake's Parser reads.
         parser: A parser with the packages, for the plant.
         folder: An empty folder for the copies.
-        copies: An empty one; the copies are added, also if the files are refused afterwards.
+        copies: The record of copies, empty; it is filled, also if Drake rejects the files.
 
     Returns:
-        The file of each model instance of the directives, or the file itself under "".
+        Model instance of the directives -> its file, or "" -> the file itself.
 
     Raises:
-        ModelError: A body has its mass from a mesh that Drake cannot read.
-        RuntimeError: Drake refuses the files; the message names copies.
+        ModelError: The mass of a body is computed from a mesh that Drake cannot read.
+        RuntimeError: Drake rejects the files; the message names copies.
     """
     packages = parser.package_map()
     has_geometry = parser.plant().geometry_source_is_registered()
@@ -136,7 +135,7 @@ def _readable(
     instance: str,
     placed: Collection[str],
 ) -> tuple[Path, list[str]]:
-    """The file or a readable copy, and the links that it fixes to the world."""
+    """The file or its readable copy, and the links that it fixes to the world."""
     if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
         return file, []
     plain = without_comments(file.read_text("utf-8", errors="replace"))
@@ -207,7 +206,7 @@ def _absolute(name: str, file: Path) -> str:
 
 
 def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
-    """The path of a mesh; None if there is none, for which Drake's message is better."""
+    """The path of a mesh; None if its package is unknown, which Drake reports."""
     name = _absolute(name, file)
     try:
         return Path(packages.ResolveUrl(name) if "://" in name else name)

@@ -1,4 +1,4 @@
-"""An MJCF file made readable for Drake: meshes as .obj, and bodies of mass 0."""
+"""Changes an MJCF file so that Drake can read it: meshes as .obj, and bodies of mass 0."""
 
 import re
 from collections.abc import Iterator
@@ -16,10 +16,10 @@ _READ = ".obj"
 
 
 def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
-    """A file with meshes as .obj only, without the other meshes and their geometry.
+    """Converts meshes to .obj, and removes unreadable meshes with their geometry.
 
-    A body whose <inertial> has mass 0 loses it, and its geometry gets no mass: MuJoCo accepts such
-    bodies if they do not move, or move with others.
+    MuJoCo accepts bodies of mass 0 that do not move, or move with others. The <inertial> of such a
+    body is removed, and its geometry gets mass 0.
 
     Args:
         text: The text of the file, without comments.
@@ -29,7 +29,7 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         The text, with the same lines and absolute names of meshes; and the omitted meshes.
 
     Raises:
-        ModelError: A body that can move has its mass from such a mesh.
+        ModelError: The mass of a movable body is computed from an omitted mesh.
     """
     root = parsed(text)
     whole, text = text, _without_mass(text, root)
@@ -99,7 +99,7 @@ def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
 
 
 def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
-    """The bodies in an element that are moved by joints."""
+    """The bodies in an element that joints can move."""
     for child in body.iterfind("body"):
         has_joint = child.find("joint") is not None or child.find("freejoint") is not None
         if moves or has_joint:
@@ -108,7 +108,7 @@ def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementT
 
 
 def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
-    """Refuses a moving body whose mass is computed from its omitted meshes."""
+    """Checks that no mass of a movable body is computed from omitted meshes."""
     always = _takes_geometry(root)
     for body in (body for world in root.iter("worldbody") for body in _moving(world)):
         if body.find("inertial") is not None and not always:

@@ -1,8 +1,8 @@
-"""Links that a robot's file fixes to the world, or lets float.
+"""Links that a robot's file fixes to the world, and floating links.
 
-Fixed links are released if the scenario places them. Floating links have no joint in Drake, which
-makes them free bodies with a quaternion, whose length 1 is an equation that no constraint force
-enforces. They get a joint in roll, pitch and yaw.
+A fixed link is released if the scenario places it. A floating link is a free body with a quaternion
+in Drake; no constraint force keeps the length of the quaternion at 1. So it gets a joint in roll,
+pitch and yaw.
 """
 
 import re
@@ -28,8 +28,8 @@ def world_links(text: str, file: Path) -> list[str]:
     """The names of the links that a file fixes to the world.
 
     Args:
-        text: A URDF, SDFormat or MJCF file without comments.
-        file: Its suffix determines which.
+        text: The text of a URDF, SDFormat or MJCF file without comments.
+        file: The file; its suffix determines the format.
     """
     if file.suffix == ".xml":
         return _fixed_bodies(text)
@@ -38,7 +38,7 @@ def world_links(text: str, file: Path) -> list[str]:
 
 
 def released(text: str, file: Path, links: Collection[str]) -> str:
-    """A file's text without the joints from the world to some links, with the same lines.
+    """Removes the joints from the world to some links; lines stay the same.
 
     The arguments are those of `world_links`, and the names of the links to release.
     """
@@ -73,9 +73,9 @@ class FloatingJoint:
 
 
 def floating_joints(text: str, file: Path) -> tuple[str, list[FloatingJoint]]:
-    """The text of a file without its floating joints, with the same lines, and these.
+    """Removes floating joints from a text with the same lines; returns it and the joints.
 
-    Drake reads those of MJCF as free bodies; they remain in the text.
+    Those of MJCF remain in the text: Drake reads them as free bodies.
 
     Raises:
         ModelError: The origin of one is not six numbers.
@@ -124,7 +124,7 @@ def add_floating_joints(
     Args:
         plant: The robot, not finalized; changed.
         instance: The model instance of the file; "" if it is the only one.
-        joints: Its floating joints, of links that no other joint holds.
+        joints: Its floating joints.
     """
     models = [plant.GetModelInstanceByName(instance)] if instance else []
     for joint in joints:
