@@ -27,7 +27,7 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _identify(options: argparse.Namespace) -> int:
-    """Identifies parameters."""
+    """Identifies parameters from records; returns the exit code."""
     # SciPy's splines take a fifth of a second to load.
     from drake_dae.studies.identification.of_scenario import identify_scenario, recorded_scenario
 
@@ -42,12 +42,12 @@ def _identify(options: argparse.Namespace) -> int:
     else:
         scenario = load_scenario(find_scenario(options.scenario), options.settings)
     result, identified = identify_scenario(scenario, records, _listed(options.free))
-    _tell(result, identified, options)
+    _report(result, identified, options)
     return 0
 
 
 def _excite(options: argparse.Namespace) -> int:
-    """Finds a motion and a force; returns the exit code, after a signal that of this."""
+    """Finds the best motion and force; returns the exit code."""
     # It loads SciPy's optimizers.
     from drake_dae.studies.excitation.excite import excite
 
@@ -62,11 +62,11 @@ def _excite(options: argparse.Namespace) -> int:
         seed=options.seed,
         progress=True,
     )
-    _tell(result, result.scenario, options)
+    _report(result, result.scenario, options)
     return 0 if result.interrupted is None else 128 + result.interrupted
 
 
-def _tell(
+def _report(
     result: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
 ) -> None:
     """Writes the scenario and prints the result."""
@@ -83,12 +83,12 @@ def _tell(
 
 
 def _listed(texts: list[str]) -> list[str]:
-    """Names that commas separate."""
+    """Splits texts at commas."""
     return [name for text in texts for name in text.split(",") if name]
 
 
 def _noise(texts: list[str]) -> dict[str, float]:
-    """The deviations of sensors.
+    """Kind of sensor -> the deviation of its noise, from options such as "position=1e-5".
 
     Raises:
         ModelError: An option is no name with a number.
@@ -104,7 +104,7 @@ def _noise(texts: list[str]) -> dict[str, float]:
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:
-    """The record of a run, or a log in CSV or MCAP."""
+    """Reads the record of a run, or a log in CSV or MCAP."""
     if path.suffix == ".csv":
         return Record.from_csv(path, columns)
     if path.suffix == ".mcap":
@@ -115,7 +115,7 @@ def _load(path: Path, columns: dict[str, str] | None) -> Record:
 
 
 def _columns(path: Path) -> dict[str, str]:
-    """The names of columns from a YAML file.
+    """Reads the names of columns from a YAML file.
 
     Raises:
         ModelError: The file cannot be read, or is no mapping of names to names.

@@ -1,4 +1,4 @@
-"""What a browser shows: `drake-dae play` an animation, `page` and `live` a loop that runs."""
+"""`drake-dae play`, `page` and `live`: animations, and loops that run in a browser."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Shows what the options name; returns the exit code."""
+    """Runs the command that the options name; returns the exit code."""
     return {"play": _play, "page": _page, "live": _live}[options.command](options)
 
 
@@ -49,7 +49,7 @@ def _animation(folder: Path) -> Path:
 
 
 def show(folder: Path) -> None:
-    """Opens the animation of a run in the browser, and says which file that is.
+    """Opens the animation of a run in the browser, and prints its file.
 
     Raises:
         ModelError: There is none, or no browser.
@@ -74,7 +74,7 @@ def _open(page: Path) -> None:
 
 
 def _page(options: argparse.Namespace) -> int:
-    """Writes a page."""
+    """Writes a scenario as a page."""
     from drake_dae.running.bench.page import write_page
 
     name, scenario, built = _built(options)
@@ -101,7 +101,7 @@ def _page(options: argparse.Namespace) -> int:
 
 
 def _live(options: argparse.Namespace) -> int:
-    """Runs a live bench, or what was commanded in one."""
+    """Runs a live bench, or repeats the commands of an earlier one."""
     from drake_dae.running.bench.live import live
     from drake_dae.running.bench.run import Commands, replay
     from drake_dae.simulation.real_time import attainable_rate
@@ -137,7 +137,7 @@ def _live(options: argparse.Namespace) -> int:
 
 
 def _saver(scenario: "Scenario", folder: Path) -> Callable[["HandRun"], str]:
-    """What saves a run of a live bench."""
+    """A function that saves a run of a live bench and returns the folder."""
     from drake_dae.scenario.files import save_scenario
 
     def save(run: "HandRun") -> str:
@@ -153,7 +153,7 @@ def _saver(scenario: "Scenario", folder: Path) -> Callable[["HandRun"], str]:
 
 
 def _built(options: argparse.Namespace) -> "tuple[str, Scenario, Commanded]":
-    """Name, scenario and commanded loop that the options name."""
+    """Builds the commanded loop of the scenario that the options name, and returns all three."""
     from drake_dae.scenario.commanded import build_commanded
     from drake_dae.scenario.files import load_scenario
     from drake_dae.scenario.shipped import find_scenario

@@ -22,7 +22,7 @@ from drake_dae.simulation.records.record import Record
 SCENARIO = "scenario.yaml"
 RECORD = "record.npz"
 PART = "record.part"
-"""The record during the run, and after a run that was killed."""
+"""The record during a run; it remains if the run is killed."""
 
 ANIMATION = "animation.html"
 
@@ -30,7 +30,7 @@ FILES = (SCENARIO, "summary.txt", RECORD, *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
 FILM = "film.gif"
-"""The files of `drake-dae render`."""
+"""The file of `drake-dae render`."""
 
 MARK = "# Scenario as run by drake-dae"
 """The first line of the scenario in a run's folder: only such a folder is reused."""
@@ -74,13 +74,13 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
 
 
 def load_run(path: Path) -> Record:
-    """The record of a run.
+    """Reads the record of a run.
 
     Args:
-        path: Its folder, or the file of the record.
+        path: The folder of the run, or the file of the record.
 
     Raises:
-        ModelError: There is none.
+        ModelError: There is no record.
     """
     if not path.is_dir():
         return Record.load(path)
@@ -103,7 +103,7 @@ def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _prepare(folder: Path) -> tuple[int, Path | None]:
-    """The open file with the lock, and the folder to which an earlier run was moved."""
+    """Locks a folder; returns the locked file, and the folder to which an earlier run was moved."""
     folder.mkdir(parents=True, exist_ok=True)
     _check(folder, None)
     lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
@@ -153,11 +153,11 @@ def _present(folder: Path) -> list[Path]:
 
 
 def _check(folder: Path, text: str | None) -> None:
-    """Refuses a folder with other files; the text is that of the scenario, None if not yet read."""
+    """Checks that a folder has no other files; text is its scenario, None if it is not read yet."""
     present, scenario = _present(folder), folder / SCENARIO
     # Empty: new, or from a run that was killed at once.
-    own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
-    if present and (present[0] != scenario or scenario.is_symlink() or not own):
+    is_of_run = text is None or text.startswith(MARK) or (not text and len(present) == 1)
+    if present and (present[0] != scenario or scenario.is_symlink() or not is_of_run):
         names = ", ".join(file.name for file in present)
         raise ModelError(
             f"'{folder}' holds {names}, not from an earlier run; choose another folder"
@@ -180,11 +180,11 @@ def _lock(file: int, folder: Path) -> None:
 
 @contextmanager
 def stage(folder: Path, *names: str) -> Iterator[Path]:
-    """A temporary folder for files, which are moved to the folder when they are complete.
+    """Makes a temporary folder for files, and moves these to the folder when they are complete.
 
     Raises:
-        OSError: Some file cannot be written; with the path of the first of the names if the error
-            has none.
+        OSError: A file cannot be written; the error has the path of the first of the names if it
+            has no other path.
     """
     place = None
     try:
@@ -201,7 +201,7 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
 
 @contextmanager
 def _workplace(folder: Path) -> Iterator[str]:
-    """A temporary folder inside another one, removed at the end also after a signal.
+    """Makes a temporary folder inside another one, and removes it at the end, also after a signal.
 
     Signals are deferred while the folder is made and while it is removed.
     """

@@ -129,7 +129,7 @@ def _unused(name: str) -> Path:
 
 @dataclass
 class _CommandRun:
-    """A run: its scenario, its folder, and its outcome."""
+    """A run of the command: its loop and scenario, its folder, and its results."""
 
     loop: ClosedLoop
     context: Context
@@ -166,7 +166,7 @@ def _step(run: _CommandRun) -> RunStatistics:
 
 
 def _warn_of_rate(run: _CommandRun) -> None:
-    """Warns before a run in real time that is too slow for it."""
+    """Warns if this machine is too slow for a run in real time."""
     scenario, config = run.scenario, run.scenario.integrator
     target = config.target_realtime_rate
     if not target:
@@ -215,7 +215,7 @@ def _run(
     simulate_by: Callable[[_CommandRun], RunStatistics],
     title: str,
 ) -> tuple[int, dict[str, Any]]:
-    """Runs and writes; the record is kept also when the run fails or is interrupted."""
+    """Runs, and writes the files, also if the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
 
     def recorded(context: Context, after: float | None) -> Record:
@@ -239,7 +239,7 @@ def _run(
 
 
 def _write(run: _CommandRun) -> bool:
-    """Writes the files, prints the summary, and says whether all files are complete."""
+    """Writes the files, prints the summary, and returns whether all files are complete."""
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
     # A signal from here on takes effect after the record is written and before the pictures.
@@ -411,9 +411,9 @@ def _print(text: str, file: TextIO) -> None:
 
 @contextmanager
 def _frozen() -> Iterator[None]:
-    """Excludes the objects made so far from garbage collection.
+    """Excludes the present objects from garbage collection in the block.
 
-    A figure creates so many objects that collecting would take as long as drawing it.
+    A figure creates so many objects that their collection would take as long as drawing.
     """
     gc.freeze()
     try:
@@ -424,7 +424,7 @@ def _frozen() -> Iterator[None]:
 
 @contextmanager
 def _collected(problems: list[str]) -> Iterator[None]:
-    """Collects an error of a file for later: the other files are written, and the summary."""
+    """Collects an error of a file, so that the other files and the summary are written."""
     try:
         yield
     except OSError as error:

@@ -39,17 +39,17 @@ class ClosedLoop:
             `tracking_error`, and `link_state` of a robot.
         plant, controller: The systems in it.
         generator: The generator of references; None for a controller that plans them itself.
-        loggers: Port name -> (sink, names and units), one sample per step, for signals with memory.
+        loggers: Port name -> (sink, names and units) of the logged signals, one sample per step.
             `record` computes the other signals from these.
         signals: Names and units of each signal that is logged or computed.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
-        plant_exogenous: That for the plant, or None.
+        plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
-        observer: The observer that feeds the law instead, or None.
-        memory: The data that `rollout` reuses.
+        observer: The observer of the disturbance or the state, or None.
+        memory: A cache for rollouts and starts.
     """
 
     diagram: Diagram
@@ -125,11 +125,11 @@ class ClosedLoop:
         return self.controller.changes(self.controller.GetMyContextFromRoot(context))
 
     def record(self, context: Context, after: float | None = None) -> Record:
-        """The logged signals up to now, and those computed from them.
+        """The record of a run: the logged signals up to now, and signals computed from them.
 
         It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
-        controller; see its class. Parameters and gains are those of each time. At an impact or a
-        change of phase, values are those before it.
+        controller; see its class. Each row is computed with the parameters and gains of its time.
+        At an impact or a change of phase, values are those before it.
 
         Args:
             context: The diagram's context.
@@ -149,7 +149,7 @@ class ClosedLoop:
         return replace(record, events=tuple(event for event in events if begin < event.time <= end))
 
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
-        """A record with the derived signals of its controller: `tracking_error` and others.
+        """Adds the derived signals of the controller, such as `tracking_error`, to a record.
 
         Args:
             record: The record.

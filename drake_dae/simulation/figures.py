@@ -1,4 +1,4 @@
-"""The figures of a run as numbers, under names for tables of many runs."""
+"""The figures of a run as numbers, with names for tables of many runs."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,12 +13,12 @@ from drake_dae.simulation.summary import SLACK, Limits
 
 
 def run_figures(record: Record, limits: Limits) -> dict[str, float]:
-    """The figures of a run, by names with units such as "largest error of tool.z [m]".
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
-    For each output the largest |z - r|, the last z - r, and the root mean square of z - r over the
-    second half of the time, the "late" error; for each constraint force its least and
-    largest value, for each control the largest |u|, then the `margins`, the largest constraint
-    residual before a projection, and the time at which the record ends.
+    For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
+    of z - r over the second half of the time. For each constraint force: its least and largest
+    value. For each control: the largest |u|. Then the `margins`, the largest constraint residual
+    before a projection, and the time at which the record ends.
 
     Args:
         record: A record with tracking_error, constraint_force, control, constraint_residual and
@@ -57,10 +57,10 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
-    """The distance of each signal from its limit, in its unit; negative beyond it.
+    """The distance of each signal from its limits, in its unit; negative beyond a limit.
 
-    The limit of a control is on |u|, that of a unilateral force is zero, and positions and
-    velocities have a lower and an upper limit. A start may be on a limit, up to round-off.
+    The limit of a control is on |u|, the lower limit of a unilateral force is 0, and positions and
+    velocities have two limits. An excess by round-off counts as 0, since a start may be on a limit.
     """
     rooms = []
     for index, (signal, largest) in enumerate(
@@ -89,9 +89,9 @@ def exceeded(record: Record, limits: Limits) -> list[str]:
 
 
 def _each(record: Record, name: str, *numbers: FloatArray) -> Iterator[tuple[Any, ...]]:
-    """Each entry of a signal: its name and unit, and its numbers."""
+    """The entries of a signal, each with its name and unit and with some numbers."""
     signals = record.signals[name].signals
-    return zip(signals, *(each.tolist() for each in numbers), strict=True)
+    return zip(signals, *(values.tolist() for values in numbers), strict=True)
 
 
 def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:

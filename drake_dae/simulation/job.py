@@ -1,4 +1,4 @@
-"""Whether a run did what the user wished: outputs at their references, and nothing violated."""
+"""Judges whether a run succeeded: outputs reach their references, and no limit is violated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,14 +14,13 @@ from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 from drake_dae.systems.control.phase_change import PhaseChange
 
 SHARE = 0.01
-"""The tolerance of an output, relative to how far references in its unit move."""
+"""The default tolerance of an output, as a fraction of the range of references in its unit."""
 
 LATE = 0.5
-"""An output must be within its tolerance from this fraction of the run on, or from when it is
-predicted to be, if that is later."""
+"""The fraction of a run from which outputs must be within tolerance, unless predicted later."""
 
 GRACE = 0.1
-"""So much later than predicted, as a fraction of the run, it may be."""
+"""The permitted delay relative to the prediction, as a fraction of the run."""
 
 
 _MOST_FAILURES = 3
@@ -265,7 +264,7 @@ def _qualities(
 
 
 def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
-    """How far the references in the unit of each output move, shape (p,), positive."""
+    """The range of the references in the unit of each output, shape (p,), positive."""
     desired = record["desired_output"]
     sizes = output_sizes(record, predicted)
     ranges = desired.max(axis=0) - desired.min(axis=0)

@@ -18,15 +18,13 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
-_PROJECTED = "before each step's projection"
-
 _ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
 
 WIDTH = 100
 """The width of a paragraph, in characters."""
 
 SLACK = 1e-9
-"""The excess over a joint limit that counts, in its unit: a start may be on it."""
+"""A smaller excess over a joint limit, in its unit, is ignored: a start may be on the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +34,7 @@ class Limits:
     Attributes:
         control: The largest |u|, shape (p,).
         state: The lowest and the highest (q, v), shape (nq + nv,) each.
-        loops: The same of the joints that close loops, (c, c').
+        loops: The same for the joints that close loops, (c, c').
         pushing: Names of the unilateral constraint forces; None if all are unilateral.
     """
 
@@ -77,7 +75,7 @@ def summary(
     reasons: Sequence[str] = (),
     bound: FloatArray | None = None,
 ) -> str:
-    """The figures of a run in plain text, compared with the prediction.
+    """A summary of a run in plain text: its figures, compared with the prediction.
 
     Numbers that are round-off relative to others of the same unit are shown as 0.
 
@@ -86,12 +84,12 @@ def summary(
             constraint_force and control; and "mode" and "gap" with opening contacts.
         predicted: The tracking error by theory, shape (k, p).
         limits: The limits of the robot.
-        run: Its statistics; None for a failed run.
+        run: The statistics of the run; None for a failed run.
         failure: The reason of the failure.
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        accuracy: The accuracy of error control; None with fixed steps.
         reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
-        bound: A bound of what the controller adds to the prediction by design, shape (p,); None if
-            it adds nothing.
+        bound: A bound of the errors that the controller adds to the prediction by design, shape
+            (p,); None if it adds none.
     """
     limits = limits or Limits()
     sections = [
@@ -101,8 +99,9 @@ def summary(
         _controls(record, limits),
     ]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    # Of compliant contact the state is not projected.
-    kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
+    # In compliant contact the state is not projected.
+    is_compliant = "contact_force" in record
+    kind = "in compliant contact" if is_compliant else "before each step's projection"
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += _identified(record)
@@ -237,7 +236,7 @@ def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
 
 
 def shortfalls(record: Record, limits: Limits) -> list[str]:
-    """Violations of limits by a run that tracks well, each in words.
+    """The violations of limits in a run, a phrase each.
 
     Args:
         record: A record with constraint_force and control.

@@ -1,4 +1,4 @@
-"""Signals of a record that are computed from the logged ones."""
+"""The signals of a record that are computed from the logged signals."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -17,7 +17,7 @@ from drake_dae.systems.plants.contract import Plant
 
 
 class RecordedLoop(Protocol):
-    """The parts of a closed loop from which a record is computed; see `ClosedLoop`."""
+    """The parts of a closed loop that `completed` needs; see `ClosedLoop`."""
 
     @property
     def plant(self) -> Plant:
@@ -49,7 +49,7 @@ class RecordedLoop(Protocol):
 
 
 def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
-    """A record with the signals computed from the log of a loop.
+    """Adds the signals that are computed from the log of a loop.
 
     Args:
         logged: The logged signals.

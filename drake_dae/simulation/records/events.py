@@ -1,4 +1,4 @@
-"""Events of opening contacts: on disk, as a table, and in animations."""
+"""The events of opening contacts: on disk, as a table, and in animations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ FLASH = 0.3
 
 
 def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
-    """Events as arrays of plain numbers and text, one row for each event; {} if there are none.
+    """Converts events to arrays of numbers and text, one row per event; {} for no events.
 
     The columns of "events.happened", "events.closed" and "events.impulses" (N s) are the contacts
     "events.contacts"; "events.rest_time" is nan without a value.
@@ -36,7 +36,7 @@ def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
 
 
 def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ...]:
-    """The events of arrays made by `event_arrays`.
+    """Converts arrays of `event_arrays` back to events.
 
     Raises:
         KeyError, ValueError: The arrays are those of something else.
@@ -90,7 +90,7 @@ def impacts(events: Sequence[ContactEvent]) -> list[ContactEvent]:
 
 
 def flashes(events: Sequence[ContactEvent], names: Sequence[str], times: FloatArray) -> FloatArray:
-    """The brightness of each contact's flash: its impulse relative to the largest, fading.
+    """The brightness of each contact's flash, which fades after an impact.
 
     Args:
         events: The events of a run.

@@ -1,4 +1,4 @@
-"""A record as an MCAP log, as Foxglove shows it, and logs of robots in MCAP."""
+"""Records as MCAP logs, which Foxglove shows, and logs of robots in MCAP."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -66,8 +66,8 @@ def write_mcap(
 def read_mcap(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     """Reads what `write_mcap` writes, or the log of a robot in JSON or ROS 2's CDR.
 
-    The rows have the times at which messages of the first topic were logged, from the first one of
-    them after which all topics are known; of others a row has the last message until then.
+    There is a row for each message of the first topic, at the time of its logging, as soon as all
+    topics have a message. From another topic a row has the last message before.
 
     Args:
         path: The file.
@@ -135,7 +135,7 @@ def _table(
 
 
 class _Json:
-    """What mcap calls a decoder factory, for JSON."""
+    """A decoder factory of mcap, for JSON."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         return json.loads if message_encoding == "json" else None
@@ -157,7 +157,7 @@ def _numbers(name: str, content: Any) -> Iterator[tuple[str, float]]:
 
 
 def _units(topic: str, schema: Any) -> dict[str, str]:
-    """The units that `write_mcap` has put into a schema."""
+    """Reads the units that `write_mcap` writes into a schema."""
     if schema.encoding != "jsonschema":
         return {}
     properties = json.loads(schema.data).get("properties", {})

@@ -1,4 +1,4 @@
-"""The versions of what made a record."""
+"""The versions of the software that made a record."""
 
 import platform
 from contextlib import suppress
