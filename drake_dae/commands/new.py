@@ -17,9 +17,8 @@ def run_command(options: argparse.Namespace) -> int:
     robot = Path(options.robot)
     out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
     if out.exists():
-        raise ScenarioError(
-            ("--out", f"'{out}' exists, and is not overwritten; choose another name")
-        )
+        text = f"'{out}' exists, and is not overwritten; choose another name"
+        raise ScenarioError(("--out", text))
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
     with warnings.catch_warnings():
