@@ -216,8 +216,7 @@ def wire_loop(
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
         named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
     if reference is not None:
-        for name, signals in reference.further_signals.items():
-            named[name] = (reference.GetOutputPort(name), signals)
+        named |= _further(reference)
     sources = {"reference": reference, "exogenous": moving}
     by_time = {name for name, block in sources.items() if block is None or block.follows_time}
     loggers = _logged(builder, plant, controller, control, named, by_time)
@@ -337,11 +336,12 @@ def _of_parts(
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     for block in (controller, observer):
         if block is not None:
-            for name, signals in block.further_signals.items():
-                named[name] = (block.GetOutputPort(name), signals)
+            named |= _further(block)
     if sensor is not None:
         port = sensor.GetOutputPort("measured_force")
         named["measured_force"] = (port, dae.constraint_input_signals)
-    for name, signals in plant.further_signals.items():
-        named[name] = (plant.GetOutputPort(name), signals)
-    return named
+    return named | _further(plant)
+
+
+def _further(block: Plant | Controller | Observer | ReferenceGenerator) -> Named:
+    return {name: (block.GetOutputPort(name), s) for name, s in block.further_signals.items()}

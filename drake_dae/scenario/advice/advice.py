@@ -92,8 +92,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if scenario.largest_roughness is not None:
         if not is_advised or scenario.encoders is None or scenario.is_cascade:
             text = (
-                "it limits gains that are computed for rigid joints and the noise of encoders "
-                "in Drake's contact; leave it out, or leave the gains out and give encoders"
+                "it is used only for gains that are computed for rigid joints with encoders in "
+                "Drake's contact; leave it out, or leave `gains` out and give encoders"
             )
             raise ScenarioError(("largest_roughness", text))
         if not scenario.largest_roughness > 0.0:
@@ -106,17 +106,17 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         return Completed(scenario)
     if model.stages:
         text = (
-            "for Drake's own contact no gains are recommended with motors or valves, or with "
-            "the tracking law and springs; give them, with integral and observer, as in the "
-            "scenario wall_flexible_contact, or for springs leave `law` out"
+            "for Drake's own contact no gains are computed if the robot has motors or valves, or "
+            "springs with the tracking law. Give gains, integral and observer, as in the scenario "
+            "wall_flexible_contact. For springs you can leave out `law` instead"
         )
         raise ScenarioError(("gains", text))
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
     if not period:
         text = (
-            "for a continuous compliant plant without `sampling` no gains are recommended; "
-            "give some, or a sampling"
+            "for a continuous compliant plant without `sampling` no gains are computed; give some, "
+            "or a sampling"
         )
         raise ScenarioError(("gains", text))
     late = 0 if sampling is None else sampling.late_samples

@@ -70,10 +70,9 @@ def robot_links(
         if isinstance(joint, QuaternionFloatingJoint):
             name = joint.child_body().name()
             raise ModelError(
-                f"body '{name}' is free; weld it to the world by "
-                f"robot.base, as base: {{weld: {name}}}, or name it in robot.free, which gives it "
-                "a joint in roll, pitch and yaw. A quaternion is not supported: no force keeps its "
-                "length"
+                f"body '{name}' is free, with a quaternion, which is not supported. Weld it to the "
+                f"world by robot.base, as base: {{weld: {name}}}, or name it in robot.free, which "
+                "gives it a joint in roll, pitch and yaw"
             )
     links = MultibodyExpressions(plant)
     _check_mass(plant)

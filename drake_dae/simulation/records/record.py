@@ -63,7 +63,9 @@ class Record:
         }
         if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
             text = ", ".join(f"{name} {size}" for name, size in lengths.items())
-            raise ModelError(f"a record has one sample of each signal at each time, got {text}")
+            raise ModelError(
+                f"all signals of a record must have as many samples as time, got the sizes {text}"
+            )
         if np.any(np.diff(self.time) <= 0.0):
             raise ModelError("the times of a record must be strictly increasing")
         for name, recorded in self.signals.items():
