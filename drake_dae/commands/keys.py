@@ -31,7 +31,7 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _scenario(options: argparse.Namespace) -> str:
-    """The file of the scenario that the options name, or its path.
+    """The text of the scenario that the options name, or its path.
 
     Raises:
         ScenarioError: The file cannot be read.
@@ -59,7 +59,7 @@ def _explained(code: str) -> str:
 
 
 def _cache(is_cleared: bool) -> None:
-    """Shows the machine code in the cache and the compiler, or removes the former."""
+    """Prints the size of the cache of machine code, and the compiler; or empties the cache."""
     files = contents()
     size = sum(path.stat().st_size for path in files if path.is_file())
     what = f"{len(files)} files, {size / 1e6:.1f} MB"

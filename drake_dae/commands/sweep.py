@@ -71,14 +71,15 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         "runs": len(study.results),
         "outcomes": Counter(str(result.outcome) for result in study.results),
         "not_finished": [
-            {"run": one.run, "outcome": str(one.outcome), "reason": one.reason}
-            for one in unfinished
+            {"run": result.run, "outcome": str(result.outcome), "reason": result.reason}
+            for result in unfinished
         ],
         "figures": study.extent(),
         "files": names.split(", "),
     }
-    if again := [str(one.run) for one in unfinished if not one.outcome.is_final]:
-        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
-        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
+    if repeated := [str(result.run) for result in unfinished if not result.outcome.is_final]:
+        count = count_of(len(repeated), "run")
+        text = f"{count} died or took too long; the same command tries again"
+        print(f"error: {text}: {', '.join(repeated[:10])}", file=sys.stderr)
         return 1, report
     return 2 if unfinished and options.check else 0, report

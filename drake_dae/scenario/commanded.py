@@ -1,4 +1,4 @@
-"""A scenario whose references, surfaces and links a person moves while it runs."""
+"""A scenario whose references, surfaces and links a person can move while it runs."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -23,18 +23,18 @@ from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.task.phases.by_hand import ended_by_hand
 
 PUSH = "push."
-"""Begins the names of the wrenches that push links."""
+"""The prefix of the names of wrenches on links."""
 
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """A loop that a person changes while it runs.
+    """A loop that a person can change while it runs.
 
     Attributes:
-        scenario: The scenario, completed, with what was added to it.
-        loop: Its loop.
+        scenario: The completed scenario, with the added parameters and wrenches.
+        loop: Its closed loop.
         context: The context of its diagram at the start.
-        left_out: What cannot be changed in it, a sentence for each.
+        left_out: A sentence for each kind of change that is not possible.
     """
 
     scenario: Scenario
@@ -45,18 +45,18 @@ class Commanded:
 
 @checked(lambda text: ScenarioError(("", text)))
 def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> Commanded:
-    """The loop of a scenario with `CommandedReferences`, surfaces that move, and links to push.
+    """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
 
-    What nobody commands is as in the scenario: surfaces stand still, wrenches and friction are
-    zero. Signals for which a task waits are inputs of the diagram, to be given by hand. Where a
-    part does not fit the scenario, it is left out.
+    Without commands the loop runs as in the scenario: surfaces are fixed, and wrenches and
+    additional friction are zero. Signals for which a task waits are inputs of the diagram. Changes
+    that the scenario does not permit are left out.
 
     Args:
         scenario: What `load_scenario` returns.
-        limits: How fast references follow; `CommandLimits()` if None.
+        limits: How fast references follow commands; `CommandLimits()` if None.
 
     Raises:
-        ScenarioError: The scenario itself does not fit; the message names its key.
+        ScenarioError: The scenario itself is not valid; the message names the key.
     """
     limits, left_out = limits or CommandLimits(), dict[str, str]()
     with suppress(DrakeDaeError):
@@ -99,7 +99,7 @@ def _built(
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Surfaces whose positions are exogenous signals that stand still; or why there are none.
+    """Makes the positions of surfaces constant exogenous signals; or says why it cannot.
 
     Those of a compliant contact are moved as parameters of the plant, which no law knows.
     """
@@ -123,25 +123,23 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
 
 
 def _with_friction(scenario: Scenario) -> Scenario | str:
-    """Surfaces with the parameters of friction, which is zero; or why without."""
-    lacks = any(
-        isinstance(each, PointOnSurface) and each.friction is None for each in scenario.constraints
-    )
-    if not lacks or scenario.plant.material is not None:
-        return scenario  # The plant may have a friction of its own.
+    """Gives frictionless contacts a coefficient of friction of 0; or says why it cannot."""
+    constraints = [
+        replace(constraint, friction=0.0)
+        if isinstance(constraint, PointOnSurface) and constraint.friction is None
+        else constraint
+        for constraint in scenario.constraints
+    ]
+    # The plant may have a friction of its own.
+    if constraints == scenario.constraints or scenario.plant.material is not None:
+        return scenario
     if scenario.actuation:
         return "none, since the law would differentiate it; give the constraint a friction"
-    constraints = [
-        replace(each, friction=0.0)
-        if isinstance(each, PointOnSurface) and each.friction is None
-        else each
-        for each in scenario.constraints
-    ]
     return replace(scenario, constraints=constraints)
 
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
-    """Links with wrenches that are zero; or why there are none."""
+    """Adds a zero wrench to each movable link; or says why it cannot."""
     if scenario.plant.carries:
         return scenario  # Its plant has pushes of its own.
     plant = robot_links(scenario.robot, SceneGraph())[0].plant
@@ -159,7 +157,7 @@ def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
     task = scenario.task
     if task is None:
         return scenario
-    contacts = task.made().contacts
+    contacts = task.make().contacts
     phases = [
         phase
         if phase.signal or contacts[place] != contacts[place + 1]
@@ -176,4 +174,4 @@ _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,
 }
-"""What is added, in this order."""
+"""The additions by name, in this order."""
