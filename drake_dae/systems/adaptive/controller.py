@@ -25,6 +25,7 @@ from drake_dae.systems.blocks.traced import (
     Block,
     Computation,
     Update,
+    zero,
 )
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.control.contract import Controller, Derived
@@ -246,7 +247,7 @@ class AdaptiveController(ParameterizedSystem, Controller):
             Computation.of(law.rates, (*read, *force, *last), ("memory_rate",)),
             Computation(ca.Function("shown", [own], shown), (memory,), tuple(self._parts)),
         ]
-        none = Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",))
+
         updates: tuple[Update, ...] = ()
         if self.sample_period:
             updates = (Update(moved, self.sample_period, 0.0, True),)
@@ -256,7 +257,7 @@ class AdaptiveController(ParameterizedSystem, Controller):
             self,
             tuple(computations),
             updates,
-            unwired={"hold": none},
+            unwired={"hold": zero("hold")},
             model=self.dae,
             signals=self._signals,
             ports={

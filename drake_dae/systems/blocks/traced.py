@@ -55,6 +55,11 @@ class Computation:
         return cls(traced.function, sources, outputs, traced)
 
 
+def zero(name: str) -> Computation:
+    """A value of 0, shape (1,), for an input port without a wire."""
+    return Computation(ca.Function("zero", [], [ca.SX.zeros(1)]), (), (name,))
+
+
 @dataclass(frozen=True, eq=False)
 class Update:
     """What a block does with its discrete state at t_k = offset + k period.

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket
@@ -15,7 +14,7 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import PARAMETERS, Computation
+from drake_dae.systems.blocks.traced import PARAMETERS, Computation, zero
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
 
@@ -166,5 +165,4 @@ class ObservingSystem(ParameterizedSystem):
     def _unwired(self, state: str) -> dict[str, Computation]:
         """What stands at inputs without a wire, by the name of the state among the sources."""
         moving = Computation.of(self.observation.moving, (state, PARAMETERS), ("reference",))
-        none = ca.Function("none", [], [ca.SX.zeros(1)])
-        return {"hold": Computation(none, (), ("hold",)), "reference": moving}
+        return {"hold": zero("hold"), "reference": moving}
