@@ -131,11 +131,11 @@ class Plant(System):
 
     def friction(self, context: Context) -> dict[str, float]:
         """Name of a constraint -> its coefficient of friction, of those that have one."""
-        values, found = self.parameters(context), dict[str, float]()
+        values, coefficients = self.parameters(context), dict[str, float]()
         for constraint in self.model.constraints if self.model is not None else ():
             if (name := constraint.friction_parameter) is not None:
-                found[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
-        return found
+                coefficients[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
+        return coefficients
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         """The parameters at the times of a run, in s, one row for each."""
@@ -189,6 +189,16 @@ class Plant(System):
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function, for a plant that takes a law as a value."""
         raise ModelError(f"{self.dae.name}: no law can be fed back to a {type(self).__name__}")
+
+    @property
+    def port_signals(self) -> dict[str, tuple[Signal, ...]]:
+        """Name of an output port of rule 1 -> names and units of its entries."""
+        return {
+            "state": tuple(self.dae.state_signals),
+            "constraint_force": tuple(self.dae.force_signals),
+            "constraint_residual": tuple(self.structure.manifold.residual_signals),
+            "controlled_output": tuple(self.dae.output_signals),
+        }
 
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Adds the plant's own part of the Meshcat view, with its wires.

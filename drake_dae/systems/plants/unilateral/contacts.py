@@ -132,10 +132,8 @@ class UnilateralContacts:
             constraint, part = parts[name]
             normal = part.start + constraint.is_unilateral.index(True)
             self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
-        own = {int(row) for touch in self.touches for row in touch.rows}
-        self.kept: Indices = np.array(
-            [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
-        )
+        opening = np.concatenate([touch.rows for touch in self.touches])
+        self.kept: Indices = np.setdiff1d(np.arange(model.dae.num_constraints), opening)
         self.normals = [touch.normal for touch in self.touches]
         self.restitution = np.array(
             [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]
@@ -155,8 +153,9 @@ class UnilateralContacts:
         ]
         self.residual = ca.vertcat(ca.SX(0, 1), *holds)
         self.sizes = [held.numel() for held in holds]
-        found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
-        self.gaps = dae.trace("gaps", found)
+        self.gaps = dae.trace(
+            "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
+        )
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
         sliding = self._sliding(model, parts)
@@ -242,17 +241,17 @@ class UnilateralContacts:
         )
 
     def painleve_error(
-        self, time: float, state: FloatArray, names: Sequence[str], found: PainleveOutcome | None
+        self, time: float, state: FloatArray, names: Sequence[str], outcome: PainleveOutcome | None
     ) -> PainleveError:
         """The error of a Painleve paradox."""
-        outcome = f". Its outcome is {found.value}" if found else ""
+        remark = f". Its outcome is {outcome.value}" if outcome else ""
         return PainleveError(
             f"{self.dae.name}: Painleve paradox at the contact of {', '.join(names)} at "
-            f"t = {time:.6g} s, state {show(state)}{outcome}. Lower the friction, slide the other "
+            f"t = {time:.6g} s, state {show(state)}{remark}. Lower the friction, slide the other "
             "way, or hold the robot less steeply to the surface",
             time,
             state,
-            found,
+            outcome,
         )
 
 

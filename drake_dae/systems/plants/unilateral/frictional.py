@@ -71,9 +71,9 @@ def impact(
     Returns:
         The impulses; None if none are found.
     """
-    found = _impulses(matrix, before, kept, contacts)
-    if found is not None and _gained(matrix, before, found) <= 0.0:
-        return found
+    impulses = _impulses(matrix, before, kept, contacts)
+    if impulses is not None and _gained(matrix, before, impulses) <= 0.0:
+        return impulses
     least, most = 0.0, 1.0
     best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
     for _ in range(HALVINGS if best is not None else 0):
@@ -87,7 +87,7 @@ def impact(
 
 
 def _bouncing(contacts: Sequence[FrictionalContact], factor: float) -> list[FrictionalContact]:
-    return [replace(one, restitution=factor * one.restitution) for one in contacts]
+    return [replace(contact, restitution=factor * contact.restitution) for contact in contacts]
 
 
 def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> float:
@@ -106,31 +106,31 @@ def _impulses(
     b = before - matrix[:, kept] @ inverse @ before[kept]
     wanted = b.copy()
     blocks = []
-    for one in contacts:
-        wanted[one.normal] += one.restitution * before[one.normal]
-        blocks.append(_axes(A, one))
+    for contact in contacts:
+        wanted[contact.normal] += contact.restitution * before[contact.normal]
+        blocks.append(_axes(A, contact))
     make = np.hstack(blocks)
     W, q = make.T @ A @ make, make.T @ wanted
     ends = np.cumsum([axes.shape[1] for axes in blocks]).tolist()
     cones = [
-        Cone(slice(end - axes.shape[1], end), one.friction)
-        for axes, end, one in zip(blocks, ends, contacts, strict=True)
+        Cone(slice(end - axes.shape[1], end), contact.friction)
+        for axes, end, contact in zip(blocks, ends, contacts, strict=True)
     ]
-    found = in_cones(W, q, cones) if len(cones) > 1 else _of_one(W, q, cones[0].friction)
-    if found is None:
+    solution = in_cones(W, q, cones) if len(cones) > 1 else _of_one(W, q, cones[0].friction)
+    if solution is None:
         return None
-    total = make @ found
+    total = make @ solution
     total[kept] = -inverse @ (before[kept] + matrix[kept] @ total)
     return total
 
 
-def _axes(matrix: FloatArray, one: FrictionalContact) -> FloatArray:
+def _axes(matrix: FloatArray, contact: FrictionalContact) -> FloatArray:
     """The normal and the sliding directions, as columns."""
-    rows = one.along if one.friction else one.along[:0]
+    rows = contact.along if contact.friction else contact.along[:0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
     moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
     axes = np.zeros((matrix.shape[0], 1 + moved.shape[1]))
-    axes[one.normal, 0] = 1.0
+    axes[contact.normal, 0] = 1.0
     axes[rows, 1:] = moved
     return axes
 
@@ -169,13 +169,13 @@ def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
     is_moved = values > NOTHING * values[-1]
     moved, idle = vectors[:, is_moved], vectors[:, ~is_moved]
     if not idle.size:
-        found = np.linalg.solve(matrix, -wanted)
+        impulses = np.linalg.solve(matrix, -wanted)
     else:
-        found = -moved @ ((moved.T @ wanted) / values[is_moved])
+        impulses = -moved @ ((moved.T @ wanted) / values[is_moved])
         if np.abs(idle.T @ wanted).max() > FITS * np.abs(wanted).max():
             return None
-        found += idle @ np.linalg.lstsq(idle[1:], -found[1:])[0]
-    return np.asarray(found) if found[0] > 0.0 else None
+        impulses += idle @ np.linalg.lstsq(idle[1:], -impulses[1:])[0]
+    return np.asarray(impulses) if impulses[0] > 0.0 else None
 
 
 def _slid(
@@ -193,8 +193,8 @@ def _slid(
 def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
     """The directions in a plane for which the contact slides along them after the impact.
 
-    Of c+ along the surface, times the mobility across it, what is across a direction of angle a is
-    a trigonometric polynomial of degree two: sum c_k z^k, |k| <= 2, whose zeros are of length one.
+    The component of c+ across the direction of angle a, times the mobility, is a trigonometric
+    polynomial of degree two in a: sum c_k z^k, |k| <= 2, z = exp(i a), whose zeros have |z| = 1.
     """
     angles = 2.0 * np.pi * np.arange(5) / 5.0
     ways = np.array([np.cos(angles), np.sin(angles)])
@@ -204,12 +204,12 @@ def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray
     size = np.abs(factors).sum()
     factors[np.abs(factors) < NOTHING * size] = 0.0
     roots = np.roots(factors)
-    found = np.angle(roots[np.abs(np.abs(roots) - 1.0) < NEAR])
+    angle = np.angle(roots[np.abs(np.abs(roots) - 1.0) < NEAR])
     orders = 1j * np.arange(2, -3, -1)
     for _ in range(POLISHED):
-        waves = np.exp(np.outer(found, orders))
+        waves = np.exp(np.outer(angle, orders))
         slopes = (waves @ (orders * factors)).real
         steep = np.abs(slopes) > NOTHING * size
-        found[steep] -= (waves @ factors).real[steep] / slopes[steep]
-    found = found[np.abs((np.exp(np.outer(found, orders)) @ factors).real) < FITS * size]
-    return np.array([np.cos(found), np.sin(found)])
+        angle[steep] -= (waves @ factors).real[steep] / slopes[steep]
+    angle = angle[np.abs((np.exp(np.outer(angle, orders)) @ factors).real) < FITS * size]
+    return np.array([np.cos(angle), np.sin(angle)])

@@ -114,19 +114,19 @@ def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[TouchRows]) -> 
     """
     first = [*kept, *(touch.normal for touch in pushing)]
     others = [row for touch in pushing for row in touch.rows if row != touch.normal]
-    found: list[int] = []
+    independent: list[int] = []
     for row in (*first, *others):
-        trial = [*found, row]
+        trial = [*independent, row]
         part = matrix[np.ix_(trial, trial)]
         length = np.sqrt(np.abs(np.diag(part)))
         if length[-1] > 0.0:
             scaled = part / length / length[:, None]
             if np.linalg.svd(scaled, compute_uv=False)[-1] >= DEPENDENT:
-                found = trial
+                independent = trial
                 continue
         if row in first:
             return None
-    return np.array(found, dtype=int)
+    return np.array(independent, dtype=int)
 
 
 def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray:
