@@ -32,6 +32,9 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
 
+NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"
+"""The reason why a sampled block does not convert to AutoDiffXd."""
+
 
 @checked(ModelError)
 class DifferentiableSystem(LeafSystem):
