@@ -153,8 +153,8 @@ class EstimatorFunctions(Observed):
             by_model = self._forces(middle, r, mu, acted)
             corrected, valid = ca.substitute([corrected, valid], [v], [by_model])
             ends = [0, 2 * count, 3 * count, corrected.numel()]
-            new_force = self._forces(*ca.vertsplit(corrected, ends), acted)
-            corrected = ca.vertcat(corrected, new_force)
+            state, new_r, new_mu = ca.vertsplit(corrected, ends)
+            corrected = ca.vertcat(corrected, self._forces(state, new_r, new_mu, acted))
             first = ca.vertcat(first, ca.SX.zeros(v.numel()))  # No control has acted yet.
         sample = ca.floor(time / period + _SAME)
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))

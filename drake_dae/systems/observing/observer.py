@@ -117,11 +117,9 @@ class DisturbanceObserver(ObservingSystem):
 
     def _exogenous_values(self, context: Context) -> FloatArray:
         x, force = self._inputs(context, "estimated_state", "measured_force")
-        held, reference = (
-            context.get_discrete_state(self._held).value(),
-            self._reference(context, x),
-        )
-        return self._checked(self._functions.exogenous, context, x, held, force, reference)[0]
+        held = context.get_discrete_state(self._held).value()
+        inputs = x, held, force, self._reference(context, x)
+        return self._checked(self._functions.exogenous, context, *inputs)[0]
 
     def _part(self, part: slice, context: Context) -> FloatArray:
         return context.get_discrete_state(self._held).value()[part]
