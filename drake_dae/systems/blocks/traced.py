@@ -55,9 +55,9 @@ class Computation:
         return cls(traced.function, sources, outputs, traced)
 
 
-def zero(name: str) -> Computation:
-    """A value of 0, shape (1,), for an input port without a wire."""
-    return Computation(ca.Function("zero", [], [ca.SX.zeros(1)]), (), (name,))
+def zero(name: str, size: int = 1) -> Computation:
+    """Zeros for an input port without a wire, shape (size,)."""
+    return Computation(ca.Function("zero", [], [ca.SX.zeros(size)]), (), (name,))
 
 
 @dataclass(frozen=True, eq=False)

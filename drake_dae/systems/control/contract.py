@@ -187,25 +187,32 @@ class Controller(System):
         return ()
 
 
-def check_law(own: DaeSystem, law: TrackingLaw) -> None:
+def output_errors(law: TrackingLaw, values: Mapping[str, FloatArray]) -> Derived:
+    """`desired_output` r and `tracking_error` z - r (29), from "reference" and z of a record."""
+    desired, signals = values["reference"][:, law.layout.lowest], law.system.output_signals
+    error = values["controlled_output"] - desired
+    return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
+
+
+def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
     """Refuses a law for a system of another size than the plant's.
 
     Args:
-        own: The plant's system.
+        dae: The plant's system.
         law: The law.
 
     Raises:
         WiringError: The sizes differ.
     """
     remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
-    check_same_sizes(own, law.system, "law", f"{remedy} a model of the same structure")
+    check_same_sizes(dae, law.system, "law", f"{remedy} a model of the same structure")
 
 
-def check_same_sizes(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
+def check_same_sizes(dae: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
     """Refuses a law or model for a system of another size than the plant's.
 
     Args:
-        own: The plant's system.
+        dae: The plant's system.
         other: The system that it is for.
         what: The name of the wired part.
         remedy: The remedy.
@@ -213,10 +220,10 @@ def check_same_sizes(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -
     Raises:
         WiringError: The sizes differ.
     """
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
+    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (dae, other)]
     if sizes[0] != sizes[1]:
         has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
         raise WiringError(
-            f"the {what} is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. "
+            f"the {what} is for '{other.name}' with {takes}, the plant '{dae.name}' has {has}. "
             f"Make {remedy}"
         )
