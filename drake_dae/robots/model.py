@@ -243,15 +243,15 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        found, left = self._placing.solve(wanted, q, values)
-        size = float(np.max(np.abs(left), initial=0.0))
+        solution, residual = self._placing.solve(wanted, q, values)
+        size = float(np.max(np.abs(residual), initial=0.0))
         if size < 1e-10:
-            return found
+            return solution
         raise InconsistentStateError(
             f"{self.name}: no configuration near the guess satisfies the constraints with "
             f"outputs {show(wanted)}; {size:.2g} is left. They may be out "
             "of reach",
-            left,
+            residual,
         )
 
     def rest_state(

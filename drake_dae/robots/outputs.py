@@ -148,8 +148,8 @@ class TiltFromNormal(PositionOutput):
             check_axes("components", self.components)
         if self.axis in self.components:
             raise ModelError(
-                f"components must be of {' and '.join(others)}, which are across the axis "
-                f"{self.axis}, got '{self.components}'"
+                f"components must be of {' and '.join(others)}, the axes normal to {self.axis}, "
+                f"got '{self.components}'"
             )
         object.__setattr__(self, "components", self.components or others)
 
@@ -157,8 +157,8 @@ class TiltFromNormal(PositionOutput):
         touch = self.contact.touch(links)
         if touch is None:
             raise ModelError(
-                f"constraint '{self.contact.name}' has no normal, as what touches a surface does; "
-                "use AxisCoordinates"
+                f"constraint '{self.contact.name}' is not a contact with a surface and has no "
+                "normal; use AxisCoordinates"
             )
         normal = ca.mtimes(links.rotation(touch.frame).T, touch.normal)
         return normal[["xyz".index(a) for a in self.components]]

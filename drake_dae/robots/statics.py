@@ -47,8 +47,8 @@ class StaticPlacement:
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
 
-        found, _ = newton(guess, linearize)
-        return found, residual(found)
+        q, _ = newton(guess, linearize)
+        return q, residual(q)
 
 
 class StaticBalance:

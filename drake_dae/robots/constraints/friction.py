@@ -57,11 +57,11 @@ def friction_parameters(
     tolerance = Parameter(
         f"{name}.stiction_tolerance", np.array([stiction_tolerance]), "m/s", positive=True
     )
-    found = []
+    parameters = []
     if friction is not None:
         coefficient = Parameter(f"{name}.friction", np.array([friction]), nonnegative=True)
-        found += [coefficient, tolerance]
+        parameters += [coefficient, tolerance]
     if viscous_friction is not None:
         value = np.array([viscous_friction])
-        found.append(Parameter(f"{name}.viscous_friction", value, "N s/m", nonnegative=True))
-    return found
+        parameters.append(Parameter(f"{name}.viscous_friction", value, "N s/m", nonnegative=True))
+    return parameters

@@ -119,11 +119,11 @@ class HeightMap(_Map):
         if self.heights is not None:
             rows = tuple(map(tuple, height_table("heights", self.heights).tolist()))
             object.__setattr__(self, "heights", rows)
-            found = _table_relief(rows, self.size, self.scale, self.resolution)
+            relief = _table_relief(rows, self.size, self.scale, self.resolution)
         else:
             source = _stamp(Path(str(self.file)))
-            found = _file_relief(source, self.size, self.scale, self.resolution)
-        object.__setattr__(self, "relief", found)
+            relief = _file_relief(source, self.size, self.scale, self.resolution)
+        object.__setattr__(self, "relief", relief)
 
     @property
     def remark(self) -> str:
@@ -166,8 +166,8 @@ class MeshSurface(_Map):
         _check(self)
         source = _stamp(Path(self.file))
         rectangle = self.middle, self.size
-        found = _mesh_relief(source, self.normal, rectangle, self.scale, self.resolution)
-        object.__setattr__(self, "relief", found)
+        relief = _mesh_relief(source, self.normal, rectangle, self.scale, self.resolution)
+        object.__setattr__(self, "relief", relief)
 
     @property
     def remark(self) -> str:
@@ -197,10 +197,10 @@ _Source = tuple[str, int, int]
 
 def _stamp(file: Path) -> _Source:
     try:
-        found = file.stat()
+        status = file.stat()
     except (OSError, ValueError):  # A null byte.
         raise ModelError(f"no file '{file}'") from None
-    return str(file), found.st_mtime_ns, found.st_size
+    return str(file), status.st_mtime_ns, status.st_size
 
 
 @lru_cache(maxsize=16)

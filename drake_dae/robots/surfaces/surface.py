@@ -142,9 +142,9 @@ class Surface(ABC):
             return shortest_steps(gradient[None], lambda x: function(x)[0])
 
         def foot(point: FloatArray) -> FloatArray:
-            found, solved = newton(point, linearize)
-            near = solved and np.linalg.norm(found - point) <= size
-            return found if near else np.full(3, np.nan)
+            nearest, solved = newton(point, linearize)
+            near = solved and np.linalg.norm(nearest - point) <= size
+            return nearest if near else np.full(3, np.nan)
 
         middle = foot(center)
         if not np.all(np.isfinite(middle)):
