@@ -109,8 +109,8 @@ class RobotModel:
         compiled: Compiled = "auto",
     ) -> None:
         self.links = links
-        every = (*constraints, *plant_constraints(links))
-        self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
+        all_constraints = (*constraints, *plant_constraints(links))
+        self.constraints = tuple(constraint.moving(exogenous) for constraint in all_constraints)
         self.outputs = tuple(outputs)
         self.name = name
         self.known_forces = tuple(known_forces)
@@ -316,8 +316,8 @@ class RobotModel:
                     "velocities"
                 )
 
-    def _nominal(self, given: ArrayLike | None) -> FloatArray:
-        nominal = self.links.default_positions if given is None else given
+    def _nominal(self, positions: ArrayLike | None) -> FloatArray:
+        nominal = self.links.default_positions if positions is None else positions
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:

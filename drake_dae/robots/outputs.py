@@ -81,9 +81,7 @@ class AxisCoordinates(PositionOutput):
 
     def __post_init__(self) -> None:
         check_axes("components", self.components)
-        if len(self.axis) != 1:
-            raise ModelError(f"axis must be one of x, y, z, got '{self.axis}'")
-        check_axes("axis", self.axis)
+        _check_axis(self.axis)
 
     def expression(self, links: Links) -> ca.SX:
         column = links.rotation(self.frame)[:, "xyz".index(self.axis)]
@@ -140,9 +138,7 @@ class TiltFromNormal(PositionOutput):
     components: str = ""
 
     def __post_init__(self) -> None:
-        if len(self.axis) != 1:
-            raise ModelError(f"axis must be one of x, y, z, got '{self.axis}'")
-        check_axes("axis", self.axis)
+        _check_axis(self.axis)
         others = "xyz".replace(self.axis, "")
         if self.components:
             check_axes("components", self.components)
@@ -213,3 +209,9 @@ class ExpressionOutput(PositionOutput):
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
         return tuple(self.outputs)
+
+
+def _check_axis(axis: str) -> None:
+    if len(axis) != 1:
+        raise ModelError(f"axis must be one of x, y, z, got '{axis}'")
+    check_axes("axis", axis)

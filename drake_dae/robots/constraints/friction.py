@@ -30,13 +30,13 @@ class Friction:
             parameters: Its parameters.
             sliding: v_t, the velocity of the point along the surface, m/s, shape (3, 1).
         """
-        known = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
+        symbols = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
         pull, drag = ca.SX(3, 1), None
-        if "friction" in known:
-            speed = ca.sqrt(ca.sumsqr(sliding) + known["stiction_tolerance"] ** 2)
-            pull = -known["friction"] * sliding / speed
-        if "viscous_friction" in known:
-            drag = -known["viscous_friction"] * sliding
+        if "friction" in symbols:
+            speed = ca.sqrt(ca.sumsqr(sliding) + symbols["stiction_tolerance"] ** 2)
+            pull = -symbols["friction"] * sliding / speed
+        if "viscous_friction" in symbols:
+            drag = -symbols["viscous_friction"] * sliding
         return cls(pull, drag)
 
 

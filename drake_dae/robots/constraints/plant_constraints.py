@@ -94,9 +94,9 @@ def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
 
 
 def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:
-    every = plant.GetDefaultDistanceConstraintParams()
-    for number, key in enumerate(sorted(every, key=lambda key: key.get_value())):
-        rod = every[key]
+    rods = plant.GetDefaultDistanceConstraintParams()
+    for number, key in enumerate(sorted(rods, key=lambda key: key.get_value())):
+        rod = rods[key]
         bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
         start, end = (frame_name(plant, body.body_frame()) for body in bodies)
         if np.isfinite(rod.stiffness()):

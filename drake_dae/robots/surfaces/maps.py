@@ -233,10 +233,10 @@ def _mesh_relief(
     vertices, triangles = read_mesh(Path(source[0]))
     axes = np.column_stack([*tangents(normal), np.array(normal)])
     _check_lengths("vertices", scale * vertices)
-    seen = scale * vertices @ axes
+    vertices_along = scale * vertices @ axes
     if np.linalg.det(axes) < 0.0:
         triangles = triangles[:, ::-1]  # A reflection would show the back sides.
-    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    low, high = vertices_along[:, :2].min(axis=0), vertices_along[:, :2].max(axis=0)
     middle = (low + high) / 2 if rectangle[0] is None else np.array(rectangle[0])
     size = high - low if rectangle[1] is None else np.array(rectangle[1])
     if not np.all(size > 0.0):
@@ -246,7 +246,7 @@ def _mesh_relief(
         _along(center, length, 2 * max(ceil(length / resolution), 4) + 1)
         for center, length in zip(middle, size, strict=True)
     )
-    return fit_relief(x, y, heights_of_mesh(seen, triangles, x, y), resolution)
+    return fit_relief(x, y, heights_of_mesh(vertices_along, triangles, x, y), resolution)
 
 
 def _check_lengths(what: str, lengths: FloatArray) -> None:

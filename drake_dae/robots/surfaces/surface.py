@@ -167,12 +167,12 @@ def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Paramet
         name: The name of the constraint that has the parameters.
         surface: The surface.
     """
-    made = tuple(
+    parameters = tuple(
         Parameter(f"{name}.{key}", np.array([value])) for key, value in surface.shape.items()
     )
-    if not made:
+    if not parameters:
         return surface, ()
-    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in made))), made
+    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in parameters))), parameters
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:

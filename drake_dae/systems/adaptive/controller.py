@@ -203,10 +203,10 @@ class AdaptiveController(ParameterizedSystem, Controller):
             return context.get_discrete_state(0).CopyToVector()
         return context.get_continuous_state_vector().CopyToVector()
 
-    def _calc(self, place: int, context: Context, output: BasicVector) -> None:
-        given = [read(context) for read in self._read]
-        found = self._checked(self.adaptive.function, context, *given, self._memory(context))
-        output.SetFromVector(found[place])
+    def _calc(self, index: int, context: Context, output: BasicVector) -> None:
+        inputs = [read(context) for read in self._read]
+        values = self._checked(self.adaptive.function, context, *inputs, self._memory(context))
+        output.SetFromVector(values[index])
 
     def _copy(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._memory(context)[part])

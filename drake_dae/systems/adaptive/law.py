@@ -119,11 +119,11 @@ class AdaptiveLaw:
                 f"degree 0, got {self.structure.output_degrees}"
             )
         self.entries, self.signals = balance.entries, balance.signals
-        wanted = model.dae.output_signals[count:]
+        force_outputs = model.dae.output_signals[count:]
         self.force_signals: tuple[Signal, ...] = ()
         if self.force_rate:
             self.force_signals = tuple(
-                Signal(f"integral of {signal.name}", f"{signal.unit} s") for signal in wanted
+                Signal(f"integral of {signal.name}", f"{signal.unit} s") for signal in force_outputs
             )
         sizes = [
             balance.parameters[name].value.size * [positive(f"adapted['{name}']", gain)]
@@ -145,8 +145,8 @@ class AdaptiveLaw:
 
     def memory(self, theta: ArrayLike) -> FloatArray:
         """(theta^, zeta) of given estimates, shape (k,), without integrals of the force."""
-        given = vector("theta", theta, len(self.signals))
-        return np.concatenate([given, np.zeros(len(self.force_signals))])
+        estimates = vector("theta", theta, len(self.signals))
+        return np.concatenate([estimates, np.zeros(len(self.force_signals))])
 
     def _trace(self) -> None:
         dae, balance, layout = self.model.dae, self._balance, self.layout
@@ -158,27 +158,27 @@ class AdaptiveLaw:
 
         # The wanted motion in the tangent space.
         lowest = layout.lowest.tolist()
-        wanted, pushed = reference[lowest[:n], :], reference[lowest[n:], :]
+        desired, desired_force = reference[lowest[:n], :], reference[lowest[n:], :]
         speed = reference[[i + 1 for i in lowest[:n]], :]
         acceleration = reference[[i + 2 for i in lowest[:n]], :]
-        error, moves = balance.positions - wanted, ca.jtimes(balance.positions, q, v)
+        error, moves = balance.positions - desired, ca.jtimes(balance.positions, q, v)
         tangent = Factorization(balance.rows)
         still = ca.SX.zeros(balance.num_forces)
-        wished = tangent.solve(ca.vertcat(speed - self.rate * error, still))
-        held = ca.SX.sym("held", wished.numel())
-        turned = ca.jtimes(ca.mtimes(balance.rows, held), q, v)
-        turned = ca.substitute(turned, held, wished)
+        tangent_velocity = tangent.solve(ca.vertcat(speed - self.rate * error, still))
+        symbols = ca.SX.sym("held", tangent_velocity.numel())
+        turned = ca.jtimes(ca.mtimes(balance.rows, symbols), q, v)
+        turned = ca.substitute(turned, symbols, tangent_velocity)
         rises = ca.vertcat(acceleration - self.rate * (moves - speed), still)
-        wished_rate = tangent.solve(rises - turned)
-        sliding = v - wished
+        tangent_acceleration = tangent.solve(rises - turned)
+        sliding = v - tangent_velocity
 
         # The law.
         shares = Factorization(balance.shares)
         pivot = ca.fmin(tangent.pivot, shares.pivot)
-        force, regressor = pushed, balance.regressor(wished_rate, sliding, estimate)
+        force, regressor = desired_force, balance.regressor(tangent_acceleration, sliding, estimate)
         if self.force_rate:
-            force = pushed - self.force_rate * integral
-        effort = balance.needed(wished_rate, sliding, estimate)
+            force = desired_force - self.force_rate * integral
+        effort = balance.needed(tangent_acceleration, sliding, estimate)
         effort -= self.damping * ca.mtimes(balance.mass, sliding)
         if balance.num_forces:
             effort -= ca.mtimes(balance.jacobian.T, shares.solve(force))
@@ -187,7 +187,7 @@ class AdaptiveLaw:
         gamma = ca.DM(self.gamma)
         rate = -gamma * ca.mtimes(regressor.T, sliding)
         if self.force_rate:
-            rate = ca.vertcat(rate, ca.mtimes(balance.shares, measured) - pushed)
+            rate = ca.vertcat(rate, ca.mtimes(balance.shares, measured) - desired_force)
 
         theta = ca.SX.sym("theta", len(self.signals))
         real = ca.substitute(balance.mass, balance.theta, theta)
@@ -197,9 +197,9 @@ class AdaptiveLaw:
         )
         lost = -self.damping * ca.bilin(balance.mass, sliding, sliding)  # V'
 
-        known = {"state": dae.state, "reference": reference}
-        given = {"measured_force": measured} if self.force_rate else {}
-        last = {"memory": memory, "parameters": dae.parameter_symbol}
+        inputs = {"state": dae.state, "reference": reference}
+        force_inputs = {"measured_force": measured} if self.force_rate else {}
+        memory_inputs = {"memory": memory, "parameters": dae.parameter_symbol}
         outputs = {
             "control": control,
             "tracking_error": ca.vertcat(error, still),
@@ -208,7 +208,7 @@ class AdaptiveLaw:
         regular = "the outputs' rates and J, or S, of the adaptive law"
         self.function = TracedFunction(
             f"{dae.name} adaptive law",
-            {**known, **last},
+            {**inputs, **memory_inputs},
             outputs,
             pivot,
             regular,
@@ -216,7 +216,7 @@ class AdaptiveLaw:
         )
         self.rates = TracedFunction(
             f"{dae.name} adaptation",
-            {**known, **given, **last},
+            {**inputs, **force_inputs, **memory_inputs},
             {"memory_rate": rate},
             pivot,
             regular,
@@ -224,7 +224,7 @@ class AdaptiveLaw:
         )
         self.energy = TracedFunction(
             f"{dae.name} energy of the adaptive law",
-            {**known, **last, "theta": theta},
+            {**inputs, **memory_inputs, "theta": theta},
             {"value": energy, "rate": lost, "regressor": regressor},
             pivot,
             regular,

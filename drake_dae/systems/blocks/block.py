@@ -1,6 +1,6 @@
 """Base classes of LeafSystems: parameters, checked functions, and conversion to AutoDiffXd."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar
 
@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
     LeafSystem_,
     OutputPort,
     PortDataType,
+    System,
     SystemScalarConverter,
 )
 
@@ -31,6 +32,11 @@ from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
+
+Alternative = Callable[
+    [TracedFunction, FloatArray, Sequence[FloatArray], FloatArray], tuple[FloatArray, ...] | None
+]
+"""A function of a traced function, its state, its inputs and its parameters."""
 
 NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"
 """The reason why a sampled block does not convert to AutoDiffXd."""
@@ -92,13 +98,7 @@ class DifferentiableSystem(LeafSystem):
         Raises:
             ModelError: It belongs to another system.
         """
-        try:
-            self.ValidateContext(context)
-        except RuntimeError:
-            raise ModelError(
-                f"the context is not that of '{self.get_name()}'; of a diagram's context take "
-                "system.GetMyMutableContextFromRoot(context)"
-            ) from None
+        check_context(self, context)
 
     def ToAutoDiffXd(self) -> LeafSystem_[AutoDiffXd]:
         """The converted system. Drake's own method would wrap it and rename its ports.
@@ -130,6 +130,8 @@ class ParameterizedSystem(DifferentiableSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    _otherwise: Alternative | None = None
+    """Other values of a function whose own are not valid; they may be None, too."""
 
     def __init__(
         self,
@@ -189,23 +191,14 @@ class ParameterizedSystem(DifferentiableSystem):
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
-        alternative = self._otherwise(function, state, inputs, parameters)
-        if alternative is not None:
-            return alternative
+        if self._otherwise is not None:
+            alternative = self._otherwise(function, state, inputs, parameters)
+            if alternative is not None:
+                return alternative
         time, state = context.get_time(), state.copy()
         error = simulation_error(function.failure(), time, state, self._signals)
         self._steps.tolerate(context, self._explained(error, parameters, *inputs))
         return function.nowhere()
-
-    def _otherwise(
-        self,
-        function: TracedFunction,
-        state: FloatArray,
-        inputs: Sequence[FloatArray],
-        parameters: FloatArray,
-    ) -> tuple[FloatArray, ...] | None:
-        """Other values of a function whose own are not valid; None if there are none."""
-        return None
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
@@ -270,6 +263,21 @@ class ParameterizedSystem(DifferentiableSystem):
             if parameter.name == name:
                 parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
+def check_context(system: System, context: Context) -> None:
+    """Refuses the context of another system.
+
+    Raises:
+        ModelError: It belongs to another system.
+    """
+    try:
+        system.ValidateContext(context)
+    except RuntimeError:
+        raise ModelError(
+            f"the context is not that of '{system.get_name()}'; of a diagram's context take "
+            "system.GetMyMutableContextFromRoot(context)"
+        ) from None
 
 
 def _shown(port: InputPort | OutputPort) -> str:

@@ -124,13 +124,13 @@ class CommandFilter:
         base = ca.SX.sym("base", DerivativeLayout(tuple(degrees)).reference_size)
         rows, first = [ca.SX(0, 1)], 0
         for change, degree in zip(changes, degrees, strict=True):
-            own = base[first : first + degree + 1]  # r and its derivatives by s
-            value, path_rate = own[0], along(s)
+            by_path = base[first : first + degree + 1]  # r and its derivatives by s
+            value, path_rate = by_path[0], along(s)
             for order in range(degree + 1):
                 rows.append(value + change)
                 if order < degree:
                     # r(s(t)): the chain rule, where each derivative by s leads to the next one.
-                    by_s = ca.jtimes(value, own[:-1, :], own[1:, :])
+                    by_s = ca.jtimes(value, by_path[:-1, :], by_path[1:, :])
                     value, change = by_s * path_rate + along(value), along(change)
             first += degree + 1
         self.rate = TracedFunction(

@@ -81,7 +81,7 @@ class TrackingController(ParameterizedSystem, Controller):
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
-        ModelError: The law cannot be fed back, or a limit or period makes no sense.
+        ModelError: The law cannot be fed back, or a limit or period is not valid.
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """

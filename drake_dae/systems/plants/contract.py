@@ -16,6 +16,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.block import check_context
 from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.trace.functions import TracedFunction
 
@@ -156,6 +157,7 @@ class Plant(System):
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
+        check_context(self, context)
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -164,8 +166,9 @@ class Plant(System):
         A run is refused from a state that is not on N*.
 
         Raises:
-            ModelError: The shape is wrong.
+            ModelError: The shape is wrong, or the context is that of another system.
         """
+        check_context(self, context)
         context.SetContinuousState(self.dae.state_vector(state))
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:

@@ -1,6 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -139,7 +139,7 @@ class DaePlant(ParameterizedSystem, Plant):
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
         self._crossing = Crossing(structure)
-        doubt = self._crossing.doubt
+        self._otherwise, doubt = self._crossing.values, self._crossing.doubt
         self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
         self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0, doubt)
         needs_control = elimination.n_star.nnz() > 0
@@ -193,20 +193,6 @@ class DaePlant(ParameterizedSystem, Plant):
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function; see `feedback.motion_under`."""
         return super().motion_under(law) if self._law is None else self._law.motion_under(law)
-
-    def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
-        self.check_context(context)
-        return super().state(context)
-
-    def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,); a run is refused from a state that is not on N*.
-
-        Raises:
-            ModelError: The shape is wrong.
-        """
-        self.check_context(context)
-        super().set_state(context, state)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -272,15 +258,6 @@ class DaePlant(ParameterizedSystem, Plant):
         """The parameters of the law at `feedback`, as `parameters_along`; None without one."""
         self.check_context(context)
         return self._steps.laws_along(context, vector("times", times, None))
-
-    def _otherwise(
-        self,
-        function: TracedFunction,
-        state: FloatArray,
-        inputs: Sequence[FloatArray],
-        parameters: FloatArray,
-    ) -> tuple[FloatArray, ...] | None:
-        return self._crossing.values(function, state, inputs, parameters)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """The values of a port of `functions` at given times, one row each; nan without a value.

@@ -47,8 +47,8 @@ def traced_plant(
     by_state, by_control = (STATE, PARAMETERS), (STATE, "control", PARAMETERS)
     computations = []
     if structure.elimination.beta.nnz():
-        both = dae.trace("plant", {"rate": rate, "force": force}, control, *regular)
-        computations.append(Computation.of(both, by_control, (DERIVATIVE, "constraint_input")))
+        together = dae.trace("plant", {"rate": rate, "force": force}, control, *regular)
+        computations.append(Computation.of(together, by_control, (DERIVATIVE, "constraint_input")))
     else:
         motion = dae.trace("plant", {"rate": rate}, control, *regular)
         by_state_alone = dae.trace("plant", {"force": force}, {}, *regular)
@@ -56,16 +56,16 @@ def traced_plant(
         computations.append(Computation.of(by_state_alone, by_state, ("constraint_input",)))
     acting = ca.SX.sym("v", dae.num_constraints)
     by_force = (STATE, "constraint_input", PARAMETERS)
-    shown = {"force": dae.forces(acting), "output": dae.outputs(acting)}
+    signals_of = {"force": dae.forces(acting), "output": dae.outputs(acting)}
     names = {"force": "constraint_force", "output": "controlled_output"}
     if not structure.elimination.n_star.nnz():
         # m beta u cancels, so the output does not depend on the control.
         alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
         output = dae.trace("controlled output", {"value": dae.outputs(alpha)}, {}, *regular)
         computations.append(Computation.of(output, by_state, ("controlled_output",)))
-        del shown["output"]
-    rest = dae.trace("signals", shown, {"force": acting})
-    computations.append(Computation.of(rest, by_force, tuple(names[name] for name in shown)))
+        del signals_of["output"]
+    rest = dae.trace("signals", signals_of, {"force": acting})
+    computations.append(Computation.of(rest, by_force, tuple(names[name] for name in signals_of)))
     manifold = structure.manifold
     residual = dae.trace("residual", {"value": manifold.residual_expression})
     computations.append(Computation.of(residual, by_state, ("constraint_residual",)))

@@ -144,7 +144,7 @@ class StateSensor(LeafSystem):
         encoders, period: The arguments.
 
     Raises:
-        ModelError: The encoders have another number of entries, or a size makes no sense.
+        ModelError: The encoders have another number of entries, or a size is not valid.
     """
 
     __slots__ = SHARED_DICTIONARY

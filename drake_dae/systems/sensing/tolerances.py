@@ -35,7 +35,7 @@ class Tolerances:
         window: The time constant of recent errors, in s.
 
     Raises:
-        ModelError: There are no outputs, or a number makes no sense.
+        ModelError: There are no outputs, or a number is not valid.
     """
 
     outputs: Mapping[str, float]

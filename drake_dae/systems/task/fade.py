@@ -57,6 +57,6 @@ def _basis(n: int) -> FloatArray:
     factors = np.zeros((n + 1, 2 * n + 2))
     for k in range(n + 1):
         factors[k, k] = 1.0 / factorial(k)
-    left = at_end[:, : n + 1] @ factors[:, : n + 1].T
-    factors[:, n + 1 :] = -np.linalg.solve(at_end[:, n + 1 :], left).T
+    remaining = at_end[:, : n + 1] @ factors[:, : n + 1].T
+    factors[:, n + 1 :] = -np.linalg.solve(at_end[:, n + 1 :], remaining).T
     return factors

@@ -139,7 +139,7 @@ class TaskPlanner:
                 the robot rests for another reason.
             cause: The reason.
         """
-        was, known = before.change.in_contact, before.reference(now.time)
+        was, present = before.change.in_contact, before.reference(now.time)
         end = len(self._phases)
         name = HELD if place is None else self._name(place)
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
@@ -148,12 +148,12 @@ class TaskPlanner:
         else:
             contact = self._task.contacts[place]
         if contact != was:
-            old, known = known, self._met(now, contact, moment)
+            old, present = present, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):
                 if i != self._place:
                     size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
-                    known[first : first + size] = old[start : start + size]
-        return self._started(now, place, name, contact, cause, moment, known)
+                    present[first : first + size] = old[start : start + size]
+        return self._started(now, place, name, contact, cause, moment, present)
 
     def _started(
         self,

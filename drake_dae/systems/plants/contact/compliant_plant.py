@@ -171,9 +171,9 @@ class CompliantPlant(ParameterizedSystem, Plant):
         return along[:, : self.dae.parameter_symbol.numel()]
 
     def state(self, context: Context) -> FloatArray:
-        self.check_context(context)
         if not self.time_step:
             return super().state(context)
+        self.check_context(context)
         return context.get_discrete_state(0).CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -182,10 +182,10 @@ class CompliantPlant(ParameterizedSystem, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        self.check_context(context)
         if not self.time_step:
             super().set_state(context, state)
             return
+        self.check_context(context)
         context.SetDiscreteState(0, self.dae.state_vector(state))
         context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
 
@@ -197,7 +197,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
         Raises:
             InconsistentStateError: None is found near the guess.
         """
-        self.check_context(context)
         return super().set_consistent_state(context, guess)
 
     def set_contact(self, context: Context, material: PointMaterial) -> None:

@@ -38,7 +38,7 @@ class DisturbanceForce:
         point: The point in the frame, m, shape (3,).
 
     Raises:
-        ModelError: It ends before it begins, or a number makes no sense.
+        ModelError: It ends before it begins, or a number is not valid.
     """
 
     frame: str

@@ -52,22 +52,22 @@ class ConstraintTerms:
         return self.all_impulses[:m, :m]
 
     def painleve_outcome(
-        self, kept: Sequence[int], normals: Sequence[int]
+        self, bilateral: Sequence[int], normals: Sequence[int]
     ) -> PainleveOutcome | None:
         """The outcome of a Painleve paradox of touching contacts; None if one set of forces fits.
 
         Args:
-            kept: The bilateral rows.
+            bilateral: The bilateral rows.
             normals: The rows of the contacts.
         """
-        rows = [*kept, *normals]
+        rows = [*bilateral, *normals]
         part = np.ix_(rows, rows)
         matrix, without, offset = (
             self.force_matrix[part],
             self.impulse_matrix[part],
             self.accelerations[rows],
         )
-        places = list(range(len(kept), len(rows)))
+        places = list(range(len(bilateral), len(rows)))
         if is_p_matrix(matrix, without, places):
             return None
         force = np.full(len(rows), np.inf)
@@ -89,7 +89,7 @@ class UnilateralContacts:
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
         along: The rows of the sliding velocities of each contact in `all_rates`.
-        kept: The rows of all other constraints.
+        bilateral: The rows of all other constraints.
         normals: The normal row of each contact.
         gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
@@ -133,7 +133,7 @@ class UnilateralContacts:
             normal = part.start + constraint.is_unilateral.index(True)
             self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
         opening = np.concatenate([touch.rows for touch in self.touches])
-        self.kept: Indices = np.setdiff1d(np.arange(model.dae.num_constraints), opening)
+        self.bilateral: Indices = np.setdiff1d(np.arange(model.dae.num_constraints), opening)
         self.normals = [touch.normal for touch in self.touches]
         self.restitution = np.array(
             [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]

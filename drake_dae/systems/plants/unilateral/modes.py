@@ -72,7 +72,7 @@ class Modes:
         dae = contacts.dae
         terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
         pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
-        independent = rows_of(terms.impulse_matrix, contacts.kept, pushing)
+        independent = rows_of(terms.impulse_matrix, contacts.bilateral, pushing)
         if independent is None:
             raise ModelError(
                 f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "

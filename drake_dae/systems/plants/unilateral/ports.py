@@ -140,24 +140,17 @@ class ModalPorts(ParameterizedSystem, Plant):
         contacts = {"mode": self.mode_signals, "gap": self.gap_signals}
         return {**self._ports.loop_signals, **contacts}
 
-    def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
-        self.check_context(context)
-        return super().state(context)
-
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets x as given, shape (n,), all contacts open: a run finds its mode at its start.
 
         Raises:
             ModelError: The shape is wrong.
         """
-        self.check_context(context)
         super().set_state(context, state)
         context.SetDiscreteState(np.zeros(len(self.contacts)))
 
     def gaps(self, context: Context) -> FloatArray:
         """phi of each contact, m, shape (k,)."""
-        self.check_context(context)
         return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
 
     @cached_property
@@ -238,7 +231,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         terms = contacts.terms(error.state, control, parameters)
         places = [i for i, shut in enumerate(self._now.closed) if shut]
         normals = [contacts.normals[i] for i in places]
-        outcome = terms.painleve_outcome(contacts.kept.tolist(), normals)
+        outcome = terms.painleve_outcome(contacts.bilateral.tolist(), normals)
         if outcome is None:
             return error
         names = [self.contacts[i] for i in places]

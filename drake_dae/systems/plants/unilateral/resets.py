@@ -126,7 +126,7 @@ class Resets:
         touches = [contacts.touches[i] for i in touching]
         if contacts.dae.frictional_contacts:
             outcome = terms.painleve_outcome(
-                contacts.kept.tolist(), [touch.normal for touch in touches]
+                contacts.bilateral.tolist(), [touch.normal for touch in touches]
             )
             if outcome in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
                 in_paradox = [contacts.names[i] for i in touching]
@@ -147,7 +147,7 @@ class Resets:
         closed: list[int] = []
         for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
             trial = [contacts.touches[j] for j in (*closed, i)]
-            if rows_of(matrix, contacts.kept, trial) is not None:
+            if rows_of(matrix, contacts.bilateral, trial) is not None:
                 closed.append(i)
         return tuple(i in closed for i in range(len(contacts.touches)))
 
@@ -170,7 +170,7 @@ class Resets:
             for i, coefficient in zip(touching, e, strict=True)
         ]
         if any(0.0 < contact.friction < np.inf for contact in frictional):
-            impulse = impact(matrix, before, contacts.kept, frictional)
+            impulse = impact(matrix, before, contacts.bilateral, frictional)
         else:
             offset = before.copy()
             offset[normals] *= 1.0 + e
@@ -181,7 +181,7 @@ class Resets:
         x = state + terms.velocity_change @ impulse
         rest = self._rest(time, x, touches, before, control, parameters)
         if rest is not None:
-            rows = np.array([*contacts.kept, *(r for touch in touches for r in touch.rows)])
+            rows = np.array([*contacts.bilateral, *(r for touch in touches for r in touch.rows)])
             impulse = impulse + stopping(matrix, after, rows)
             after = before + matrix @ impulse
             x = state + terms.velocity_change @ impulse
@@ -212,7 +212,9 @@ class Resets:
         if not leaving:
             return 0.0
         staying = [touch for touch in touches if touch not in leaving]
-        fit = complementary(terms.force_matrix, terms.accelerations, self._contacts.kept, staying)
+        fit = complementary(
+            terms.force_matrix, terms.accelerations, self._contacts.bilateral, staying
+        )
         if fit is None:
             return None
         normals = [touch.normal for touch in leaving]
@@ -232,7 +234,7 @@ class Resets:
         offset: FloatArray,
         touches: Sequence[TouchRows],
     ) -> ImpactSolution:
-        fit = complementary(matrix, offset, self._contacts.kept, touches)
+        fit = complementary(matrix, offset, self._contacts.bilateral, touches)
         if fit is None:
             raise self._unfit(time, state)
         return fit

@@ -144,7 +144,7 @@ class PhasePlan:
             phase, most = self.phases[to], self.phases[to].retries
             count = counts[to]
             if most is None and word == APPROACH:
-                count, most = 1 + sum(one == APPROACH for one in chosen), self._retries
+                count, most = 1 + sum(key == APPROACH for key in chosen), self._retries
             if most is None or count <= most:
                 if count and most is not None:
                     remarks.append(f"retry {count} of {most}")
@@ -230,11 +230,11 @@ class PhasePlan:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
 
     def _check_reached(self) -> None:
-        reached, left = {0}, [0]
-        while left:
-            after = {to for _, to in self._edges[left.pop()]} - reached
+        reached, unexplored = {0}, [0]
+        while unexplored:
+            after = {to for _, to in self._edges[unexplored.pop()]} - reached
             reached |= after
-            left += after
+            unexplored += after
         for place in range(self.last):
             if place not in reached:
                 raise ModelError(
