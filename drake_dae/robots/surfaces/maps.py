@@ -97,7 +97,7 @@ class HeightMap(_Map):
         point: The middle of the map, m, shape (3,).
         normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, m.
-        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+        resolution: The distance of the bell curves, m; finer details are smoothed. If None, a
             sixteenth of the longer side, but no less than the heights are apart.
 
     Raises:
@@ -147,7 +147,7 @@ class MeshSurface(_Map):
             shape (2,); that of the mesh if None.
         size: The lengths of the rectangle, m, shape (2,); those of the mesh if None.
         scale: The length of a unit of the mesh, m: 0.001 for millimetres.
-        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+        resolution: The distance of the bell curves, m; finer details are smoothed. If None, a
             sixteenth of the longer side.
 
     Raises:

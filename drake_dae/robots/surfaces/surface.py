@@ -132,9 +132,7 @@ class Surface(ABC):
         p = ca.SX.sym("p", 3)
         distance = self.distance(p)
         function = TracedFunction(
-            "distance",
-            {"offset": p},
-            {"distance": distance, "gradient": ca.gradient(distance, p)},
+            "distance", {"offset": p}, {"distance": distance, "gradient": ca.gradient(distance, p)}
         )
 
         def linearize(point: FloatArray) -> NewtonModel | None:

@@ -81,10 +81,7 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             if port.get_data_type() == PortDataType.kAbstractValued:
                 self._law = formulas["control"]
                 self.DeclareAbstractOutputPort(
-                    name,
-                    nothing,
-                    weakly(self._calc_feedback),
-                    tickets["parameters"] | of_reference,
+                    name, nothing, weakly(self._calc_feedback), tickets["parameters"] | of_reference
                 )
                 continue
             if name not in formulas:

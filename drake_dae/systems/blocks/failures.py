@@ -33,18 +33,15 @@ def cannot_go_on(
     """
     return SimulationError(
         f"the simulation cannot go on at t = {time:.6g} s, state {show_state(state)}: "
-        f"{reason.rstrip('.')}. Where the state grows without bound or a reference leaves what the "
-        f"robot can reach, change these; otherwise {remedy}",
+        f"{reason.rstrip('.')}. If the state grows without bound, or a reference is out of "
+        f"reach, change these; otherwise {remedy}",
         time,
         state,
     )
 
 
 def simulation_error(
-    failure: Failure,
-    time: float,
-    state: FloatArray,
-    signals: Mapping[str, Sequence[Signal]],
+    failure: Failure, time: float, state: FloatArray, signals: Mapping[str, Sequence[Signal]]
 ) -> SimulationError:
     """The exception for a function without a valid value.
 
@@ -68,7 +65,7 @@ def simulation_error(
         case FailureKind.OVERFLOW:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
-                "without bound. Look at the gains, and at what the model has wrong",
+                "without bound. Check the gains and the errors of the model",
                 time,
                 state,
             )

@@ -49,10 +49,7 @@ class SpringView(ParameterizedSystem):
             "joint_torque": dae.trace("torque of the springs", {"value": model.joint_force}),
         }
         self._port = self.DeclareVectorInputPort("estimated_state", dae.num_states)
-        tickets = {
-            self.input_port_ticket(self._port.get_index()),
-            self.all_parameters_ticket(),
-        }
+        tickets = {self.input_port_ticket(self._port.get_index()), self.all_parameters_ticket()}
         for name, function in self._functions.items():
             value = port_value(self._value, function)
             self.DeclareVectorOutputPort(name, function.outputs[0].size, value, tickets)

@@ -9,14 +9,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.systems.blocks.traced import (
-    DERIVATIVE,
-    PARAMETERS,
-    STATE,
-    TIME,
-    Block,
-    Computation,
-)
+from drake_dae.systems.blocks.traced import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
 from drake_dae.systems.control.command_filter import CommandFilter, CommandLimits
 from drake_dae.systems.control.references import ReferenceGenerator, traced_references
 

@@ -31,7 +31,7 @@ SIGNAL = "signal_"
 """The beginning of the name of an input port for a signal."""
 
 Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
-"""Outputs z, what they should be, both of shape (k,), and their names and units."""
+"""Outputs z and their desired values, shape (k,) each, and their names and units."""
 
 
 @checked(ModelError)
@@ -126,10 +126,7 @@ class Controller(System):
         check_law(plant.dae, self.law)
 
     def derived(
-        self,
-        context: Context | None,
-        times: FloatArray,
-        values: Mapping[str, FloatArray],
+        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """Derived signals of a record: desired outputs, errors and others.
 
@@ -142,7 +139,7 @@ class Controller(System):
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
-        """The outputs now and what they should be, with their names; None if unknown.
+        """The current outputs and their desired values, with their names; None if unknown.
 
         Args:
             context: The context of this system.
@@ -154,7 +151,7 @@ class Controller(System):
         return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
 
     def reference_now(self, context: Context) -> FloatArray | None:
-        """R: what is wired or fixed, or what the references are by themselves; None without any."""
+        """R from the wire or fixed value, or from references by time; None without any."""
         port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
         return port.Eval(context) if port is not None and port.HasValue(context) else None
 

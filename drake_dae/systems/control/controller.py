@@ -143,7 +143,7 @@ class TrackingController(ParameterizedSystem, Controller):
         )
 
     def _add_integrals(self, limits: ArrayLike, sample_period: float) -> set[DependencyTicket]:
-        """Declares the integrals, and returns what the control depends on."""
+        """Declares the integrals, and returns the dependencies of the control."""
         count = len(self.law.integral.outputs)
         largest = np.asarray(limits, dtype=float)
         if largest.shape not in ((), (count,)) or not np.all(largest > 0.0):
@@ -221,7 +221,7 @@ class TrackingController(ParameterizedSystem, Controller):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def all_parameters(self, context: Context) -> FloatArray:
-        """What the law's function takes as parameters: the model's at the context's time, and K."""
+        """The parameters of the law's function: the model's at the context's time, and K."""
         self.check_context(context)
         return np.array(self._values(context))
 

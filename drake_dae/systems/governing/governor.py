@@ -165,10 +165,7 @@ class PathGovernor(ReferenceGenerator):
             updates,
             model=self.law.system,
             signals={"state": self.law.system.state_signals},
-            ports={
-                "reference": tuple(self.law.reference_signals),
-                "path": PATH_SIGNALS,
-            },
+            ports={"reference": tuple(self.law.reference_signals), "path": PATH_SIGNALS},
         )
 
 

@@ -7,12 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    Context,
-    EventStatus,
-    State,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, EventStatus, State, ValueProducer
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers

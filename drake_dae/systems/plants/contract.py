@@ -222,6 +222,6 @@ class Plant(System):
         """
         if self.model is None:
             raise ModelError(
-                f"{needed_by} needs a robot, as of a RobotPlant, and '{self.dae.name}' is none"
+                f"{needed_by} needs a robot, such as a RobotPlant, and '{self.dae.name}' is none"
             )
         return self.model

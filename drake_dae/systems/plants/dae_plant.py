@@ -18,12 +18,7 @@ from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import (
-    InconsistentStateError,
-    ModelError,
-    SimulationError,
-    SingularityError,
-)
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.failures import (
@@ -303,16 +298,10 @@ class DaePlant(ParameterizedSystem, Plant):
         return jammed_contact(self.structure, error, control, parameters, force) or error
 
     def _formulas(self) -> dict[str, Formula]:
-        dae, residual = self.dae, self.structure.manifold.residual_expression
-        functions = {
-            "derivative": self.dynamics,
-            "state": dae.trace("state", {"value": dae.state}),
-            "constraint_force": self._force,
-            "constraint_residual": dae.trace("residual", {"value": residual}),
-            "controlled_output": self._output,
-        }
+        state = self.dae.trace("state", {"value": self.dae.state})
+        functions = {"derivative": self.dynamics, "state": state, **self.functions}
         return {
-            name: TracedFormula(function, signals=self._signals)
+            name: TracedFormula(function, function.output_names[0], signals=self._signals)
             for name, function in functions.items()
         }
 

@@ -6,13 +6,7 @@ from weakref import proxy, ref
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    CacheEntry,
-    Context,
-    InputPort,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import CacheEntry, Context, InputPort, LeafSystem, ValueProducer
 
 from drake_dae.arrays import FloatArray
 from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing

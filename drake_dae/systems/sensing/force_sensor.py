@@ -226,7 +226,4 @@ class ForceSensor(DifferentiableSystem):
             measured = measured + errors[size:] * noise
         inputs["parameters"] = errors
         output = TracedFunction("measured force", inputs, {"value": measured + errors[:size]})
-        return {
-            "derivative": TracedFormula(rate),
-            "measured_force": TracedFormula(output),
-        }
+        return {"derivative": TracedFormula(rate), "measured_force": TracedFormula(output)}

@@ -109,12 +109,7 @@ class TaskController(Diagram, Controller):
     takes_over, shown, refused = True, ("desired_output",), _REFUSED
 
     def __init__(
-        self,
-        task: Task,
-        law: TrackingLaw,
-        free_law: TrackingLaw,
-        *,
-        sample_period: float = 0.0,
+        self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 0.0
     ) -> None:
         super().__init__()
         check_sampled(task, sample_period)

@@ -10,17 +10,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.contact.contact_laws import (
-    Compliance,
-    contact_force,
-    contact_step,
-)
+from drake_dae.systems.plants.contact.contact_laws import Compliance, contact_force, contact_step
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
-from drake_dae.systems.plants.contact.point_contact import (
-    ball_normals,
-    point_contacts,
-    touching,
-)
+from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts, touching
 from drake_dae.systems.plants.contact.stepped_stages import stage_rates, stages_after
 from drake_dae.systems.plants.robot_ports import stage_ports
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -54,10 +46,7 @@ class CompliantEquations:
     """
 
     def __init__(
-        self,
-        model: RobotModel,
-        structure: ConstraintStructure,
-        material: PointMaterial,
+        self, model: RobotModel, structure: ConstraintStructure, material: PointMaterial
     ) -> None:
         dae, self._model, self._h = model.dae, model, material.time_step
         self._structure = structure

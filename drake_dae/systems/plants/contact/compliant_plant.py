@@ -46,9 +46,9 @@ from drake_dae.trace.functions import TracedFunction
 class CompliantPlant(ParameterizedSystem, Plant):
     """A robot whose contacts are compliant, by Drake's equations of point contact.
 
-    It is what a `ContactPlant` is, without a MultibodyPlant: its equations are traced, so that
-    rollouts, exports and linear models know it, surfaces may have any shape and move, and studies
-    change its parameters in a context. Each `PointOnSurface` touches with a ball; nothing else of
+    It is like a `ContactPlant` without a MultibodyPlant: its equations are traced, so that it works
+    in rollouts, exports and linear models, surfaces may have any shape and move, and studies change
+    its parameters in a context. Each `PointOnSurface` touches with a ball; nothing else of
     the robot collides.
 
     With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,

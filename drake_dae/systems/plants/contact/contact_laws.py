@@ -160,7 +160,7 @@ class _Lagged:
     def of(
         cls, contact: PointContact, before: ca.SX, mass: ca.SX, h: float, compliance: Compliance
     ) -> "_Lagged":
-        """The impulse with what is taken from the state before the step."""
+        """The impulse, with constants from the state before the step."""
         elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
         damping = ca.fmax(0, 1 - compliance.dissipation * ca.dot(contact.normal, before))
         lagged = contact.friction * h * elastic * damping
@@ -180,7 +180,7 @@ class _Lagged:
         return sliding / size
 
     def next_share(self, velocity: ca.SX, share: ca.SX, change: ca.SX) -> ca.SX:
-        """p after a Newton step, no longer than 1."""
+        """p after a Newton step, with a length of at most 1."""
         sliding, size = self._size(velocity)
         moved = self.contact.along(change)
         share_after = (sliding + moved - share * ca.dot(sliding / size, moved)) / size

@@ -17,11 +17,7 @@ from pydrake.systems.framework import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.errors import (
-    InconsistentStateError,
-    ModelError,
-    SimulationError,
-)
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.blocks.failures import off_manifold
@@ -118,9 +114,7 @@ class UnilateralRobotPlant(ModalPorts):
             "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
         ).cache_index()
         self._margins_index = self.DeclareCacheEntry(
-            "margins",
-            ValueProducer(_no_margins, weakly(self._calc_margins)),
-            self._by_control,
+            "margins", ValueProducer(_no_margins, weakly(self._calc_margins)), self._by_control
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))

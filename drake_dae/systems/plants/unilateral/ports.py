@@ -10,10 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.structure.constrained import (
-    ConstraintStructure,
-    constraint_structure_of,
-)
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.robots.model import RobotModel

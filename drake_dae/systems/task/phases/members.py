@@ -76,7 +76,7 @@ class Approach(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Press(Phase):
-    """The force goes from what it is to a goal, smoothly.
+    """The force goes smoothly to a goal.
 
     Attributes:
         force: The goal, in N: a positive number, or a reference, whose time starts with the phase.
@@ -218,7 +218,7 @@ class Release(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Retreat(Phase):
-    """The distance goes from what it is to a goal, smoothly.
+    """The distance goes smoothly to a goal.
 
     Attributes:
         distance: The goal, in m.
