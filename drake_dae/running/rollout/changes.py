@@ -12,7 +12,7 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
 from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
-from drake_dae.systems.blocks.trials import SLOWEST
+from drake_dae.systems.blocks.trials import LEAST_PROGRESS
 
 WINDOW = 1e-13
 """A moment is found to within this time, in s."""
@@ -257,7 +257,7 @@ def run_with_changes(
         rows.append(run.rows)
         count += 1
         if count % MOST == 0 and piece is not None:
-            if run.time - mark < SLOWEST * (run.time - problem.times[0]):
+            if run.time - mark < LEAST_PROGRESS * (run.time - problem.times[0]):
                 run = replace(run, ending=RunEnding.SLOW, mark=mark)
                 break
             mark = run.time
