@@ -98,10 +98,10 @@ def positive(what: str, value: Any, error: type[Exception] = ModelError) -> floa
     Raises:
         ModelError: It is none.
     """
-    found = number(what, value, error)
-    if found <= 0.0:
+    checked = number(what, value, error)
+    if checked <= 0.0:
         raise error(f"{what} must be positive, got {brief(value)}")
-    return found
+    return checked
 
 
 def vector(

@@ -193,9 +193,9 @@ def _equilibria(
         return ()
     if stability.state is not None:
         states = np.vstack([stability.state, states])
-    found = dynamics.equilibria(states, outputs=outputs)
+    equilibria = dynamics.equilibria(states, outputs=outputs)
     known = () if stability.state is None else (stability,)
-    others = found[len(known) :]
+    others = equilibria[len(known) :]
     return (*known, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
@@ -266,8 +266,8 @@ def _assumptions(
         else:
             finding, reason = Finding.NOT_EXAMINED, before
         margin = (margins or {}).get(number)
-        found = violated.get(number)
-        result.append(Assumption(number, statement, finding, margin, reason, found))
+        violation = violated.get(number)
+        result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
 
 

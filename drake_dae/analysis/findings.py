@@ -176,11 +176,11 @@ class Findings:
     @property
     def problems(self) -> tuple[str, ...]:
         """The violations, one text each; empty if there are none."""
-        found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
+        sentences = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
         # Where an assumption is violated, the theorem adds nothing.
-        if not found and self.independence is not None and self.independence.is_singular:
+        if not sentences and self.independence is not None and self.independence.is_singular:
             place = named_values(self.system.state_signals, self.independence.state)
-            found.append(
+            sentences.append(
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {place}"
             )
@@ -189,7 +189,7 @@ class Findings:
         if contact is not None and contact.is_paradoxical:
             when = "" if contact.time is None else f"t = {contact.time:.6g} s, "
             critical = ", ".join(f"{k} = {v:.4g}" for k, v in contact.critical_friction.items())
-            found.append(
+            sentences.append(
                 "Friction: the Painleve paradox occurs at "
                 f"{when}{named_values(self.system.state_signals, contact.state)}: a principal "
                 f"minor of A(x) is {contact.reserve:.3g} of what it is without friction, and "
@@ -199,11 +199,13 @@ class Findings:
         decisive = self.decisive
         if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
             place = "along the reference " if decisive is self.zero_dynamics_along else ""
-            found.append(f"Assumption 2.2: {place}{decisive.reason}")
+            sentences.append(f"Assumption 2.2: {place}{decisive.reason}")
         for one in self.unstable_inside:
             if one.state is not None:
                 place = named_values(self.system.state_signals, one.state)
-                found.append(f"Assumption 2.2: inside the region, at rest at {place}: {one.reason}")
+                sentences.append(
+                    f"Assumption 2.2: inside the region, at rest at {place}: {one.reason}"
+                )
         if self.motion is not None and self.motion.ending is not None:
-            found.append(str(self.motion.ending))
-        return tuple(found)
+            sentences.append(str(self.motion.ending))
+        return tuple(sentences)

@@ -273,12 +273,12 @@ def _along(motion: PinnedMotion) -> Table:
 
 def _worst(motion: PinnedMotion) -> dict[str, tuple[float, float]]:
     """The smallest margins of A(x) and B(x), and when."""
-    found = {}
+    margins_and_times = {}
     for letter, margins in (("A", motion.constraint_margins), ("B", motion.control_margins)):
         if margins.size and np.all(np.isfinite(margins)):
             worst = int(np.argmin(margins))
-            found[f"{letter}(x)"] = (float(margins[worst]), float(motion.times[worst]))
-    return found
+            margins_and_times[f"{letter}(x)"] = (float(margins[worst]), float(motion.times[worst]))
+    return margins_and_times
 
 
 def _complex(values: ComplexArray) -> str:

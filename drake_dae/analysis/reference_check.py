@@ -35,14 +35,14 @@ def check_reference(
 
     def value(time: float) -> FloatArray:
         given = reference(time)
-        found = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
-        if found is None or found.size != layout.reference_size:
+        values = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
+        if values is None or values.size != layout.reference_size:
             raise ModelError(
                 f"{system.name}: the reference must have size {layout.reference_size} (each output "
                 f"and its derivatives up to its degree {layout.degrees}), got "
-                f"{'None' if found is None else found.size}"
+                f"{'None' if values is None else values.size}"
             )
-        return found.reshape(-1)
+        return values.reshape(-1)
 
     if not grid.size or not np.all(np.isfinite(grid)):
         return
@@ -59,16 +59,16 @@ def check_reference(
     )
     signals = layout.reference_signals(system.output_signals)
     for i in map(int, layout.chained):
-        stated, found = values[:, i + 1], slopes[:, i]
-        scale = max(np.abs(stated).max(), np.abs(found).max())
+        stated, numeric = values[:, i + 1], slopes[:, i]
+        scale = max(np.abs(stated).max(), np.abs(numeric).max())
         round_off = 1e-13 * np.abs(values[:, i]).max() / step
-        unsure = 4.0 * np.abs(found - coarse[:, i])
-        excess = np.abs(stated - found) - 1e-3 * scale - round_off - unsure
+        unsure = 4.0 * np.abs(numeric - coarse[:, i])
+        excess = np.abs(stated - numeric) - 1e-3 * scale - round_off - unsure
         worst = int(np.argmax(excess))
         if excess[worst] > 0.0:
             raise ModelError(
                 f"{system.name}: the reference contradicts itself: its {signals[i + 1].name} = "
                 f"{stated[worst]:.4g} at t = {tried[worst]:.4g} s, but {signals[i].name} "
-                f"changes by {found[worst]:.4g} per second. Give the derivatives of r, output by "
+                f"changes by {numeric[worst]:.4g} per second. Give the derivatives of r, output by "
                 "output: r_1, r_1', ..., r_2, ..."
             )

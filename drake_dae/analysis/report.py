@@ -16,8 +16,8 @@ class Analysis(Findings):
     """What the theory says about one system; made by `analyze`, printed by `print`."""
 
     def __repr__(self) -> str:
-        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
-        return f"Analysis('{self.system.name}': {found})"
+        problems = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Analysis('{self.system.name}': {problems})"
 
     def __str__(self) -> str:
         return to_text([*self.parts(), *([problem] for problem in self.problems)])

@@ -227,12 +227,12 @@ class Derivatives:
                 pivot = ca.fmin(pivot, own_pivot)
         if still and ca.depends_on(ca.vertcat(*needed), symbols[still]):
             pivot = ca.fmin(pivot, self.pivot)
-        _, found = ca.substitute_inplace(
+        _, results = ca.substitute_inplace(
             [symbols[still], *(unknowns[columns] for columns, _, _ in blocks)],
             [values[still], *solutions],
             [self.control, pivot, shown],
         )
-        return found[0], found[1], found[2]
+        return results[0], results[1], results[2]
 
     def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
         """The derivatives of equations of some orders, and of an expression, by what moves."""

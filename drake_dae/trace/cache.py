@@ -63,22 +63,22 @@ def open_cache(create: bool = False) -> Path | None:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with suppress(FileExistsError):
                 folder.mkdir(0o700)
-        found = folder.stat()
+        status = folder.stat()
     except OSError as error:
         if isinstance(error, FileNotFoundError) and not create:
             return None
         raise MachineCodeError(_message(folder, error)) from None
-    if not stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISDIR(status.st_mode):
         raise MachineCodeError(f"the cache {folder} is no folder; remove it")
-    if found.st_uid != os.getuid():
+    if status.st_uid != os.getuid():
         raise MachineCodeError(
-            f"the cache {folder} belongs to another user (id {found.st_uid}), whose code is not "
+            f"the cache {folder} belongs to another user (id {status.st_uid}), whose code is not "
             "loaded; name a folder of your own in DRAKE_DAE_CACHE"
         )
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise MachineCodeError(
-            f"others can write the cache {folder} (mode {stat.S_IMODE(found.st_mode):04o}), so its "
-            f"code is not loaded; chmod 700 {folder}"
+            f"others can write the cache {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so "
+            f"its code is not loaded; chmod 700 {folder}"
         )
     return folder
 
@@ -144,8 +144,8 @@ def contents() -> list[Path]:
     """
     folder = open_cache()
     try:
-        found = sorted(folder.iterdir()) if folder is not None else []
-        return [path for path in found if _OURS.fullmatch(path.name)]
+        paths = sorted(folder.iterdir()) if folder is not None else []
+        return [path for path in paths if _OURS.fullmatch(path.name)]
     except OSError as error:
         raise MachineCodeError(_message(cache_folder(), error)) from None
 

@@ -128,12 +128,12 @@ def find_compiler() -> Compiler:
     Raises:
         MachineCodeError: There is none.
     """
-    found = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
-    if isinstance(found, str):
-        raise MachineCodeError(found)
-    if found.identity in _HANGING:
-        raise MachineCodeError(_HANGING[found.identity])
-    return found
+    compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+    if isinstance(compiler, str):
+        raise MachineCodeError(compiler)
+    if compiler.identity in _HANGING:
+        raise MachineCodeError(_HANGING[compiler.identity])
+    return compiler
 
 
 def give_up(compiler: Compiler, error: MachineCodeError) -> None:

@@ -39,10 +39,10 @@ def numpy_explained(what: str) -> Iterator[None]:
     Args:
         what: The name of the function in the warning.
     """
-    with warnings.catch_warnings(record=True) as found:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
-    for one in found:
+    for one in caught:
         text = str(one.message)
         if one.category is FutureWarning and "casadi" in text and "numpy" in text:
             _warn(what)

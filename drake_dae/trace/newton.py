@@ -118,8 +118,8 @@ def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
         nonlocal at, value
         if x is not at:
             at, value = x, function(x)
-        found: T = value
-        return found
+        result: T = value
+        return result
 
     return evaluated
 

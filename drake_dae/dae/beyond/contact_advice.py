@@ -178,7 +178,7 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     phase = _PHASE / 2.0 if situation.estimates else _PHASE
     highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
     rates = np.geomspace(highest, highest / 30.0, 14).tolist()
-    found = []
+    candidates = []
     for fast in _state_rates(situation, highest):
         tried = ([_contact(situation, w, fast, share) for w in rates] for share in _SLOWER)
         best = (_best(situation, parts, roughness / 2.0**0.5) for parts in tried)
@@ -186,10 +186,10 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
             continue
         left = (roughness**2 - contact.roughness**2) ** 0.5
         if (free := _best(situation, [_free(situation, w, fast) for w in rates], left)) is not None:
-            found.append((free, contact, fast))
-    if not found:
+            candidates.append((free, contact, fast))
+    if not candidates:
         raise GainError(_reason(situation, rates, roughness / 2.0**0.5, highest))
-    free, contact, fast = min(found, key=lambda each: each[0].error * each[1].error)
+    free, contact, fast = min(candidates, key=lambda each: each[0].error * each[1].error)
     w, of_contact = free.rate, contact.rates
     return AdvisedGains(
         gains=ContactGains(
@@ -304,9 +304,9 @@ def _blamed(situation: SensedContact) -> str:
 
     def without(name: str) -> float:
         quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
-        found = sampled_loop(
+        loop = sampled_loop(
             quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.seen(1.0)
         )
-        return found.deviations()[1]
+        return loop.deviations()[1]
 
     return min(("position", "velocity"), key=without)

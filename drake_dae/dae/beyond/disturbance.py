@@ -167,12 +167,14 @@ class Observation:
         moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
         slopes = [ca.jacobian(column, x[rows]) for column in columns]
         planes = ca.horzcat(ca.SX(len(rows), 0), *slopes)
-        found = {
+        directions_of_forces = {
             "metric": ca.mtimes(projector.T, moves),
             "free": projector,
             "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
         }
-        directions = system.trace("directions of friction", found, pressed, often=False)
+        directions = system.trace(
+            "directions of friction", directions_of_forces, pressed, often=False
+        )
         wanted, moving = _wanted(structure, rows)
         return cls(function, friction, directions, wanted, moving, tuple(rows), frictions)
 
@@ -192,7 +194,7 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
         metric: W, shape (k, k).
         d: What is shared, shape (k, 1).
     """
-    size, found = forces.shape[0], list[ca.SX]()
+    size, components = forces.shape[0], list[ca.SX]()
     for j in range(forces.shape[1]):
         force, plane = forces[:, j], planes[:, j * size : (j + 1) * size]
         # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
@@ -202,8 +204,8 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
         across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
         matched = ca.mtimes(metric, beside(across, metric, force))
         square = ca.fmax(ca.dot(matched, force), _TINY)
-        found.append(ca.dot(matched, d) / square)
-    return ca.vertcat(ca.SX(0, 1), *found)
+        components.append(ca.dot(matched, d) / square)
+    return ca.vertcat(ca.SX(0, 1), *components)
 
 
 def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
@@ -216,14 +218,14 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
     """
     squares = ca.sum1(planes * ca.mtimes(metric, planes))
     least = _FLAT * ca.mmax(squares) if squares.numel() else 0
-    found: list[tuple[ca.SX, ca.SX]] = []
+    basis: list[tuple[ca.SX, ca.SX]] = []
     for column in ca.horzsplit(planes):
-        for direction, matched in found:  # Modified Gram-Schmidt, in the metric W.
+        for direction, matched in basis:  # Modified Gram-Schmidt, in the metric W.
             column -= direction * ca.dot(matched, column)
         matched = ca.mtimes(metric, column)
         square = ca.dot(column, matched)
         matched = ca.if_else(square > least, 1, 0) / ca.fmax(square, _TINY) * matched
-        found.append((column, matched))
+        basis.append((column, matched))
         d -= ca.mtimes(column, ca.mtimes(matched.T, d))
     return d
 
@@ -261,14 +263,14 @@ def _wanted(
 def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
     """The exogenous coefficients of friction, and the constraint input of each."""
     forces = [signal.name for signal in system.constraint_input_signals]
-    found = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
+    pressed_by = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
     for name in names:
-        if name not in (*found, DISTURBANCE):
+        if name not in (*pressed_by, DISTURBANCE):
             raise ModelError(
                 f"{system.name}: '{name}' varies and is not the coefficient of friction of one "
                 "contact; an observer estimates a disturbance and coefficients of friction"
             )
-    return {name: found[name] for name in names if name in found}
+    return {name: pressed_by[name] for name in names if name in pressed_by}
 
 
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:

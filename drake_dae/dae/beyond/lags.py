@@ -49,12 +49,12 @@ class Lags:
         both = np.zeros((size + 1, size + 1))
         both[:size, :size] = rate * (np.eye(size, k=-1) - np.eye(size))
         both[0, size] = rate
-        found = expm(both * period)
+        transition = expm(both * period)
         slopes = np.zeros((degree, size))
         for j in range(1, size):
             for i in range(j + 1):
                 slopes[j - 1, degree - i] = rate**j * (-1) ** (j - i) * comb(j, i)
-        return cls(rate, degree, found[:size, :size], found[:size, size], slopes)
+        return cls(rate, degree, transition[:size, :size], transition[:size, size], slopes)
 
     def after(self, lags: ca.SX, signal: ca.SX) -> ca.SX:
         """s at the next sample, one column for each, shape (k, n + 1); d is of shape (k, 1)."""

@@ -240,12 +240,12 @@ def _estimated(
     """A `StateEstimator`, likewise; q, w and a are its prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None
-    found = _filter(rates.state_rate, rates.observer_rate, period, ratio)
+    observer = _filter(rates.state_rate, rates.observer_rate, period, ratio)
     ahead = np.array([now["q"], now["w"], now["a"]])
 
     def corrected(position: FloatArray, velocity: FloatArray) -> FloatArray:
-        measured = np.array([position, velocity][: found.gain.shape[1]])
-        result: FloatArray = ahead + found.gain @ (measured - ahead[: len(measured)])
+        measured = np.array([position, velocity][: observer.gain.shape[1]])
+        result: FloatArray = ahead + observer.gain @ (measured - ahead[: len(measured)])
         return result
 
     def known(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:

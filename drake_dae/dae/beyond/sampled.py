@@ -85,16 +85,16 @@ def sampled_poles(
     matrix[:size, :size] = end[0] @ begin[0]
     matrix[:size, late * size : (late + 1) * size] += end[1]
     matrix[:size, (late + 1) * size :] += end[0] @ begin[1]
-    found = np.linalg.eigvals(matrix).astype(complex)
-    return found[np.argsort(-np.abs(found), kind="stable")]
+    eigenvalues = np.linalg.eigvals(matrix).astype(complex)
+    return eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")]
 
 
 def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
     """exp(A t) and Gamma(t) G."""
     size = len(A)
     both = np.block([[A, G], [np.zeros((size, 2 * size))]])
-    found = scipy.linalg.expm(both * length)
-    return found[:size, :size], found[:size, size:]
+    transition = scipy.linalg.expm(both * length)
+    return transition[:size, :size], transition[:size, size:]
 
 
 @checked(ModelError)
@@ -156,13 +156,13 @@ def sampling_error(
             for state, rate in zip(courses[0], rates, strict=True)
         ]
     )
-    found = -(delay + period) * driven
+    error = -(delay + period) * driven
     layout = law.layout
     push = np.zeros((layout.chain_size, moments.size))
     push[layout.ends] = -(delay + 0.5 * period) * driven[:, layout.dynamic].T
     chains = _response(law.gains.error_matrix, moments, push.T)
-    found[:, layout.dynamic] = chains[:, layout.heads]
-    return found
+    error[:, layout.dynamic] = chains[:, layout.heads]
+    return error
 
 
 def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatArray:
@@ -175,10 +175,10 @@ def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatA
     both[:, :size, size + 1] = np.diff(push, axis=0) / lengths[:, None]
     both[:, size + 1, size] = 1.0
     steps = scipy.linalg.expm(both * lengths[:, None, None])
-    found = np.zeros((times.size, size))
+    states = np.zeros((times.size, size))
     for index, step in enumerate(steps):
-        found[index + 1] = step[:size, :size] @ found[index] + step[:size, size]
-    return found
+        states[index + 1] = step[:size, :size] @ states[index] + step[:size, size]
+    return states
 
 
 def _check(law: TrackingLaw) -> None:
@@ -191,10 +191,10 @@ def _check(law: TrackingLaw) -> None:
 
 
 def _delay(delay: float) -> float:
-    found = number("delay", delay)
-    if found < 0.0:
+    seconds = number("delay", delay)
+    if seconds < 0.0:
         raise ModelError(f"delay must be 0 s or more, got {delay:g}")
-    return found
+    return seconds
 
 
 def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:

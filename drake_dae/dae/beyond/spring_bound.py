@@ -83,14 +83,14 @@ def spring_error_bound(
         },
         often=False,
     )
-    values, found, ahead = system.parameter_values, [], []
+    values, traced, ahead = system.parameter_values, [], []
     for state in x:
-        found.append([part.copy() for part in function(state, values)])
+        traced.append([part.copy() for part in function(state, values)])
     p = tau.shape[1]
-    moves = [part[0].reshape(len(rows), p) for part in found]
+    moves = [part[0].reshape(len(rows), p) for part in traced]
     # The actuated accelerations are the force's, by virtual work.
     select = np.linalg.pinv(_actuation(law, rows))
-    for (_, rate, _), matrix, torque in zip(found, moves, tau, strict=True):
+    for (_, rate, _), matrix, torque in zip(traced, moves, tau, strict=True):
         ahead.append(select @ (rate + matrix @ torque))
     control = tau + np.array(ahead) @ B.T
     bends = np.gradient(np.gradient(tau, moments, axis=0), moments, axis=0)
@@ -100,7 +100,7 @@ def spring_error_bound(
     for k, matrix in enumerate(moves):
         left = loop.rate**2 * np.eye(p) + K @ select @ matrix
         error = -np.linalg.solve(left, bends[k] + K @ np.linalg.solve(B, late[k]))
-        driven[k] = found[k][2].reshape(p, p) @ error
+        driven[k] = traced[k][2].reshape(p, p) @ error
     # Differences at both ends are one-sided.
     inner = slice(2, -2)
     rates = np.gradient(driven, moments, axis=0)
@@ -261,5 +261,5 @@ def stable_scales(
 
 def _square(given: ArrayLike) -> FloatArray:
     """A diagonal or a matrix as a matrix."""
-    found = np.asarray(given, dtype=float)
-    return np.diag(found) if found.ndim == 1 else found
+    matrix = np.asarray(given, dtype=float)
+    return np.diag(matrix) if matrix.ndim == 1 else matrix

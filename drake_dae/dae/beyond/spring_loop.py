@@ -103,10 +103,10 @@ def contact_gains_behind(
     # That of a rate of a ninth of the loop's.
     least = _JITTER * _SLOWER / (14.0**0.5 * loop.rate)
     noise = max(velocity_noise, least)
-    found = contact_gains(stiffness, mobility, sample_time, delay, noise)
-    observer = min(0.8 * loop.rate, 3.75 * found.observer_rate)
+    gains = contact_gains(stiffness, mobility, sample_time, delay, noise)
+    observer = min(0.8 * loop.rate, 3.75 * gains.observer_rate)
     return replace(
-        found,
+        gains,
         observer_rate=observer,
         observer_force_rate=observer / 2.0,
         friction_rate=observer / 4.0,

@@ -263,7 +263,7 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
     x, explicit = system.state, system.explicit
     manifold = Manifold(system, [[explicit.k[i]] for i in range(system.num_constraints)])
     samples = Samples(manifold, np.array([violation.state]))
-    found: set[int] = set()
+    early: set[int] = set()
     for i in range(system.num_constraints):
         last = explicit.k[i]
         for _ in range(system.num_states):
@@ -277,10 +277,10 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
             if by_force.any():
                 break
             if by_control.any():
-                found.update(int(j) for j in np.flatnonzero(by_control))
+                early.update(int(j) for j in np.flatnonzero(by_control))
                 break
             last = lie_derivative(last, explicit.f, x)
-    return sorted(found)
+    return sorted(early)
 
 
 def _structure_at_nominal(chain: _Chain) -> Structure:

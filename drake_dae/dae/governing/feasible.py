@@ -63,10 +63,10 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     metric /= ca.trace(metric) / high.size
     rows, bounds = _forces(structure, limits, scale)
     goal = wanted / scale
-    found = nearest_within(metric, goal, rows, bounds, SOFTNESS)
+    nearest = nearest_within(metric, goal, rows, bounds, SOFTNESS)
     over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(rows, goal) - bounds)
     is_limited = ca.mmax(over) > WITHIN
-    kept = ca.if_else(is_limited, found * scale, wanted)
+    kept = ca.if_else(is_limited, nearest * scale, wanted)
     control = ca.fmax(-scale, ca.fmin(scale, kept))
     excess = ca.if_else(is_limited, wanted - control, 0.0)
     outputs = {

@@ -44,11 +44,11 @@ def nearest_within(
     symbols = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
     after = _step(**symbols, softness=softness)
     step = ca.Function("step", list(symbols.values()), after, {"cse": True})
-    found = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
-    found.append(ca.SX.ones(count))
+    iterate = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
+    iterate.append(ca.SX.ones(count))
     for _ in range(STEPS + size // LARGER):
-        found = list(step(metric, goal, rows, bounds, *found))
-    return found[0]
+        iterate = list(step(metric, goal, rows, bounds, *iterate))
+    return iterate[0]
 
 
 def _step(

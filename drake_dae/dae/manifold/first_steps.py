@@ -43,8 +43,8 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     unit = ca.fmax(scale, ca.fabs(start))
     lengths = [ca.norm_2(step / scale) for step in steps]
     sizes = [ca.norm_2(step / unit) for step in steps[:2]]
-    found, outcome = _followed(start, steps, lengths, *sizes)
-    outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": found, "step": steps[0]}
+    moved, outcome = _followed(start, steps, lengths, *sizes)
+    outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
     # A cheap test in place of the sines, which are computed only where this one fails.
     doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / usual[i] for i in heads])) - DOUBT
     return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
@@ -65,15 +65,15 @@ def _followed(
     at_start = size <= ROUNDING
     after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
     goes_on = ca.logic_and(at_start, lengths[0] > 0)
-    found = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
+    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
     for number in range(1, len(steps)):
         shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
         goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
         goes_on = ca.logic_and(goes_on, lengths[number] > 0)
-        found += ca.if_else(goes_on, steps[number], 0)
+        moved += ca.if_else(goes_on, steps[number], 0)
     ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
     # A first step of length zero does not tell whether the start is consistent.
     moves = ca.logic_or(after_one, lengths[0] > 0)
     outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
     stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
-    return found, ca.if_else(stays, STAYS, outcome)
+    return moved, ca.if_else(stays, STAYS, outcome)

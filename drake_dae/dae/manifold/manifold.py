@@ -113,10 +113,10 @@ class Manifold:
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
         """`project` without checks of its arguments; the state itself if it is consistent."""
-        found = self.first_steps(start, p)
-        if found is None:
+        moved = self.first_steps(start, p)
+        if moved is None:
             return self.searched(start, p, crosses)
-        return found if found is start else found.copy()
+        return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
         """The first few Newton steps of `project`, for a simulation; the arguments are not checked.
@@ -134,10 +134,10 @@ class Manifold:
         state[...] = start
         parameters[...] = p
         is_valid = function.run()
-        sizes, found, _ = function.outputs
+        sizes, moved, _ = function.outputs
         outcome = sizes.item(0)
         if is_valid and outcome == FOUND:
-            return found
+            return moved
         return start if outcome == STAYS and function.is_finite else None
 
     def searched(
@@ -169,8 +169,8 @@ class Manifold:
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
             return near.copy()  # It was there up to round-off, which no level would move.
-        found = self._settling.settled(start, p)
-        return self.project(start if found is None else found, p)
+        settled = self._settling.settled(start, p)
+        return self.project(start if settled is None else settled, p)
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""

@@ -67,7 +67,7 @@ class ConsistentStateSearch:
             crosses: As for `project`.
         """
         function = self._first_steps
-        sizes, found, _ = function.evaluate(start, p)
+        sizes, moved, _ = function.evaluate(start, p)
         is_finite = function.is_finite
         if (
             is_finite
@@ -75,7 +75,7 @@ class ConsistentStateSearch:
             and not self._residual.function.evaluate(start, p)[0].any()
         ):
             return start
-        known = found.copy() if is_finite and sizes.item(0) == FOUND else None
+        known = moved.copy() if is_finite and sizes.item(0) == FOUND else None
         if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
             known = self._nearly(start, p)
         return self._searched(start, p) if known is None else known
@@ -87,16 +87,16 @@ class ConsistentStateSearch:
         if not converged:
             # Gradients are dependent or steps diverge: least squares with decreasing residual.
             z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
-        found = scale * z
-        if converged and not np.array_equal(found, start):
-            return found
+        state = scale * z
+        if converged and not np.array_equal(state, start):
+            return state
         # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self._residual.size(found, p) <= CONSISTENT:
-            return found
-        residual = self._residual.function.evaluate(found, p)[0].copy()
-        if converged and self._first_steps.evaluate(found, p)[1].any():
-            return found
-        raise InconsistentStateError(self._why(found, p, residual), residual)
+        if self._residual.size(state, p) <= CONSISTENT:
+            return state
+        residual = self._residual.function.evaluate(state, p)[0].copy()
+        if converged and self._first_steps.evaluate(state, p)[1].any():
+            return state
+        raise InconsistentStateError(self._why(state, p, residual), residual)
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""

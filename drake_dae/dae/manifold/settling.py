@@ -37,16 +37,16 @@ class Settling:
         """The consistent state next to one, to round-off; None if the method does not converge."""
         kinetic = self._kinetic
         if kinetic.does_no_work(start, parameters, self._residual.gradients(start, parameters)):
-            found = start.copy()
+            state = start.copy()
             moves = (
-                _settle_level(self._residual, found, rows, columns, parameters, (kinetic, depth))
+                _settle_level(self._residual, state, rows, columns, parameters, (kinetic, depth))
                 for rows, columns, depth in kinetic.levels
             )
             if all(moves):
-                return found
-        found = start.copy()
-        moves = (_settle_level(self._residual, found, *each, parameters) for each in self._levels)
-        return found if all(moves) else None
+                return state
+        state = start.copy()
+        moves = (_settle_level(self._residual, state, *each, parameters) for each in self._levels)
+        return state if all(moves) else None
 
 
 def _settle_level(

@@ -72,10 +72,10 @@ class NormalForm:
         chains = ca.vertcat(residual, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
-            found = choose_completion(structure, chains, samples)
+            chosen = choose_completion(structure, chains, samples)
         else:
-            found = check_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = found  # (22)
+            chosen = check_completion(structure, chains, samples, completion)
+        self.completion, self.completion_signals, self.margin = chosen  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
@@ -144,9 +144,9 @@ class NormalForm:
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
         p = self.system.parameter_vector(parameters)
-        found = self._newton(x, target, p)  # (24)
-        if found is not None:
-            return found
+        solution = self._newton(x, target, p)  # (24)
+        if solution is not None:
+            return solution
         start, first = self._at(x, p)
         if not np.all(np.isfinite(start)):
             raise ModelError(
@@ -156,9 +156,9 @@ class NormalForm:
         reached, stride = 0.0, 0.5
         while reached < 1.0:
             share = min(1.0, reached + stride)
-            found = self._newton(x, start + share * (target - start), p)
-            if found is not None:
-                x, reached, stride = found, share, 2.0 * stride
+            solution = self._newton(x, start + share * (target - start), p)
+            if solution is not None:
+                x, reached, stride = solution, share, 2.0 * stride
             elif stride > 1e-4:
                 stride /= 2.0
             else:
@@ -181,8 +181,8 @@ class NormalForm:
                 return None
             return NewtonModel(lambda z: solve(left(z)), True)
 
-        found, converged = newton(state / scale, linearize)
-        return scale * found if converged else None
+        solution, converged = newton(state / scale, linearize)
+        return scale * solution if converged else None
 
     def _out_of_reach(
         self,

@@ -147,13 +147,13 @@ def references_by_name(
         ReferenceSignalError: A name has no output, an output has no reference or two, or a
             reference does not fit or is not smooth enough.
     """
-    found = []
+    assignments = []
     for name, reference in references.items():
         try:
-            found.append(assigned(name, reference, outputs, degrees))
+            assignments.append(assigned(name, reference, outputs, degrees))
         except ReferenceSignalError as error:
             raise ReferenceSignalError(f"reference '{name}': {error}") from error
-    return in_order(found, outputs)
+    return in_order(assignments, outputs)
 
 
 def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:

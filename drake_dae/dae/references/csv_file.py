@@ -137,8 +137,8 @@ class CsvReference(SplineReference):
 
     def _off(self, spline: TimeSpline) -> FloatArray:
         """The largest deviation of a spline from the rows, shape (size,)."""
-        found = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
-        return np.abs(found - self.table[:, 1:]).max(axis=0)
+        fitted = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
+        return np.abs(fitted - self.table[:, 1:]).max(axis=0)
 
     def _excess(self, spline: TimeSpline) -> float:
         """The largest ratio of deviation to tolerance."""

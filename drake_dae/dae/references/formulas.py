@@ -215,9 +215,9 @@ def settle(reference: Reference, *names: str) -> None:
             )
     lengths = {name: array.size for name, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
-        found = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ReferenceSignalError(
-            f"{listed} need as many entries as each other, or one number for all: {found}"
+            f"{listed} need as many entries as each other, or one number for all: {counts}"
         )
     length = next(iter(lengths.values()), 1)
     for name, array in arrays.items():

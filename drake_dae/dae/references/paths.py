@@ -60,8 +60,8 @@ class PathReference(FormulaReference):
         moments = np.concatenate(
             [ramp * shares, ramp + (end - 2 * ramp) * shares, end - ramp * shares]
         )
-        found = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
-        excess = [peak / limit for peak, limit in zip(found, self.limits.values, strict=True)]
+        largest = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
+        excess = [peak / limit for peak, limit in zip(largest, self.limits.values, strict=True)]
         slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
         # The error between the samples is below 0.1 %.
         return travel if slower <= 1.0 + 1e-9 else travel.slower(1.001 * slower)

@@ -60,10 +60,10 @@ class TimeSpline:
     def differences(self) -> list[FloatArray]:
         """Delta^j c / step^j for j = 0, ..., order; the first and the last point repeated."""
         rest = self.degree - 1
-        found = [np.pad(self.points, ((rest, rest), (0, 0)), mode="edge")]
-        while len(found) <= self.order:
-            found.append(np.diff(found[-1], axis=0) / self.step)
-        return found
+        orders = [np.pad(self.points, ((rest, rest), (0, 0)), mode="edge")]
+        while len(orders) <= self.order:
+            orders.append(np.diff(orders[-1], axis=0) / self.step)
+        return orders
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
@@ -140,12 +140,12 @@ def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[i
     Returns:
         The points, shape (n, k), and the edge of each; a corner belongs to the edge before it.
     """
-    found, edges = [corners[:1]], [0]
+    points, edges = [corners[:1]], [0]
     for edge, (first, last) in enumerate(pairwise(corners)):
         count = int(np.ceil(np.linalg.norm(last - first) / spacing - 1e-9))
-        found.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
+        points.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
         edges += [edge] * count
-    return np.concatenate(found), edges
+    return np.concatenate(points), edges
 
 
 @checked(ReferenceSignalError)

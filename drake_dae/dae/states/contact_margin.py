@@ -86,12 +86,12 @@ class ContactMargins:
     def over(self, samples: Samples, search: bool) -> ContactMargin:
         """The smallest margin at sampled states and, downhill from the worst, between them."""
         p = self._system.parameter_values
-        found = sorted((self.at(state, p) for state in samples.states), key=_first)
-        worst = found[0]
+        margins = sorted((self.at(state, p) for state in samples.states), key=_first)
+        worst = margins[0]
         if not search:
             return worst
         box = ConsistentRegion(samples.manifold, surroundings(samples))
-        for start in found[:3]:
+        for start in margins[:3]:
             for better in self._downhill(box, start, p):
                 worst = min(worst, better, key=_first)
         return worst
@@ -120,10 +120,10 @@ class ContactMargins:
                         return np.inf, np.zeros(state.size)
                     return max(float(reserve.item()), 0.0), gradient
 
-                found = self.at(box.descend(slope, best.state), parameters)
-                if not _first(found) < factor:
+                lower = self.at(box.descend(slope, best.state), parameters)
+                if not _first(lower) < factor:
                     break
-                best = found
+                best = lower
                 yield best
 
     def _direction(self, parameters: FloatArray) -> FloatArray:

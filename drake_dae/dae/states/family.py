@@ -91,12 +91,14 @@ class Family:
             return member is not None and acts(*member)
 
         numbers = self._numbers
-        found = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
+        candidates = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
         # No parameter alone decides: those without which it does not act.
-        found = found or [n for n in numbers if not acts_with(n[1], others=values, those=defaults)]
+        candidates = candidates or [
+            n for n in numbers if not acts_with(n[1], others=values, those=defaults)
+        ]
         largest = [
             (name, places[int(np.argmax(np.abs(values[places] - defaults[places])))])
-            for name, places in found or numbers
+            for name, places in candidates or numbers
         ]
         return Deciding(
             tuple(name for name, _ in largest),
@@ -135,19 +137,19 @@ class Family:
     def _numbers(self) -> list[tuple[str, list[int]]]:
         """The numbers to draw: parameters and derivatives of signals, with their places."""
         system = self._system
-        found, start, following = [], 0, sum(p.value.size for p in system.parameters)
+        entries, start, following = [], 0, sum(p.value.size for p in system.parameters)
         rates = []
         for p in system.parameters:
             size = p.value.size
             free = [start + i for i in range(size) if p.low[i] < p.high[i]]
             if free:
-                found.append((p.name, free))
+                entries.append((p.name, free))
             for order in range(1, len(p.derivatives) + 1):
                 if free:
                     rates.append((p.name + "'" * order, [following + i - start for i in free]))
                 following += size
             start += size
-        return found + rates
+        return entries + rates
 
     @cached_property
     def _members(self) -> list[tuple[FloatArray, FloatArray]]:
@@ -155,25 +157,29 @@ class Family:
             return []
         system, random = self._system, np.random.default_rng(0)
         low, high = system.parameter_box
-        defaults, found = system.parameter_values, []
+        defaults, members = system.parameter_values, []
         for number in range(MEMBERS):
             away = random.uniform(low, high) - defaults
             state = self._states[number % len(self._states)]
             for _ in range(_TRIES):
                 member = self._consistent(state, defaults + away)
                 if member is not None:
-                    found.append(member)
+                    members.append(member)
                     break
                 away *= _NEARER
-        return found
+        return members
 
     def _consistent(
         self, state: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
         """A consistent state near one for other numbers; None if there is none in the domain."""
         try:
-            found = self._manifold.project(state, parameters)
+            consistent = self._manifold.project(state, parameters)
         except InconsistentStateError:
             return None
-        fields = fields_at(self._system, found, parameters)
-        return (found, parameters) if all(np.all(np.isfinite(f)) for f in fields.values()) else None
+        fields = fields_at(self._system, consistent, parameters)
+        return (
+            (consistent, parameters)
+            if all(np.all(np.isfinite(f)) for f in fields.values())
+            else None
+        )

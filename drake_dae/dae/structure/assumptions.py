@@ -165,10 +165,10 @@ class Violation:
                 what = "gradients of constraints"
                 if self.cause in (ViolationKind.CONSTRAINT_RANK, ViolationKind.HIDDEN_DEGREE):
                     what = "rows of A(x)"
-                found = [f"{what}: {rows}"] if rows else []
+                statements = [f"{what}: {rows}"] if rows else []
                 if value:
-                    found.insert(0, f"smallest singular value {value} ({scaled})")
-                return f"A(x) loses rank{where}: {'; '.join(found)}"
+                    statements.insert(0, f"smallest singular value {value} ({scaled})")
+                return f"A(x) loses rank{where}: {'; '.join(statements)}"
             case ViolationKind.NUMBERS:
                 kind = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
@@ -178,11 +178,11 @@ class Violation:
                 )
             case ViolationKind.BOUNDS:
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                found = [
+                statements = [
                     f" of '{name}', between its default {default:.6g} and {bound:.6g}"
                     for name, bound, default in (self.deciding.pairs if self.deciding else ())
                 ]
-                return f"{matrix} loses rank within the bounds{','.join(found)}"
+                return f"{matrix} loses rank within the bounds{','.join(statements)}"
             case ViolationKind.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "

@@ -121,16 +121,16 @@ def find_constraint_structure(
         ModelError: A function is not finite at the nominal state, the mass matrix is not symmetric
             and positive definite, or count or spread make no sense.
     """
-    found, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(found)
+    structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(structure)
     if violation:
         raise violation.error()
     # Rows of n* that are only round-off are no feedthrough.
-    _, n_star = eliminated_at(samples, found.elimination)
+    _, n_star = eliminated_at(samples, structure.elimination)
     acts = np.any([value for value, _ in n_star], axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
-    feedthrough = ca.sparsify(ca.mtimes(rows, found.elimination.n_star))
-    return replace(found, elimination=replace(found.elimination, n_star=feedthrough))
+    feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
+    return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
 
 
 def constraint_structure_of(
@@ -222,7 +222,7 @@ def examine_constraints(
     elimination = eliminate(derivatives)
     # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
     matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
-    found = ConstraintStructure(
+    structure = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
         manifold=samples.manifold,
@@ -232,7 +232,7 @@ def examine_constraints(
         scale=samples.scale,
         constraint_margin=find_margin(samples, matrix) if chains else None,
     )
-    return found, samples
+    return structure, samples
 
 
 def check_system(system: DaeSystem) -> None:
@@ -248,20 +248,24 @@ def check_system(system: DaeSystem) -> None:
         raise Violation(2, ViolationKind.COUNT, names).error()
 
 
-def constraint_violation(found: ConstraintStructure) -> Violation | None:
+def constraint_violation(structure: ConstraintStructure) -> Violation | None:
     """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
     causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
-    signals, margin = found.system.constraint_output_signals, found.constraint_margin
-    violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
+    signals, margin = structure.system.constraint_output_signals, structure.constraint_margin
+    violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
     if margin is None:
         return None
-    matrix = found.system.frictional_contacts.without_friction(found.elimination.constraint_matrix)
-    violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
+    matrix = structure.system.frictional_contacts.without_friction(
+        structure.elimination.constraint_matrix
+    )
+    violation = with_numbers(violation, 2, structure.manifold, structure.states, matrix)
     if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
     if violation.cause is not ViolationKind.CONSTRAINT_RANK:
-        return _as_redundant(found.system, violation)
-    dependence = find_dependence(found.manifold, found.elimination, found.states, margin.state)
+        return _as_redundant(structure.system, violation)
+    dependence = find_dependence(
+        structure.manifold, structure.elimination, structure.states, margin.state
+    )
     cause = ViolationKind.CONSTRAINT_RANK
     if dependence.in_gradients:
         cause = (
@@ -272,7 +276,7 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
     elif dependence.everywhere:
         cause = ViolationKind.HIDDEN_DEGREE
     found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
-    return _as_redundant(found.system, found_cause)
+    return _as_redundant(structure.system, found_cause)
 
 
 def with_numbers(

@@ -137,7 +137,7 @@ def combinations_of(
     """
     matrix, lengths = _scaled(values[0])
     kept: list[int] = []
-    found = []
+    combinations = []
     for i, name in enumerate(names):
         factors, error = _fit(matrix, kept, i)
         if error >= least:
@@ -150,8 +150,8 @@ def combinations_of(
             scaled, own = _scaled(value)
             others.append(_fit(scaled, used, i)[0] * own[i] / own[used])
         constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
-        found.append(Combination(name, tuple(names[j] for j in used), plain, constant))
-    return found
+        combinations.append(Combination(name, tuple(names[j] for j in used), plain, constant))
+    return combinations
 
 
 def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, float]:

@@ -75,5 +75,5 @@ class Elsewhere:
 
     def deciding(self, indices: Sequence[int]) -> Deciding | None:
         """The deciding numbers for constraints or outputs on which nothing acts at the defaults."""
-        found = (self._found[i].deciding for i in indices if i in self._found)
-        return next(found, None)
+        deciding = (self._found[i].deciding for i in indices if i in self._found)
+        return next(deciding, None)

@@ -241,8 +241,8 @@ class Passage:
         self, state: FloatArray, rate: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         n, m = state.size, self.structure.system.num_constraints
-        found = [v.copy() for v in self._derivatives.evaluate(state, rate, parameters)]
-        c_rate, c_second, slope, turning, bending = found
+        derivatives = [v.copy() for v in self._derivatives.evaluate(state, rate, parameters)]
+        c_rate, c_second, slope, turning, bending = derivatives
         return (
             c_rate,
             c_second,

@@ -192,9 +192,9 @@ def output_chains(
                 stuck.append(i)
         if stuck:
             those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
-            found = tuple(following_outputs(samples, those))
+            following = tuple(following_outputs(samples, those))
             violation = Violation(
-                5, ViolationKind.NO_CONTROL, those, combinations=found, deciding=deciding
+                5, ViolationKind.NO_CONTROL, those, combinations=following, deciding=deciding
             )
             raise violation.error()
         undecided = still

@@ -96,11 +96,11 @@ class Structure(ConstraintStructure):
             return None
         motion = self.derivatives
         shown = ca.vertcat(motion.rate, motion.constraint_input)
-        found = motion.inverse(self.highest_derivatives, wanted, shown)
-        if found is None:
+        solution = motion.inverse(self.highest_derivatives, wanted, shown)
+        if solution is None:
             return None
         size = self.system.num_states
-        return found[2][:size, :], found[2][size:, :], found[1]
+        return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
         """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
@@ -113,12 +113,12 @@ class Structure(ConstraintStructure):
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
         """
-        found: tuple[ca.SX, ...] | None = None
+        solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
-            found = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
-        if found is None:  # L_h* of an output vanishes, but not by structure.
-            found = self.control_by_matrix(wanted)
-        control, pivot, *_ = found
+            solution = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
+        if solution is None:  # L_h* of an output vanishes, but not by structure.
+            solution = self.control_by_matrix(wanted)
+        control, pivot, *_ = solution
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot

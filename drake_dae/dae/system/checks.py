@@ -54,7 +54,7 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         if contact.friction is not None:
             parameter_slice(name, parameters, contact.friction)
     expressions = _expressions(given, state, parameters)
-    found = {"state": state, "parameters": parameters, **expressions}
+    fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
     for key, count, letter in (
@@ -64,10 +64,10 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         ("control_signals", p, "u"),
         ("output_signals", q, "z"),
     ):
-        found[key] = _signals(name, key, given[key], count, letter)
-    found |= _numbers(name, given, n)
-    found |= _choice(name, given, p, q)
-    return found
+        fields[key] = _signals(name, key, given[key], count, letter)
+    fields |= _numbers(name, given, n)
+    fields |= _choice(name, given, p, q)
+    return fields
 
 
 def _parameters(name: str, given: Any) -> tuple[Parameter, ...]:
@@ -104,15 +104,15 @@ def _signals(
 def _numbers(name: str, given: Mapping[str, Any], size: int) -> dict[str, FloatArray]:
     """The nominal state, and how large states are where that is given."""
     start = np.zeros(size) if given["nominal_state"] is None else given["nominal_state"]
-    found = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
+    arrays = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
     if given["state_scale"] is not None:
         scale = vector(f"{name}: state_scale", given["state_scale"], size)
         if not np.all(scale > 0.0):
             raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
-        found["state_scale"] = scale
-    for array in found.values():
+        arrays["state_scale"] = scale
+    for array in arrays.values():
         array.setflags(write=False)
-    return found
+    return arrays
 
 
 def _choice(name: str, given: Mapping[str, Any], controls: int, outputs: int) -> dict[str, ca.SX]:

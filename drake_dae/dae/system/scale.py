@@ -149,17 +149,17 @@ def _alike(comparisons: list[_Comparison]) -> FloatArray:
     """
     unknowns, logarithms, equation, weight, is_plain = map(np.array, zip(*comparisons, strict=True))
     kept: Booleans = is_plain
-    found = np.zeros(unknowns.shape[1])
+    solution = np.zeros(unknowns.shape[1])
     for _ in range(SELECTIONS):
         weights = kept * weight
         for _ in range(REPETITIONS):
-            factors, last = np.sqrt(weights), found
-            found = np.linalg.lstsq(factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9)[
-                0
-            ]
-            left = unknowns @ found + logarithms
+            factors, last = np.sqrt(weights), solution
+            solution = np.linalg.lstsq(
+                factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9
+            )[0]
+            left = unknowns @ solution + logarithms
             weights = kept * weight / np.sqrt(1.0 + left * left)
-            if np.max(np.abs(found - last)) < CONVERGED:
+            if np.max(np.abs(solution - last)) < CONVERGED:
                 break
         largest = np.zeros(unknowns.shape[1])
         np.maximum.at(largest, equation, left)
@@ -167,7 +167,7 @@ def _alike(comparisons: list[_Comparison]) -> FloatArray:
         if np.array_equal(significant, kept):
             break
         kept = significant
-    return found
+    return solution
 
 
 def _terms(

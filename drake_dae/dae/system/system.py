@@ -418,14 +418,14 @@ class DaeSystem:
                 f"{self.name}: values must have shape ({size},) or (samples, {size}), got "
                 f"{values.shape}"
             )
-        found = np.empty((*values.shape[:-1], self._defaults.size))
-        found[...] = self._defaults
+        parameters = np.empty((*values.shape[:-1], self._defaults.size))
+        parameters[...] = self._defaults
         sizes = {p.name: p.value.size for p in other.parameters}
         for p in self.parameters:
             if sizes.get(p.name) == p.value.size:
                 own = self.parameter_slice(p.name)
-                found[..., own] = values[..., other.parameter_slice(p.name)]
-        return found
+                parameters[..., own] = values[..., other.parameter_slice(p.name)]
+        return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """A state as a new array of shape (n,).

@@ -96,18 +96,18 @@ class AlongCurve:
                 where = f"at t = {time:.4g} s of the reference the path is out of reach"
                 raise ReferenceSignalError(f"{where}: {error}") from error
             coarse.append(guess)
-        found = np.array(coarse)
+        states = np.array(coarse)
         # By interpolation, then on finer grids.
         for number in (4 * COARSE, count):
             finer = np.unique(np.linspace(0, count, number + 1).astype(int))
-            start = _interpolated(places, found, finer)
-            found, places = self.states(rest[finer], start, parameters), finer
+            start = _interpolated(places, states, finer)
+            states, places = self.states(rest[finer], start, parameters), finer
         moving = self.reference(piece, still + 1.0, still) - rest
         moving[:, self.layout.lowest[self.layout.dynamic] + 2] = 0.0
-        _, gradients = self._newton(found, rest, parameters)
-        goals = np.zeros(found.shape)
+        _, gradients = self._newton(states, rest, parameters)
+        goals = np.zeros(states.shape)
         goals[:, -self.layout.chain_size :] = moving[:, self.layout.chained]
-        return found, self._solved(gradients, goals)
+        return states, self._solved(gradients, goals)
 
     def states(self, rows: FloatArray, start: FloatArray, parameters: FloatArray) -> FloatArray:
         """The states on Z(R) of rows of R near given ones, by Newton's method, shape (k, n).

@@ -138,7 +138,7 @@ class Curve:
         self, times: FloatArray, values: FloatArray, speeds: FloatArray
     ) -> list[tuple[float, float, float, bool]]:
         """First and last time, length, and whether it is a pause, of each piece."""
-        found: list[tuple[float, float, bool]] = []
+        ranges: list[tuple[float, float, bool]] = []
         moves = speeds > self._rest
         first, before = float(times[0]), -1  # The begin of a piece, and its last moving sample.
         rates = self._weights * values[:, self._first]
@@ -150,23 +150,23 @@ class Curve:
                 is_next = before >= 0 and k - before <= 2
                 turn = self._turn(times, rates, before, k) if is_next else None
                 if turn is not None:
-                    found.append((first, turn, False))
+                    ranges.append((first, turn, False))
                     first = turn
                 before = k
             elif k + 1 < times.size and not moves[k + 1] and (k == 0 or moves[k - 1]):
                 last = k + int(np.argmax(np.append(moves[k:], True)))
                 if before >= 0:
-                    found.append((first, float(times[k]), False))
+                    ranges.append((first, float(times[k]), False))
                 first, before = float(times[last - 1]), -1
-                found.append((float(times[k]), first, True))
+                ranges.append((float(times[k]), first, True))
         if first < times[-1]:
-            found.append((first, float(times[-1]), False))
+            ranges.append((first, float(times[-1]), False))
         lengths = np.concatenate(
             [[0.0], np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2)]
         )
         return [
             (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), still)
-            for a, b, still in found
+            for a, b, still in ranges
         ]
 
     def _turn(self, times: FloatArray, rates: FloatArray, k: int, after: int) -> float | None:

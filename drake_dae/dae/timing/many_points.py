@@ -41,14 +41,14 @@ class ManyPoints:
             For each result an array of shape (k, size), or (k, rows, columns) of a matrix.
         """
         count = len(arguments[0])
-        results = [np.empty((count, found.shape[1])) for found in self._found]
+        results = [np.empty((count, part.shape[1])) for part in self._found]
         for first in range(0, count, BLOCK):
             last = min(first + BLOCK, count)
             for own, given in zip(self._given, arguments, strict=True):
                 own[: last - first] = given[first:last] if given.ndim == 2 else given
             self._evaluate()
-            for result, found in zip(results, self._found, strict=True):
-                result[first:last] = found[: last - first]
+            for result, part in zip(results, self._found, strict=True):
+                result[first:last] = part[: last - first]
         return [
             array if columns == 1 else array.reshape(count, columns, rows).transpose(0, 2, 1)
             for array, (rows, columns) in zip(results, self._shapes, strict=True)

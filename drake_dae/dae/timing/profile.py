@@ -95,12 +95,12 @@ class TimeProfile:
     @property
     def shares(self) -> dict[str, float]:
         """What limits the motion, with its share of the time, the largest first."""
-        found: dict[str, float] = {}
+        sums: dict[str, float] = {}
         for one in self.pieces:
             for place, time in zip(one.limiting.tolist(), np.diff(one.times), strict=True):
                 name = self.causes[place].text
-                found[name] = found.get(name, 0.0) + float(time) / self.duration
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+                sums[name] = sums.get(name, 0.0) + float(time) / self.duration
+        return dict(sorted(sums.items(), key=lambda item: -item[1]))
 
 
 @checked(ReferenceSignalError)
@@ -181,16 +181,16 @@ class PathTiming:
         curve = Curve(references, along.layout, begin, end, points)
         guess = system.nominal_state if start is None else vector("start", start, system.num_states)
         numbers = system.parameter_vector(parameters)
-        found, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
+        parts, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
         for piece in _without_last_pause(curve.pieces, along.layout):
             if piece.is_pause:
-                found.append(_pause(piece))
+                parts.append(_pause(piece))
                 continue
             tools = tool_limits(references, piece, along.layout)
             rows = rows_along(along, piece, guess, numbers, tools)
             guess, causes = rows.at_rest[-1], rows.names
-            found.append(_fastest(rows, piece, largest_rate))
-        return TimeProfile(tuple(found), (*causes, _PAUSE), begin, along.layout)
+            parts.append(_fastest(rows, piece, largest_rate))
+        return TimeProfile(tuple(parts), (*causes, _PAUSE), begin, along.layout)
 
 
 @checked(ReferenceSignalError)
@@ -266,8 +266,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
     factor = np.ones(largest.size)
     before: FloatArray | None = None
     for _ in range(LOWERINGS + 1):
-        found, before = _settled(rows, piece, largest, factor, before)
-        b, a, times = smoothed(piece.distances, found.b, found.a)
+        fastest, before = _settled(rows, piece, largest, factor, before)
+        b, a, times = smoothed(piece.distances, fastest.b, fastest.a)
         lines = rows.lines(b)
         excess = np.max(lines.alpha * a[:, None] + lines.beta * b[:, None], axis=1, initial=0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -276,8 +276,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
             break
         wide = np.pad(np.maximum(excess / (1.0 + EXCESS / 2.0), 1.0), 1, mode="edge")
         factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
-    limiting = np.where(found.active >= 0, found.active, which[1:])
-    return ProfilePiece(piece, times, b, a, found.highest, limiting)
+    limiting = np.where(fastest.active >= 0, fastest.active, which[1:])
+    return ProfilePiece(piece, times, b, a, fastest.highest, limiting)
 
 
 def _settled(
@@ -291,20 +291,20 @@ def _settled(
     for number in range(1 if rows.is_linear else PASSES):
         lines = rows.lines(before)
         lowered = LinearLimits(lines.alpha * factor[:, None], lines.beta * factor[:, None])
-        found = fastest_motion(piece.distances, lowered, largest / factor)
-        if not np.isfinite(found.b).all():
+        fastest = fastest_motion(piece.distances, lowered, largest / factor)
+        if not np.isfinite(fastest.b).all():
             raise ReferenceSignalError(
                 "nothing limits the motion: give limits of controls, joints or forces"
             )
-        moves = found.b[1:] + found.b[:-1] > 0.0
+        moves = fastest.b[1:] + fastest.b[:-1] > 0.0
         if not moves.all():
             place = float(piece.times[int(np.argmin(moves))])
             raise ReferenceSignalError(
                 f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses "
                 "all of a limit"
             )
-        if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
+        if before is not None and np.abs(fastest.b - before).max() <= SETTLED * fastest.b.max():
             break
         if not rows.is_linear:
-            before = found.b if before is None or number < 10 else (found.b + before) / 2.0
-    return found, before
+            before = fastest.b if before is None or number < 10 else (fastest.b + before) / 2.0
+    return fastest, before

@@ -102,14 +102,14 @@ def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatA
     The room between the lowest upper and the highest lower bound of a is concave in b: Newton's
     method from the right ends after finitely many steps.
     """
-    found = start.copy()
+    lowered = start.copy()
     rows = np.arange(len(alpha))
     up, down = alpha > 0.0, alpha < 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / np.where(alpha == 0.0, 1.0, alpha)
         slope = beta * inverse
         for _ in range(100):
-            finite = np.where(np.isfinite(found), found, 1e30)[:, None]
+            finite = np.where(np.isfinite(lowered), lowered, 1e30)[:, None]
             bounds = inverse - slope * finite
             p = np.where(up, bounds, np.inf).argmin(axis=1)
             q = np.where(down, bounds, -np.inf).argmax(axis=1)
@@ -117,8 +117,8 @@ def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatA
             gap = bounds[rows, p] - bounds[rows, q]
             falls = slope[rows, p] - slope[rows, q]
             new = (inverse[rows, p] - inverse[rows, q]) / falls
-            over = has & (gap < 0.0) & (falls > 0.0) & (new < found * (1.0 - 1e-14))
+            over = has & (gap < 0.0) & (falls > 0.0) & (new < lowered * (1.0 - 1e-14))
             if not over.any():
                 break
-            found[over] = new[over]
-    return found
+            lowered[over] = new[over]
+    return lowered

@@ -80,12 +80,12 @@ def _polynomials(
 ) -> FloatArray:
     """The factors of (1, x, ..., x^5) in each interval, shape (N, outputs, 6)."""
     count, low = widths.size, layout.lowest
-    found = np.zeros((count, len(layout.degrees), 6))
+    coefficients = np.zeros((count, len(layout.degrees), 6))
     values = piece.values[:, low]
-    found[:, :, 0] = values[:-1]
-    found[:, :, 1] = np.diff(values, axis=0)
+    coefficients[:, :, 0] = values[:-1]
+    coefficients[:, :, 1] = np.diff(values, axis=0)
     if piece.is_pause:
-        return found
+        return coefficients
     speed = np.sqrt(b)
     width = widths[:, None]
     rates = piece.tangents * speed[:, None]
@@ -102,5 +102,5 @@ def _polynomials(
         ],
         axis=-1,
     )
-    found[:, moving] = given @ QUINTIC.T
-    return found
+    coefficients[:, moving] = given @ QUINTIC.T
+    return coefficients

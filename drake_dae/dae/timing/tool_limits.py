@@ -41,7 +41,7 @@ def tool_limits(
 
     with a polygon inside it.
     """
-    found, first = [], 0
+    every, first = list[ToolLimits](), 0
     columns = {int(place): column for column, place in enumerate(layout.dynamic)}
     for reference in references:
         rows = range(first, first + reference.size)
@@ -63,5 +63,5 @@ def tool_limits(
         with np.errstate(divide="ignore"):
             largest = np.where(size > 0.0, (limits.speed / size) ** 2, np.inf)
         of_b = (along[:, None] * cosine + across[:, None] * sine) / shrunk
-        found.append(ToolLimits(largest, size[:, None] * cosine / shrunk, of_b))
-    return found
+        every.append(ToolLimits(largest, size[:, None] * cosine / shrunk, of_b))
+    return every

@@ -55,16 +55,16 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
     residual = manifold.residual_expression
     names = tuple(signal.name for signal in system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
-    found = damping
-    if not isinstance(found, FeedbackGains):
-        found = result_of("constraint_damping", found, names, degrees, error=GainError)
-    if not isinstance(found, FeedbackGains) or (found.names, found.degrees) != (names, degrees):
+    gains = damping
+    if not isinstance(gains, FeedbackGains):
+        gains = result_of("constraint_damping", gains, names, degrees, error=GainError)
+    if not isinstance(gains, FeedbackGains) or (gains.names, gains.degrees) != (names, degrees):
         raise GainError(
             f"constraint_damping must be a design such as poles(-200.0) for the constraints "
             f"{', '.join(names) or 'none'} with r_i - 1 = {degrees} poles each"
         )
     rates = residual[np.flatnonzero(layout.orders).tolist(), :]
-    force = ca.mtimes(ca.sparsify(ca.DM(found.matrix)), rates)
+    force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     return _along(replace(structure, derivatives=derivatives), derivatives)
 
@@ -141,12 +141,12 @@ def contact_damping(
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    found = best_damping(stiffness, mobility, sample_time, delay)
+    best = best_damping(stiffness, mobility, sample_time, delay)
     if sample_time:
         frequency = float(np.sqrt(mobility * stiffness))
-        lost = unstable_from(frequency, sample_time, delay, found)
-        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {found:.4g} 1/s")
-    return found
+        lost = unstable_from(frequency, sample_time, delay, best)
+        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {best:.4g} 1/s")
+    return best
 
 
 def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:

@@ -240,13 +240,13 @@ def _per_output(
     useless = [name for name in values if name in names and name not in expected]
     if unknown or missing or useless:
         parts = [
-            f"{text}: {', '.join(found)}"
-            for text, found in (
+            f"{text}: {', '.join(is_wrong)}"
+            for text, is_wrong in (
                 ("unknown outputs", unknown),
                 ("no gains for", missing),
                 ("degree 0, no gains", useless),
             )
-            if found
+            if is_wrong
         ]
         raise GainError(f"gains per output: {'; '.join(parts)}. Needed: {', '.join(expected)}")
     return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]

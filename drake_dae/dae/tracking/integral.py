@@ -50,12 +50,12 @@ class IntegralAction:
                 mu_i = 0 that is not measured.
         """
         known = [signal.name for signal in system.output_signals]
-        found = []
+        integrated = []
         for name in names:
             if name not in known:
                 raise GainError(f"integral: {unknown_name('output', name, known)}")
             i = known.index(name)
-            if i in found:
+            if i in integrated:
                 raise GainError(f"integral: '{name}' occurs twice")
             if degrees[i] == 0 and (measured is None or i not in measured.inputs):
                 raise GainError(
@@ -63,8 +63,8 @@ class IntegralAction:
                     "no error to integrate; make the law with measured_force=True, and integrate "
                     "a constraint input"
                 )
-            found.append(i)
-        chosen = tuple(sorted(found))
+            integrated.append(i)
+        chosen = tuple(sorted(integrated))
         signals = tuple(
             Signal(f"integral of {known[i]}", f"{system.output_signals[i].unit or '1'} s")
             for i in chosen

@@ -117,15 +117,15 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
 
 def _force_outputs(system: DaeSystem) -> dict[int, int]:
     """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
-    found = {}
+    forces = {}
     for i in range(system.num_outputs):
         row = ca.sparsify(system.m[i, :])
         if row.nnz() == 1 and system.l[i].is_zero():
             j = row.sparsity().get_triplet()[1][0]
             if row[j].is_one():
-                found[i] = j
-    if not found:
+                forces[i] = j
+    if not forces:
         raise ModelError(
             f"{system.name}: measured_force needs an output that is a constraint input, z_i = v_j"
         )
-    return found
+    return forces

@@ -175,10 +175,10 @@ class TrackingLaw:
         Returns:
             A function of what `function` takes; None where there is none.
         """
-        found = self.structure.motion_for(self._wanted) if self._model is self.structure else None
-        if found is None:
+        motion = self.structure.motion_for(self._wanted) if self._model is self.structure else None
+        if motion is None:
             return None
-        rate, force, pivot = found
+        rate, force, pivot = motion
         outputs = {"rate": rate, "force": force}
         name = f"{self.system.name} under its law"
         return TracedFunction(name, self._inputs, outputs, pivot, often=False)
@@ -204,19 +204,19 @@ class TrackingLaw:
         """
         names = tuple(signal.name for signal in self.system.output_signals)
         degrees = self.integral.all_degrees
-        found = gains
-        if not isinstance(found, FeedbackGains):
-            found = result_of("gains", found, names, degrees, error=GainError)
-        if not isinstance(found, FeedbackGains):
+        designed = gains
+        if not isinstance(designed, FeedbackGains):
+            designed = result_of("gains", designed, names, degrees, error=GainError)
+        if not isinstance(designed, FeedbackGains):
             raise GainError(
-                f"gains must be a design such as poles(-4.0), got one of {brief(found)}"
+                f"gains must be a design such as poles(-4.0), got one of {brief(designed)}"
             )
-        if (found.names, found.degrees) != (names, degrees):
+        if (designed.names, designed.degrees) != (names, degrees):
             raise GainError(
-                f"the gains are for the outputs {', '.join(found.names)} with degrees "
-                f"{found.degrees}, the system has {', '.join(names)} with {degrees}"
+                f"the gains are for the outputs {', '.join(designed.names)} with degrees "
+                f"{designed.degrees}, the system has {', '.join(names)} with {degrees}"
             )
-        return found
+        return designed
 
     def all_parameters(
         self,
@@ -249,13 +249,13 @@ class TrackingLaw:
     def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
-        found = []
+        signals = []
         for i, (signal, degree) in enumerate(
             zip(self.system.output_signals, self.degrees, strict=True)
         ):
-            found += [integrals[i]] if i in integrals else []
-            found += [signal.derivative(order) for order in range(degree)]
-        return found
+            signals += [integrals[i]] if i in integrals else []
+            signals += [signal.derivative(order) for order in range(degree)]
+        return signals
 
     def control(
         self,

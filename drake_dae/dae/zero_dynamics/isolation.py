@@ -83,10 +83,10 @@ def isolation(
         return Isolation(0, 0.0)
     radius = 0.0
     for i in weak:
-        found = rest.radius(i)
-        if found is None:
+        distance = rest.radius(i)
+        if distance is None:
             return None
-        radius = max(radius, found)
+        radius = max(radius, distance)
     return Isolation(len(weak), radius)
 
 
@@ -150,15 +150,15 @@ class _Rest:
         """
         noise = max(self._noise[index], ROUNDED * self._usual(index))
         seen = GROWTH * max(self._left[index], noise)
-        found = None
+        radius = None
         for distance in RADII:
             # On both sides: a function that grows on one and decreases on the other does not
             # vanish.
             if not min(self._at_distance(index, distance)) > seen:
                 break
-            found = distance
-        if found is not None or self._left[index] > GROWTH * noise:
-            return found
+            radius = distance
+        if radius is not None or self._left[index] > GROWTH * noise:
+            return radius
         longest = max(AFAR, 2.0 * float(np.max(np.abs(self._state) / self._scale)))
         distances = 2.0 ** np.arange(1, np.log2(longest) + 1)
         far = (max(self._at_distance(index, float(distance))) for distance in distances)
@@ -166,14 +166,14 @@ class _Rest:
 
     def _at_distance(self, index: int, distance: float) -> tuple[float, float]:
         """The size of the rate on both sides of a direction; 0 where it is not known."""
-        found = []
+        rates = []
         for side in (distance, -distance):
             aside = self._beside(index, side)
             state, converged = self._pinned.project(aside, *self._at)
             moved = np.max(np.abs(state - aside) / self._scale)
             is_near = converged and moved <= STRAIGHT * distance
-            found.append(self._left_at(state, index) if is_near else 0.0)
-        return found[0], found[1]
+            rates.append(self._left_at(state, index) if is_near else 0.0)
+        return rates[0], rates[1]
 
     def _left_at(self, state: FloatArray, index: int) -> float:
         rate = self._rate(state)

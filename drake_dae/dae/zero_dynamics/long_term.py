@@ -51,6 +51,15 @@ class Behavior(Enum):
     UNCLEAR = "was not followed long enough to decide"
 
 
+VERDICTS = {
+    Behavior.GROWS: Verdict.UNSTABLE,
+    Behavior.LEAVES: Verdict.UNSTABLE,
+    Behavior.CIRCLES: Verdict.BOUNDED,
+    Behavior.WANDERS: Verdict.UNDECIDED,
+}
+"""The verdicts that follow from a long-term behavior."""
+
+
 @dataclass(frozen=True, eq=False)
 class LongTerm:
     """The long-term behavior of a motion, with its evidence.
@@ -66,9 +75,19 @@ class LongTerm:
     closed: PeriodicMotion | None = None
 
     def __str__(self) -> str:
-        return (
-            self.behavior.value if self.closed is None else f"{self.behavior.value} ({self.closed})"
-        )
+        periodic = "" if self.closed is None else f" ({self.closed})"
+        return self.behavior.value + periodic
+
+    def verdict_on_unstable(self, reason: str) -> tuple[Verdict, str]:
+        """The verdict on an unstable motion that other motions leave with this behavior.
+
+        Args:
+            reason: Why the motion is unstable; the returned reason may add the behavior.
+        """
+        if self.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
+            return Verdict.UNSTABLE, reason
+        verdict = VERDICTS.get(self.behavior, Verdict.UNSTABLE)
+        return verdict, f"{reason}; a motion that leaves it {self}"
 
 
 def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
@@ -131,7 +150,7 @@ def carry_in_halves(
     """The flow over an interval and over its halves.
 
     Raises:
-        Lost: The motion cannot be followed.
+        MotionLost: The motion cannot be followed.
     """
     middle = 0.5 * (begin + end)
     first = flow.carry(state, begin, middle)
@@ -219,24 +238,13 @@ def judge_at_rest(
     pinned, sizes = equilibria.pinned, equilibria.sizes
     values, errors, _ = equilibria.eigenvalues(goal, rest, parameters)
     place = f"at the equilibrium with {pinned.describe(goal)}"
-    found = judge(values, errors, rest, place)
-    if found.verdict is not Verdict.UNSTABLE:
-        return found
+    at_rest = judge(values, errors, rest, place)
+    if at_rest.verdict is not Verdict.UNSTABLE:
+        return at_rest
     flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, sizes)
     course = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
-    return _after(found, course)
-
-
-def _after(found: Stability, course: LongTerm) -> Stability:
-    """The verdict on an unstable equilibrium, given the behavior of motions that leave it."""
-    verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
-        course.behavior, Verdict.UNSTABLE
-    )
-    if course.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
-        return found
-    return replace(
-        found, verdict=verdict, reason=f"{found.reason}; a motion that leaves it {course}"
-    )
+    verdict, reason = course.verdict_on_unstable(at_rest.reason)
+    return replace(at_rest, verdict=verdict, reason=reason)
 
 
 def judge_without_rest(
@@ -255,7 +263,7 @@ def judge_without_rest(
         parameters: Values of all parameters.
         reason: Why there is no equilibrium.
     """
-    nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
+    pinned = equilibria.pinned
     flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         course = watch_from(flow, pinned.state(goal, start, parameters))
@@ -263,13 +271,7 @@ def judge_without_rest(
             rest = equilibria.find(goal, course.state, parameters)
             return judge_at_rest(equilibria, goal, rest, parameters)
     except InconsistentStateError:
-        return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    verdict = {
-        Behavior.GROWS: Verdict.UNSTABLE,
-        Behavior.LEAVES: Verdict.UNSTABLE,
-        Behavior.CIRCLES: Verdict.BOUNDED,
-        Behavior.WANDERS: Verdict.UNDECIDED,
-    }.get(course.behavior)
-    if verdict is None:
-        return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    return Stability(verdict, nothing, None, f"{reason}; the motion from there {course}")
+        return Stability(Verdict.UNDECIDED, reason)
+    if course.behavior not in VERDICTS:
+        return Stability(Verdict.UNDECIDED, reason)
+    return Stability(VERDICTS[course.behavior], f"{reason}; the motion from there {course}")

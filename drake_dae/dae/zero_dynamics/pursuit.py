@@ -235,13 +235,13 @@ class _Pursuit:
                 "it is too fast to be followed",
             )
         goal, parameters = self._goal(time), self._parameters(time)
-        found, converged = self._pinned.project(state, goal, parameters)
+        projected, converged = self._pinned.project(state, goal, parameters)
         near = JUMP * np.maximum(self._pinned.system.scale, np.abs(last.state)) + np.abs(
             state - last.state
         )
-        if not converged or np.any(np.abs(found - state) > near):
+        if not converged or np.any(np.abs(projected - state) > near):
             return False
-        point = self._pinned.point(found, goal, parameters)
+        point = self._pinned.point(projected, goal, parameters)
         regular = self._pinned.regularity(point) is Regularity.REGULAR
         if not regular or point.signs != last.signs:
             return False

@@ -153,16 +153,16 @@ def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Pe
         duration: The longest time to follow, in s.
     """
     periods = islice(_near(flow, state, duration), CROSSINGS)
-    found = (close(flow, state, 0.0, period, free=True) for period in periods)
-    return next((one for one in found if one is not None), None)
+    motions = (close(flow, state, 0.0, period, free=True) for period in periods)
+    return next((one for one in motions if one is not None), None)
 
 
 def find_multiple(
     flow: DisturbanceFlow, state: FloatArray, begin: float, period: float
 ) -> PeriodicMotion | None:
     """The attracting motion near a state whose period is a multiple of the reference's."""
-    found = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
-    return next((one for one in found if one is not None and one.attracts), None)
+    motions = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
+    return next((one for one in motions if one is not None and one.attracts), None)
 
 
 def _near(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Iterator[float]:

@@ -1,6 +1,6 @@
 """Stability of the zero dynamics at an equilibrium, by linearization.            (35)-(36)"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -44,16 +44,16 @@ class Stability:
             limit cycle; undecided if an eigenvalue is on the imaginary axis up to round-off, if no
             equilibrium is found, or if motions that leave it attract their neighbours but do not
             return. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
+        reason: The reason for the verdict, in words.
         eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
             (dimension,); empty if no equilibrium is found.
         state: The equilibrium, shape (n,); None if none is needed, or found.
-        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
-    eigenvalues: ComplexArray
-    state: FloatArray | None
     reason: str
+    eigenvalues: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    state: FloatArray | None = None
 
 
 def linearized_eigenvalues(
@@ -169,22 +169,19 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
     """
     largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
     if np.any(values.real > errors):
-        return Stability(Verdict.UNSTABLE, values, state, f"non-minimum phase: {largest}")
+        return Stability(Verdict.UNSTABLE, f"non-minimum phase: {largest}", values, state)
     if np.all(values.real < -errors):
-        return Stability(Verdict.STABLE, values, state, f"minimum phase: {largest}")
+        return Stability(Verdict.STABLE, f"minimum phase: {largest}", values, state)
     count = np.count_nonzero(np.abs(values.real) <= errors)
-    return Stability(
-        Verdict.UNDECIDED,
-        values,
-        state,
+    reason = (
         f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
-        f"imaginary axis, up to round-off, {place}",
+        f"imaginary axis, up to round-off, {place}"
     )
+    return Stability(Verdict.UNDECIDED, reason, values, state)
 
 
 def without_dynamics(structure: Structure) -> Stability:
     """The verdict on a system without zero dynamics: whether R determines the motion."""
-    nothing = np.zeros(0, dtype=complex)
     margins = {
         "A(x) of Assumption (2)": structure.constraint_margin,
         "B(x) of (16)": structure.control_margin,
@@ -195,6 +192,5 @@ def without_dynamics(structure: Structure) -> Stability:
                 "no zero dynamics, but the reference does not determine the motion: "
                 f"{matrix} is singular at x = {show(margin.state)}"
             )
-            return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    reason = "no zero dynamics: the reference alone determines the motion"
-    return Stability(Verdict.STABLE, nothing, None, reason)
+            return Stability(Verdict.UNDECIDED, reason)
+    return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")

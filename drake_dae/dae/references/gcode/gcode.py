@@ -197,12 +197,12 @@ class _Path:
 
     def at(self, along: FloatArray) -> FloatArray:
         """The points at distances along the path, shape (n, 2)."""
-        found, which = np.empty((along.size, 2)), self.moves_at(along)
+        points, which = np.empty((along.size, 2)), self.moves_at(along)
         for number in np.unique(which).tolist():
             chosen, move = which == number, self.moves[number]
             shares = (along[chosen] - self.ends[number]) / move.length
-            found[chosen] = move.at(np.clip(shares, 0.0, 1.0))
-        return found
+            points[chosen] = move.at(np.clip(shares, 0.0, 1.0))
+        return points
 
     def times(self, change: float, bend: float, acceleration: float) -> FloatArray:
         """When the motion passes the nodes, in s.

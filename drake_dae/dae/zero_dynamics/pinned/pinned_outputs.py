@@ -91,10 +91,10 @@ class PinnedOutputs:
             InconsistentStateError: None is found near the guess.
         """
         name, outputs = self.system.name, self.describe(reference)
-        found, converged = self.project(guess, reference, parameters)
+        state, converged = self.project(guess, reference, parameters)
         if converged:
-            return found
-        residual = self.residual(found, reference, parameters)
+            return state
+        residual = self.residual(state, reference, parameters)
         if not np.all(np.isfinite(residual)):
             raise InconsistentStateError(
                 f"{name}: {outputs} have no value near the given state; start inside the domain "
@@ -102,12 +102,12 @@ class PinnedOutputs:
                 residual,
             )
         # The remaining distances, if these are small.
-        length = np.linalg.norm(self.gradients(found, parameters) * self.system.scale, axis=1)
+        length = np.linalg.norm(self.gradients(state, parameters) * self.system.scale, axis=1)
         missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
         worst = int(np.argmax(missed))
         if missed[worst] <= CONSISTENT:
             raise InconsistentStateError(
-                f"{name}: {outputs} lead to x = {show(found)}, where A(x) or B(x) is singular",
+                f"{name}: {outputs} lead to x = {show(state)}, where A(x) or B(x) is singular",
                 residual,
             )
         raise InconsistentStateError(
@@ -129,8 +129,8 @@ class PinnedOutputs:
         def linearize(z: FloatArray) -> NewtonModel | None:
             return shortest_steps(self.gradients(scale * z, parameters) * scale, residual)
 
-        found, converged = newton(start / scale, linearize)
-        return scale * found, converged
+        z, converged = newton(start / scale, linearize)
+        return scale * z, converged
 
     def describe(self, reference: FloatArray) -> str:
         """The outputs of a reference, for a message."""
