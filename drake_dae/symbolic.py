@@ -176,8 +176,8 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True
             f"{_NOT_SMOOTH[kind]} has no derivatives everywhere, and the theory differentiates; "
             "use a smooth function instead"
         )
-    known = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _DISCONTINUOUS
-    if kind not in known:
+    functions = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _DISCONTINUOUS
+    if kind not in functions:
         raise ModelError(f"nothing is known of the function {expression}")
     _, parts = expression.Unapply()
-    return known[kind](*[to_casadi(part, symbols, smooth) for part in parts])
+    return functions[kind](*[to_casadi(part, symbols, smooth) for part in parts])

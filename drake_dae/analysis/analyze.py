@@ -80,7 +80,7 @@ def analyze(
         system: The system (1)-(3).
         region: State name -> (lowest, highest); other states are drawn around the nominal one.
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
-            few others close to the first: what is zero at one state alone is not zero.
+            few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
             the motion that it commands, and the zero dynamics judged at its first outputs and
             along the motion.
@@ -119,13 +119,13 @@ def analyze(
         if states is None
         else ExaminedStates.given(system, states, random)
     )
-    given = chosen.guesses[: chosen.num_given]
+    given_states = chosen.guesses[: chosen.num_given]
     try:
         check_system(system)
         constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
     except AssumptionError as error:
         where = chosen.describe(len(chosen.guesses), "state")
-        tried = given if states is not None else chosen.guesses
+        tried = given_states if states is not None else chosen.guesses
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
     except InconsistentStateError as error:
         if region is None:
@@ -138,8 +138,8 @@ def analyze(
     samples = around
     if states is not None:
         # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(around.manifold, given)
-        check_consistent(samples.manifold, given, samples.states)
+        samples = Samples(around.manifold, given_states)
+        check_consistent(samples.manifold, given_states, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
     analysis = _examine(constrained, around, samples, where, search=states is None)
     analysis = replace(analysis, region=chosen.region)
@@ -194,9 +194,9 @@ def _equilibria(
     if stability.state is not None:
         states = np.vstack([stability.state, states])
     equilibria = dynamics.equilibria(states, outputs=outputs)
-    known = () if stability.state is None else (stability,)
-    others = equilibria[len(known) :]
-    return (*known, *(dynamics.stability(state, outputs=outputs) for state in others))
+    first = () if stability.state is None else (stability,)
+    others = equilibria[len(first) :]
+    return (*first, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _examine(
@@ -204,7 +204,7 @@ def _examine(
 ) -> Analysis:
     """All but the zero dynamics and the reference: degrees at some samples, margins at others."""
     system, elimination = samples.system, constrained.elimination
-    known: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
+    results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
     satisfied, regular = {1, 2, 3}, True
@@ -222,10 +222,10 @@ def _examine(
         judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
-        known["constraint_structure"] = constrained
+        results["constraint_structure"] = constrained
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
-            known["contact_margin"] = margins_of_contacts.over(samples, search)
+            results["contact_margin"] = margins_of_contacts.over(samples, search)
     without_law = why_no_law(system)
     if regular and not without_law:
         try:
@@ -238,14 +238,14 @@ def _examine(
             margin = find_margin(samples, matrix, structure.round_off, search)
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
-            known |= {
+            results |= {
                 "output_degrees": structure.output_degrees,
                 "independence": _independence(structure, samples),
             }
             if is_regular(samples, matrix, structure.round_off):
-                known["structure"] = structure
+                results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
-    return Analysis(system, where, samples.states, assumptions, **known)
+    return Analysis(system, where, samples.states, assumptions, **results)
 
 
 def _assumptions(

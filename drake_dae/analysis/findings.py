@@ -34,7 +34,7 @@ class Assumption:
 
     Attributes:
         number: Its number in the paper.
-        statement: What it asks for.
+        statement: What it requires.
         finding: Whether it holds at the examined states and between them.
         margin: The margin of A(x) for (2), and of B(x) for (5); for (1) and (4) where a row of
             these vanishes; else None.
@@ -56,7 +56,7 @@ OF_VERDICT = {
     Verdict.UNSTABLE: Finding.VIOLATED,
     Verdict.UNDECIDED: Finding.UNDECIDED,
 }
-"""The verdict on Assumption 2.2, which asks for bounded states, from that on the zero dynamics."""
+"""The verdict on Assumption 2.2, which requires bounded states, from that on the zero dynamics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Findings:
     Attributes:
         system: The system.
         where: Which states were examined, in words.
-        region: The region that was asked for; None if none was.
+        region: The requested region; None if there is none.
         states: The states, consistent where the constraints have degrees, shape (samples, n).
         assumptions: Assumptions (1), ..., (5), in this order.
         constraint_degrees: r_1, ..., r_m.
@@ -135,8 +135,8 @@ class Findings:
     @property
     def zero_dynamics_dimension(self) -> int | None:
         """The dimension of xi in (22), n - sum r_i - sum mu_i."""
-        known, degrees = self.manifold_dimension, self.output_degrees
-        return None if known is None or degrees is None else known - sum(degrees)
+        dimension, degrees = self.manifold_dimension, self.output_degrees
+        return None if dimension is None or degrees is None else dimension - sum(degrees)
 
     @property
     def decisive(self) -> Stability | StabilityAlong | None:

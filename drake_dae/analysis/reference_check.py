@@ -34,8 +34,8 @@ def check_reference(
     grid = numbers(f"{system.name}: times", times).reshape(-1)
 
     def value(time: float) -> FloatArray:
-        given = reference(time)
-        values = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
+        result = reference(time)
+        values = None if result is None else numbers(f"{system.name}: reference({time:g})", result)
         if values is None or values.size != layout.reference_size:
             raise ModelError(
                 f"{system.name}: the reference must have size {layout.reference_size} (each output "

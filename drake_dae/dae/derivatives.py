@@ -166,7 +166,7 @@ class Derivatives:
     def inverse(
         self, expression: ca.SX, wanted: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """The control for which an expression of the motion takes wanted values.
+        """The control for which an expression of the motion takes desired values.
 
         The equations of the motion and `expression = wanted` are solved together for the control
         and for the unknowns that it moves, block by block along their structure (Dulmage and
@@ -175,7 +175,7 @@ class Derivatives:
 
         Args:
             expression: Of the state and of the unknowns, shape (p, 1).
-            wanted: The wanted values, shape (p, 1).
+            wanted: The desired values, shape (p, 1).
             shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
 
         Returns:
@@ -205,11 +205,11 @@ class Derivatives:
             ahead = unknowns[waiting]
             # An unknown that is solved for later may appear here with a slope that cancels.
             every = equations[[row for rows, _ in stage for row in rows]]
-            known = ca.vertsplit(
+            right_sides = ca.vertsplit(
                 ca.substitute(every, ahead, ca.SX.zeros(ahead.numel())),
                 np.cumsum([0, *[len(rows) for rows, _ in stage]]).tolist(),
             )
-            for (rows, columns), right in zip(stage, known, strict=True):
+            for (rows, columns), right in zip(stage, right_sides, strict=True):
                 factors = Factorization(ca.densify(matrix[rows, columns]))
                 blocks.append((columns, factors.solve(-right), factors.pivot))
             solved = {column for _, columns in stage for column in columns}
@@ -298,9 +298,9 @@ class Derivatives:
         if damping is not None:
             rate = rate + damping
         self._equations.append(ca.vertcat(self._balance, rate))
-        known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
+        remainder = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
         count = len(self._rows)
-        solution = self._unknowns(known[:count, :], known[count:, :])
+        solution = self._unknowns(remainder[:count, :], remainder[count:, :])
         self._values.append(ca.densify(self._inline(solution, len(self._values))))
 
     def _inline(self, expression: ca.SX, orders: int) -> ca.SX:

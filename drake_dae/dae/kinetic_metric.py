@@ -3,7 +3,7 @@
 A mechanical system E x' = f + g v has constraint forces along the gradients of its constraints.
 Their impulses change velocities by dv = M^-1 J^T mu, the change of least kinetic energy. Positions
 change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So heavy bodies move little in any
-units, and coordinates that no constraint force acts on stay unchanged.
+units, and coordinates on which no constraint force acts do not change.
 """
 
 import casadi as ca
@@ -106,12 +106,12 @@ class KineticMetric:
 def _groups(system: DaeSystem, count: int) -> list[Indices]:
     """The states whose rates hold constraint inputs, those whose rates hold these, and so on."""
     mass = nonzeros(system.mass_matrix.sparsity())
-    own = nonzeros(system.g.sparsity()).any(axis=1)
+    moved = nonzeros(system.g.sparsity()).any(axis=1)
     while True:
-        both = own | mass[:, own].any(axis=1)
-        if np.array_equal(both, own):
+        both = moved | mass[:, moved].any(axis=1)
+        if np.array_equal(both, moved):
             break
-        own = both
+        moved = both
     plain = np.array(
         [
             mass[i].sum() == 1 and bool(system.mass_matrix[i, i].is_one())
@@ -119,11 +119,11 @@ def _groups(system: DaeSystem, count: int) -> list[Indices]:
         ]
     )
     uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
-    groups, taken = [np.flatnonzero(own)], own.copy()
+    groups, taken = [np.flatnonzero(moved)], moved.copy()
     while len(groups) < count:
         following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
         if not following.any():
             break
         groups.append(np.flatnonzero(following))
         taken |= following
-    return groups if own.any() else []
+    return groups if moved.any() else []

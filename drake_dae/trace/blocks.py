@@ -23,12 +23,12 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
     stage_of = np.full(pattern.size2(), -1)
     for k in range(count):
         own_rows = rows[row_starts[k] : row_starts[k + 1]]
-        own = columns[column_starts[k] : column_starts[k + 1]]
+        block = columns[column_starts[k] : column_starts[k + 1]]
         stage = int(stage_of[used[own_rows].any(axis=0)].max()) + 1
-        stage_of[own] = stage
+        stage_of[block] = stage
         if stage == len(stages):
             stages.append([])
-        stages[stage].append((own_rows, own))
+        stages[stage].append((own_rows, block))
     return stages
 
 

@@ -36,9 +36,9 @@ def cache_folder() -> Path:
     """
     if os.environ.get("DRAKE_DAE_CACHE"):
         return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if given.is_absolute():  # Its specification says to ignore other paths.
-        return given / "drake_dae"
+    folder = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if folder.is_absolute():  # Its specification says to ignore other paths.
+        return folder / "drake_dae"
     try:
         home = Path.home()
     except RuntimeError:

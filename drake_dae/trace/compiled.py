@@ -199,8 +199,8 @@ def _level(compiled: Compiled, operations: int) -> str:
 
 
 def _key(source: str, compiler: Compiler, level: str, options: tuple[str, ...]) -> str:
-    given = *FLAGS, *compiler.target, level, *options
-    parts = (source, *compiler.command, compiler.identity, *given)
+    options_of_build = *FLAGS, *compiler.target, level, *options
+    parts = (source, *compiler.command, compiler.identity, *options_of_build)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 

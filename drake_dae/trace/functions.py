@@ -167,8 +167,8 @@ class TracedFunction:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
         # zip(..., strict=True) and [:] would take as long as the function.
         inputs, index = self.arguments, 0
-        for given in arguments:
-            inputs[index][...] = given
+        for argument in arguments:
+            inputs[index][...] = argument
             index += 1  # noqa: SIM113 - enumerate takes longer.
         self.run()
         return self.outputs
@@ -226,9 +226,9 @@ class TracedFunction:
         """The failure of the last call, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
-                name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
-                for name, given in zip(self.input_names, self.arguments, strict=True)
-                if not np.all(np.abs(given) < limit)
+                name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
+                for name, argument in zip(self.input_names, self.arguments, strict=True)
+                if not np.all(np.abs(argument) < limit)
             }
             if bad:
                 return Failure(self.name, fault, bad)
@@ -271,18 +271,20 @@ class TracedFunction:
             numbers(f"{self.name}: '{label}'", argument)
             for label, argument in zip(self.input_names, arguments, strict=True)
         ]
-        for label, own, given in zip(self.input_names, self.arguments, arrays, strict=True):
-            if own.size != given.size:
-                raise ModelError(f"{self.name}: '{label}' has size {given.size}, not {own.size}")
-            if given.ndim > 1 and given.shape != (own.size, 1):
-                raise ModelError(f"{self.name}: '{label}' has shape {given.shape}, not {own.shape}")
+        for label, buffer, array in zip(self.input_names, self.arguments, arrays, strict=True):
+            size = buffer.size
+            if array.size != size:
+                raise ModelError(f"{self.name}: '{label}' has size {array.size}, not {size}")
+            if array.ndim > 1 and array.shape != (size, 1):
+                raise ModelError(f"{self.name}: '{label}' has shape {array.shape}, not {(size,)}")
         values = self.evaluate(*(array.reshape(-1) for array in arrays))
         return tuple(output.copy() for output in values)
 
 
-def _fits(given: Any, own: FloatArray) -> bool:
-    """Whether an argument is an array as a function has it, as most are."""
-    return type(given) is np.ndarray and given.dtype is own.dtype and given.shape == own.shape
+def _fits(argument: Any, buffer: FloatArray) -> bool:
+    """Whether an argument is an array of the shape and type of an input buffer, as most are."""
+    is_array = type(argument) is np.ndarray
+    return is_array and argument.dtype is buffer.dtype and argument.shape == buffer.shape
 
 
 def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:

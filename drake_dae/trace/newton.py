@@ -106,7 +106,7 @@ def newton(
 
 
 def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
-    """A function that is evaluated once where `newton` asks for it several times in turn.
+    """A function with a memory of its last value, since `newton` evaluates it several times there.
 
     Args:
         function: The function; its iterates are never written over.

@@ -60,6 +60,12 @@ def smallest_singular_value(matrix: FloatArray) -> float:
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 
+def equilibrated(matrix: FloatArray) -> FloatArray:
+    """A matrix with its rows and columns divided by `equilibration`."""
+    rows, columns = equilibration(matrix)
+    return matrix / rows[:, None] / columns
+
+
 def equilibration(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Divisors of the rows and of the columns that bring all to about length one (Ruiz)."""
     rows, columns = np.ones(matrix.shape[0]), np.ones(matrix.shape[1])

@@ -49,11 +49,11 @@ def with_disturbance(
         ModelError: A name is not that of a state or parameter, or occurs twice; or the system
             already has a parameter "disturbance".
     """
-    known = [signal.name for signal in system.state_signals]
+    names = [signal.name for signal in system.state_signals]
     for name in states:
-        if name not in known:
-            raise ModelError(f"{system.name}: {unknown_name('state', name, known)}")
-    rows = [known.index(name) for name in states]
+        if name not in names:
+            raise ModelError(f"{system.name}: {unknown_name('state', name, names)}")
+    rows = [names.index(name) for name in states]
     if not rows or len(set(rows)) != len(rows):
         raise ModelError(
             f"{system.name}: with_disturbance needs names of states, each once, got "
@@ -145,8 +145,8 @@ class Observation:
         drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
         inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
-        given = {"control": u, "constraint_input": v}
-        function = system.trace("momentum", outputs, given, often=False)
+        signals = {"control": u, "constraint_input": v}
+        function = system.trace("momentum", outputs, signals, often=False)
 
         # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
@@ -184,15 +184,15 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
 
         (c~^T W d) / (c~^T W c),
 
-    where c~ is c less what a force on the contact across its sliding would explain as well. So a
-    payload that pulls the tool across its motion is no friction, although M^-1 couples both.
+    where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
+    So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
 
     Args:
         forces: The forces as columns, shape (k, c).
         planes: T, the reactions of each contact if it sticks, side by side, shape (k, c k).
         velocity: The velocities, shape (k, 1).
         metric: W, shape (k, k).
-        d: What is shared, shape (k, 1).
+        d: The disturbance, shape (k, 1).
     """
     size, components = forces.shape[0], list[ca.SX]()
     for j in range(forces.shape[1]):
@@ -214,7 +214,7 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
     Args:
         planes: T, shape (k, j), of any rank.
         metric: W, shape (k, k).
-        d: What is shared, as columns.
+        d: Disturbances, as columns.
     """
     squares = ca.sum1(planes * ca.mtimes(metric, planes))
     least = _FLAT * ca.mmax(squares) if squares.numel() else 0
@@ -239,10 +239,10 @@ def _wanted(
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
     rates = {i: structure.output_chains[i][1] for i in starts}
-    own = ca.SX.zeros(layout.reference_size)
+    at_present = ca.SX.zeros(layout.reference_size)
     for i, rate in rates.items():
-        own[starts[i] + 1] = rate
-    moving = system.trace("velocities of outputs", {"R": own}, often=False)
+        at_present[starts[i] + 1] = rate
+    moving = system.trace("velocities of outputs", {"R": at_present}, often=False)
     if len(starts) < len(steered):
         return None, moving
     reference, ahead = ca.SX.sym("R", layout.reference_size), ca.SX.sym("t")
@@ -280,8 +280,10 @@ def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
     others = ca.horzcat(system.g, system.h)
     identity = ca.SX.eye(system.num_states)
     for i in np.flatnonzero(pattern.any(axis=0)).tolist():
-        own = ca.is_equal(ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2)
-        if i in rows or not own or ca.sparsify(others[i, :]).nnz():
+        is_plain = ca.is_equal(
+            ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2
+        )
+        if i in rows or not is_plain or ca.sparsify(others[i, :]).nnz():
             name = system.state_signals[i].name
             raise ModelError(
                 f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "

@@ -142,10 +142,10 @@ def sampling_error(
     moments = vector("times", times, None)
     if moments.size < 3 or np.any(np.diff(moments) <= 0.0):
         raise ModelError("times must be three or more, and increase")
-    sizes = (moments.size, law.system.num_states), (moments.size, law.system.num_controls)
+    count, system = moments.size, law.system
     courses = [
-        _course(name, given, size)
-        for name, given, size in zip(("states", "controls"), (states, controls), sizes, strict=True)
+        _course("states", states, (count, system.num_states)),
+        _course("controls", controls, (count, system.num_controls)),
     ]
     values = law.system.parameter_vector(parameters)
     matrix = law.system.trace("control matrix", {"B": law.structure.control_matrix}, often=False)
@@ -211,9 +211,9 @@ def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> No
         )
 
 
-def _course(name: str, given: ArrayLike, shape: tuple[int, int]) -> FloatArray:
+def _course(name: str, values: ArrayLike, shape: tuple[int, int]) -> FloatArray:
     """Rows for each time."""
-    rows = numbers(name, given)
+    rows = numbers(name, values)
     if rows.shape != shape or not np.isfinite(rows).all():
         raise ModelError(
             f"{name} must be finite and of shape {shape}, with a row for each of {shape[0]} times, "

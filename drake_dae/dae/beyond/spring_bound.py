@@ -1,4 +1,4 @@
-"""What a loop around springs leaves of errors, and for which springs it is stable."""
+"""The errors that a loop around springs leaves, and the springs for which it is stable."""
 
 import casadi as ca
 import numpy as np
@@ -12,7 +12,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 SCALES = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-"""The examined stiffnesses of springs, relative to those that the loop believes."""
+"""The examined stiffnesses of springs, relative to those in the model of the loop."""
 
 _HORIZON = 20.0
 """Time constants of the slowest pole for which a response is integrated."""
@@ -32,7 +32,7 @@ def spring_error_bound(
 ) -> FloatArray:
     """A bound of the errors that springs add to those of a rigid law, by singular perturbation.
 
-    The torque of a `TorqueLoop` differs from the wanted one by e, where
+    The torque of a `TorqueLoop` differs from the desired one by e, where
 
         e'' + 2 zeta w e' + (w^2 + K M^-1 P) e = -(1 + zeta + zeta w T) tau_d'' - K B^-1 t u',
 
@@ -69,7 +69,7 @@ def spring_error_bound(
     """
     moments = vector("times", times, None)
     x, tau = numbers("states", states), numbers("torques", torques)
-    K, B = (_square(given) for given in (stiffness, inertia))
+    K, B = (_square(value) for value in (stiffness, inertia))
     if moments.size < 5 or x.shape[0] != moments.size or tau.shape[0] != moments.size:
         raise ModelError("times, states and torques must have as many rows, five or more")
     elimination, system = law.structure.elimination, law.system
@@ -116,7 +116,7 @@ def _actuation(law: TrackingLaw, rows: list[int]) -> FloatArray:
 def _bounds(
     law: TrackingLaw, largest: FloatArray, fastest: FloatArray, loop: SpringLoop
 ) -> FloatArray:
-    """Bounds of errors that such inputs drive."""
+    """Bounds of the errors by inputs with these largest values and rates."""
     degrees, integrated = law.degrees, law.integral.outputs
     matrix, heads = law.gains.error_matrix, law.gains.layout.starts
     result = np.zeros(len(degrees))
@@ -126,8 +126,8 @@ def _bounds(
             result[i] = largest[i]
             continue
         start = int(heads[i])
-        own = matrix[start : start + count, start : start + count]
-        at_once, summed = _sizes(own, degree, i in integrated)
+        block = matrix[start : start + count, start : start + count]
+        at_once, summed = _sizes(block, degree, i in integrated)
         result[i] = min(at_once * largest[i], summed * fastest[i])
     zeta = loop.damping
     if zeta >= 1.0:
@@ -136,7 +136,7 @@ def _bounds(
 
 
 def _sizes(matrix: FloatArray, degree: int, is_integrated: bool) -> tuple[float, float]:
-    """The integrals of |g| and of |integral of g|; infinite where an error stays."""
+    """The integrals of |g| and of |integral of g|; infinite where an error does not decay."""
     slowest = -np.max(np.linalg.eigvals(matrix).real)
     fastest = np.max(np.abs(np.linalg.eigvals(matrix)))
     step, count = 0.02 / fastest, int(_HORIZON * fastest / slowest / 0.02)
@@ -182,7 +182,7 @@ def spring_loop_radius(
     Raises:
         ModelError: A number is not positive.
     """
-    K, B, L = (_square(given) for given in (stiffness, inertia, mobility))
+    K, B, L = (_square(value) for value in (stiffness, inertia, mobility))
     T, s, p = positive("period", period), positive("scale", scale), len(K)
     one, none = np.eye(p), np.zeros((p, p))
     inverse = np.linalg.inv(B)
@@ -259,7 +259,7 @@ def stable_scales(
     return SCALES[low], SCALES[high]
 
 
-def _square(given: ArrayLike) -> FloatArray:
+def _square(value: ArrayLike) -> FloatArray:
     """A diagonal or a matrix as a matrix."""
-    matrix = np.asarray(given, dtype=float)
+    matrix = np.asarray(value, dtype=float)
     return np.diag(matrix) if matrix.ndim == 1 else matrix

@@ -23,7 +23,7 @@ DAMPING = 0.7
 @checked(ModelError)
 @dataclass(frozen=True)
 class SpringLoop:
-    """The numbers of a loop around springs, which makes their torque tau follow a wanted one,
+    """The numbers of a loop around springs, which makes their torque tau follow a desired one,
 
         tau'' + 2 zeta w tau' + w^2 tau = 2 zeta w tau_d' + w^2 tau_d + ...;    see `TorqueLoop`.
 
@@ -100,7 +100,7 @@ def contact_gains_behind(
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    # That of a rate of a ninth of the loop's.
+    # The noise for which `contact_gains` chooses a ninth of the loop's rate.
     least = _JITTER * _SLOWER / (14.0**0.5 * loop.rate)
     noise = max(velocity_noise, least)
     gains = contact_gains(stiffness, mobility, sample_time, delay, noise)

@@ -157,13 +157,13 @@ class _Chain:
             for i in columns:
                 control = system.control_signals[i]
                 self._bases[i] = (Signal(f"{control.name}*", control.unit), 0)
-        held = [self._signal(i) for i in columns]
+        integrated_signals = [self._signal(i) for i in columns]
         for i in columns:
             self._bases[i] = (self._bases[i][0], self._bases[i][1] + 1)
             name = self._names[i]
             self.integrators[name] = self.integrators.get(name, 0) + 1
         following = [self._signal(i) for i in columns]
-        self.system = integrated(system, columns, held, following, nominal, mixing)
+        self.system = integrated(system, columns, integrated_signals, following, nominal, mixing)
         # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
         new = self.system.state[system.num_states :]
         self.offset += ca.mtimes(self.matrix[:, columns], new)
@@ -221,15 +221,15 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
             5,
         )
     q = len(rows) - (p - rank)
-    heard = [j for j in range(p) if matrices[:, rows, j].any()]
-    if len(heard) == q:
-        return heard, None
+    acting = [j for j in range(p) if matrices[:, rows, j].any()]
+    if len(acting) == q:
+        return acting, None
 
     def distance(columns: list[int]) -> float:
         values = np.linalg.svd(scaled[:, rows][:, :, columns], compute_uv=False)
         return round(float(values[:, -1].min()), 9)
 
-    candidates: list[list[int]] = [list(columns) for columns in combinations(heard, q)]
+    candidates: list[list[int]] = [list(columns) for columns in combinations(acting, q)]
     columns = max(candidates, key=distance)
     others = [j for j in range(p) if j not in columns]
     # Least squares over all dependent rows, since q of them may be dependent at other states. It is
@@ -237,7 +237,7 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     part = structure.control_matrix[rows, :] / row_size[rows]
     chosen = part[:, columns]
     mixing = ca.SX(q, p - q)
-    mixed = [i for i, j in enumerate(others) if j in heard]
+    mixed = [i for i, j in enumerate(others) if j in acting]
     mixing[:, mixed] = Factorization(ca.mtimes(chosen.T, chosen)).solve(
         ca.mtimes(chosen.T, part[:, [others[i] for i in mixed]])
     )
@@ -296,9 +296,9 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
             raise
         remedy = "Keep away from this state"
         if chain.integrators:
-            given = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
+            entries = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
             remedy += (
-                f", or give another nominal_control, for example nominal_control={{{given}}}; "
+                f", or give another nominal_control, for example nominal_control={{{entries}}}; "
                 f"integrators: {_in_words(chain.integrators)}"
             )
         raise AssumptionError(

@@ -80,7 +80,7 @@ def extend(
 ) -> DaeSystem:
     """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
 
-    Constraints, outputs, parameters and mass matrix do not change, nor do the degrees r_i if
+    Constraints, outputs, parameters and mass matrix do not change, and the degrees r_i neither if
     Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
     any constraint input does, integrators repair it: the constraint then restricts the state u_i.
 
@@ -113,7 +113,7 @@ def extend(
         system = integrated(
             system,
             columns,
-            held=[base[i].derivative(order) for i in columns],
+            added=[base[i].derivative(order) for i in columns],
             following=[base[i].derivative(order + 1) for i in columns],
             nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
         )
@@ -136,7 +136,7 @@ def refuse_metric(system: DaeSystem) -> None:
 def integrated(
     system: DaeSystem,
     columns: list[int],
-    held: Sequence[Signal],
+    added: Sequence[Signal],
     following: Sequence[Signal],
     nominal: FloatArray,
     mixing: ca.SX | None = None,
@@ -152,7 +152,7 @@ def integrated(
     """
     q, n, p = len(columns), system.num_states, system.num_controls
     others = [j for j in range(p) if j not in columns]
-    new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in held])
+    new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in added])
     h = ca.SX(n + q, p)
     h[:n, others] = system.h[:, others]
     if mixing is not None:
@@ -167,7 +167,7 @@ def integrated(
         f=ca.vertcat(system.f + ca.mtimes(system.h[:, columns], new), ca.SX(q, 1)),
         g=ca.vertcat(system.g, ca.SX(q, system.num_constraints)),
         h=h,
-        state_signals=(*system.state_signals, *held),
+        state_signals=(*system.state_signals, *added),
         control_signals=tuple(controls),
         nominal_state=np.concatenate([system.nominal_state, nominal]),
         state_scale=(
@@ -188,13 +188,13 @@ def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> F
     """
     values = values or {}
     _check_names(system, values, "nominal_control")
-    given = [values.get(s.name, 0.0) for s in system.control_signals]
-    return vector(f"{system.name}: nominal_control", given, system.num_controls)
+    controls = [values.get(s.name, 0.0) for s in system.control_signals]
+    return vector(f"{system.name}: nominal_control", controls, system.num_controls)
 
 
-def _check_names(system: DaeSystem, given: Mapping[str, float], what: str) -> None:
+def _check_names(system: DaeSystem, numbers: Mapping[str, float], what: str) -> None:
     names = [signal.name for signal in system.control_signals]
-    unknown = [name for name in given if name not in names]
+    unknown = [name for name in numbers if name not in names]
     if unknown:
         raise ModelError(
             f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "

@@ -33,7 +33,7 @@ SMALL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Governing:
-    """A law and its references, whose time s goes as fast as limits allow at the present state.
+    """A law and its references, whose time s runs as fast as limits allow at the present state.
 
     For any s(t) the reference r(s(t)) is admissible, so that errors obey (30), (31), whatever s
     does. With
@@ -114,8 +114,8 @@ class Governing:
     def _reference(self, time: ca.SX) -> ca.SX:
         """R at a symbolic time of the reference."""
         rows = [ca.SX(0, 1)]
-        for reference, own in with_degrees(self.references, self.law.degrees):
-            row = reference.expression(own, time)
+        for reference, degrees in with_degrees(self.references, self.law.degrees):
+            row = reference.expression(degrees, time)
             if row is None:
                 raise ReferenceSignalError(
                     f"a {type(reference).__name__} of so many pieces is no expression of time, "
@@ -138,18 +138,18 @@ class Governing:
         slope_now, slope = (
             structure.control_for(wanted + effect)[0] - control for effect in (now, ahead)
         )
-        own, by = limited.by_control()
-        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope)
+        free, by = limited.by_control()
+        values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope)
         sizes = np.minimum(np.abs(limited.low), np.abs(limited.high))
         bounds = ca.SX(limited.low), ca.SX(limited.high)
         at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
         later = _interval(values, slopes, *bounds, sizes)
-        own, by = limited.rates_of_states()
+        free, by = limited.rates_of_states()
         speeds = self.law.system.state[limited.states]
         low = APPROACH * (limited.state_low - speeds)
         high = APPROACH * (limited.state_high - speeds)
         sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
-        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope_now)
+        values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope_now)
         return [_interval(values, slopes, ca.SX(low), ca.SX(high), sizes), later, at_once]
 
 
@@ -169,8 +169,8 @@ def _interval(
         sizes: The sizes of the limits, shape (k,).
     """
     least, most = ca.SX(-FREE), ca.SX(FREE)
-    for i, known in enumerate(sizes.tolist()):
-        size = known if np.isfinite(known) and known > 0.0 else 1.0
+    for i, limit in enumerate(sizes.tolist()):
+        size = limit if np.isfinite(limit) and limit > 0.0 else 1.0
         acts = ca.fabs(slopes[i]) > SMALL * size
         inverse = ca.if_else(acts, 1.0 / slopes[i], 0.0)
         for bound, is_upper in ((low[i], False), (high[i], True)):

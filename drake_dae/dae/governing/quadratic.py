@@ -15,7 +15,7 @@ DONE = 1e-12
 """The mean of the products of slacks and multipliers at which x does not change any more."""
 
 BOUNDARY = 0.995
-"""The share of the way to the nearest bound that a step goes at most."""
+"""The largest step, relative to the distance to the nearest bound."""
 
 
 def nearest_within(

@@ -87,7 +87,7 @@ def linearize_loop(
             f"{law.system.name}: a law with integral action has a state of its own; convert the "
             "closed loop's diagram to AutoDiffXd for Drake's Linearize instead"
         )
-    system, own = law.system, law.all_parameters()
+    system, values = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
     plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
     n, m, p = system.num_states, system.num_constraints, system.num_controls
@@ -96,8 +96,8 @@ def linearize_loop(
     slope = law.function.derivative(law.function.output_names.index("control"), moving)
     free = plant.at(np.zeros(p))
     # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
-    first = law.function(plant.state, R, *measured, own)[0].copy()
-    gains = slope(plant.state, R, *measured, own)[0].reshape(p, -1).copy()
+    first = law.function(plant.state, R, *measured, values)[0].copy()
+    gains = slope(plant.state, R, *measured, values)[0].reshape(p, -1).copy()
     by_force = gains[:, n + R.size :] if measured else np.zeros((p, m))
     around = np.eye(p) - by_force @ plant.by_control[n:]
     if smallest_singular_value(around) < SINGULAR:
@@ -108,7 +108,7 @@ def linearize_loop(
     control = np.linalg.solve(around, first + by_force @ free.constraint_input)
     point = plant.at(np.asarray(control, dtype=np.float64))
     if measured:
-        gains = slope(plant.state, R, point.constraint_input, own)[0].reshape(p, -1).copy()
+        gains = slope(plant.state, R, point.constraint_input, values)[0].reshape(p, -1).copy()
     feedback = np.hstack([gains[:, :n], by_force])
     return plant.linearization(point, feedback, gains[:, n : n + R.size], law.reference_signals)
 

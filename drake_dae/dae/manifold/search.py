@@ -75,10 +75,10 @@ class ConsistentStateSearch:
             and not self._residual.function.evaluate(start, p)[0].any()
         ):
             return start
-        known = moved.copy() if is_finite and sizes.item(0) == FOUND else None
+        consistent = moved.copy() if is_finite and sizes.item(0) == FOUND else None
         if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
-            known = self._nearly(start, p)
-        return self._searched(start, p) if known is None else known
+            consistent = self._nearly(start, p)
+        return self._searched(start, p) if consistent is None else consistent
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """The consistent state next to one where the first few steps do not converge."""

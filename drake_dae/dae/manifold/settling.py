@@ -94,11 +94,11 @@ def _settle_level(
 def _levels(layout: DerivativeLayout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
     """The rows of each order of derivatives, and the states that are new in them."""
     used = nonzeros(gradient.sparsity())
-    known = np.zeros(gradient.shape[1], dtype=bool)
+    taken = np.zeros(gradient.shape[1], dtype=bool)
     levels = []
     for order in range(max(layout.degrees, default=0)):
-        own = np.flatnonzero(layout.orders == order)
-        new = used[own].any(axis=0) & ~known
-        known |= new
-        levels.append((own, np.flatnonzero(new)))
+        rows = np.flatnonzero(layout.orders == order)
+        new = used[rows].any(axis=0) & ~taken
+        taken |= new
+        levels.append((rows, np.flatnonzero(new)))
     return levels

@@ -42,8 +42,8 @@ def check_completion(
             f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
             f"n - sum r_i - sum mu_i; got {got}"
         )
-    known = ca.vertcat(system.state, system.parameter_symbol)
-    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(known, s)]
+    allowed = ca.vertcat(system.state, system.parameter_symbol)
+    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
     if unknown:
         raise ModelError(
             f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "

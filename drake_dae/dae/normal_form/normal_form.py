@@ -130,7 +130,7 @@ class NormalForm:
 
         Args:
             coordinates: (y, zeta, xi), shape (n,).
-            guess: A state near the wanted one, shape (n,); the nominal consistent state if None.
+            guess: A state near the solution, shape (n,); the nominal consistent state if None.
             parameters: Values of all parameters; the defaults if None.
 
         Returns:

@@ -36,10 +36,10 @@ class ReferenceRows(Reference):
     rows: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        known = range(self.reference.size)
-        if not self.rows or len(set(self.rows) & set(known)) != len(self.rows):
+        all_rows = range(self.reference.size)
+        if not self.rows or len(set(self.rows) & set(all_rows)) != len(self.rows):
             raise ReferenceSignalError(
-                f"rows must be distinct ones of 0 to {known[-1]}, got {self.rows}"
+                f"rows must be distinct ones of 0 to {all_rows[-1]}, got {self.rows}"
             )
 
     @property
@@ -65,8 +65,8 @@ class ReferenceRows(Reference):
 
     def _needed(self, degrees: Sequence[int]) -> list[int]:
         """The degree of each row of the whole reference."""
-        given = dict(zip(self.rows, degrees, strict=True))
-        return [given.get(row, 0) for row in range(self.reference.size)]
+        degree_of = dict(zip(self.rows, degrees, strict=True))
+        return [degree_of.get(row, 0) for row in range(self.reference.size)]
 
     def _places(self, degrees: Sequence[int]) -> list[int]:
         """The places of the chosen rows' values among those of all."""
@@ -118,18 +118,20 @@ def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Ref
         ReferenceSignalError: An output has none, or two.
     """
     rows: dict[int, tuple[Assigned, int]] = {}
-    for one in references:
-        for row, place in enumerate(one.places):
-            if place in rows:
-                names = " and ".join(f"'{name}'" for name in (rows[place][0].name, one.name))
-                raise ReferenceSignalError(f"'{outputs[place]}' has two, by {names}")
-            rows[place] = one, row
-    left = [name for place, name in enumerate(outputs) if place not in rows]
-    if left:
+    for entry in references:
+        for row, i in enumerate(entry.places):
+            if i in rows:
+                first = rows[i][0].name
+                raise ReferenceSignalError(
+                    f"'{outputs[i]}' has two, by '{first}' and '{entry.name}'"
+                )
+            rows[i] = entry, row
+    missing = [name for i, name in enumerate(outputs) if i not in rows]
+    if missing:
         raise ReferenceSignalError(
-            f"missing: {', '.join(left)}; references are needed for {', '.join(outputs)}"
+            f"missing: {', '.join(missing)}; references are needed for {', '.join(outputs)}"
         )
-    return list(_runs([rows[place] for place in range(len(outputs))]))
+    return list(_runs([rows[i] for i in range(len(outputs))]))
 
 
 @checked(ReferenceSignalError)
@@ -168,29 +170,29 @@ def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int
 
 def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
     """The same for a single name."""
-    places = {output: place for place, output in enumerate(outputs)}
-    if name in places:
-        return [places[name]]
+    index = {output: i for i, output in enumerate(outputs)}
+    if name in index:
+        return [index[name]]
     group, _, letters = name.rpartition(".")
     chosen = [f"{group}.{letter}" for letter in letters]
-    if len(set(chosen)) == len(chosen) > 1 and all(one in places for one in chosen):
-        return [places[one] for one in chosen]
-    members = [place for output, place in places.items() if output.rpartition(".")[0] == name]
+    if len(set(chosen)) == len(chosen) > 1 and index.keys() >= set(chosen):
+        return [index[output] for output in chosen]
+    members = [i for output, i in index.items() if output.rpartition(".")[0] == name]
     if not name or not members:
         raise ReferenceSignalError(unknown_name("output", name, outputs))
-    highest = max(degrees[place] for place in members)
-    return [place for place in members if degrees[place] == highest]
+    highest = max(degrees[i] for i in members)
+    return [i for i in members if degrees[i] == highest]
 
 
 def _runs(rows: Sequence[tuple[Assigned, int]]) -> Iterator[Reference]:
     """The references of rows, as few as possible."""
     first = 0
     while first < len(rows):
-        one, row = rows[first]
+        entry, row = rows[first]
         last = first + 1
-        while last < len(rows) and rows[last] == (one, row + last - first):
+        while last < len(rows) and rows[last] == (entry, row + last - first):
             last += 1
-        is_whole = last - first == one.reference.size
+        is_whole = last - first == entry.reference.size
         chosen = tuple(range(row, row + last - first))
-        yield one.reference if is_whole else ReferenceRows(one.reference, chosen)
+        yield entry.reference if is_whole else ReferenceRows(entry.reference, chosen)
         first = last

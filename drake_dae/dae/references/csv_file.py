@@ -210,6 +210,6 @@ def _number(cell: str, where: str) -> float:
     """A cell of the table as a finite number."""
     value = number_in(cell)
     if value is None or abs(value) > MOST:
-        wanted = "a number" if value is None else f"a number of at most {MOST:g}"
-        raise ReferenceSignalError(f"{where}: expected {wanted}, got '{cell[:40]}'")
+        expected = "a number" if value is None else f"a number of at most {MOST:g}"
+        raise ReferenceSignalError(f"{where}: expected {expected}, got '{cell[:40]}'")
     return value

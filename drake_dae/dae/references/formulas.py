@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import vector
-from drake_dae.dae.references.reference import FormulaReference, Reference
+from drake_dae.dae.references.reference import FormulaReference, Reference, check_continuity
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.given import result_of
 
@@ -124,11 +124,7 @@ class PointToPointReference(FormulaReference):
         return ca.vertcat(*[a + (b - a) * blend for a, b in zip(first, last, strict=True)])
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this PointToPointReference has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        check_continuity(self, self.order, degrees)
 
 
 @checked(ReferenceSignalError)
@@ -155,18 +151,18 @@ class ExpressionReference(FormulaReference):
     parameters: Mapping[str, ArrayLike | ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = {}
+        parameters = {}
         for name, value in self.parameters.items():
             if not isinstance(value, ca.SX):
                 what = f"parameter '{name}'"
                 value = vector(what, np.atleast_1d(value), None, ReferenceSignalError)
-            known[name] = value
-        object.__setattr__(self, "parameters", MappingProxyType(known))
+            parameters[name] = value
+        object.__setattr__(self, "parameters", MappingProxyType(parameters))
         time = ca.SX.sym("t")
         rows = self.rows(time)
-        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in known.values())))
-        own = {symbol.element_hash() for symbol in symbols}
-        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in own]
+        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in parameters.values())))
+        allowed = {symbol.element_hash() for symbol in symbols}
+        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in allowed]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
                 "a reference must be a column of expressions of the time and its parameters "
@@ -178,12 +174,12 @@ class ExpressionReference(FormulaReference):
         return int(self.rows(ca.SX.sym("t")).numel())
 
     def with_parameters(self, values: Mapping[str, ArrayLike | ca.SX]) -> "ExpressionReference":
-        own = {name: values.get(name, value) for name, value in self.parameters.items()}
-        return ExpressionReference(self.function, own)
+        changed = {name: values.get(name, value) for name, value in self.parameters.items()}
+        return ExpressionReference(self.function, changed)
 
     def rows(self, time: ca.SX) -> ca.SX:
-        given = {name: ca.SX(value) for name, value in self.parameters.items()}
-        function = partial(self.function, **given)
+        symbols = {name: ca.SX(value) for name, value in self.parameters.items()}
+        function = partial(self.function, **symbols)
         value = result_of("function", function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
@@ -200,18 +196,18 @@ def settle(reference: Reference, *names: str) -> None:
         ReferenceSignalError: They are not finite numbers, are empty, or have different lengths.
     """
     listed = ", ".join(names)
-    given = {name: getattr(reference, name) for name in names}
+    values = {name: getattr(reference, name) for name in names}
     try:
-        arrays = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
     except (TypeError, ValueError):
-        shown = next(iter(given.values())) if len(given) == 1 else given
+        shown = next(iter(values.values())) if len(values) == 1 else values
         raise ReferenceSignalError(f"{listed}: must be numbers, got {shown!r}") from None
     for name, array in arrays.items():
         if not array.size:
             raise ReferenceSignalError(f"{name}: empty, at least one number is needed")
         if array.ndim > 1 or not np.isfinite(array).all():
             raise ReferenceSignalError(
-                f"{name} must be finite numbers, shape (k,), got {given[name]!r}"
+                f"{name} must be finite numbers, shape (k,), got {values[name]!r}"
             )
     lengths = {name: array.size for name, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
@@ -221,5 +217,4 @@ def settle(reference: Reference, *names: str) -> None:
         )
     length = next(iter(lengths.values()), 1)
     for name, array in arrays.items():
-        values = tuple(float(value) for value in np.broadcast_to(array, length))
-        object.__setattr__(reference, name, values)
+        object.__setattr__(reference, name, tuple(np.broadcast_to(array, length).tolist()))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive, vector
 from drake_dae.dae.references.formulas import settle
-from drake_dae.dae.references.reference import FormulaReference
+from drake_dae.dae.references.reference import FormulaReference, check_continuity
 from drake_dae.dae.references.travel import PathLimits, Travel, rest_to_rest
 from drake_dae.errors import ReferenceSignalError
 
@@ -84,11 +84,8 @@ class PathReference(FormulaReference):
         return [ca.substitute(value, s, ca.vertcat(*along)) for value in values]
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if self.limits is not None and max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        if self.limits is not None:
+            check_continuity(self, self.order, degrees)
 
 
 def check_order(order: int, most: int = 12) -> None:
@@ -268,15 +265,14 @@ class SpiralReference(PathReference):
 
     def point(self, distance: ca.SX) -> ca.SX:
         b = self.pitch / tau
-        first = self.start_radius / b
         is_outward = self.start_radius < self.end_radius
         outward = distance if is_outward else self.length - distance
         low = min(self.start_radius, self.end_radius) / b
         a = ca.sqrt((low + 1) ** 2 + 2 * outward / b) - 1
-        angle = self.phase + a - first
+        angle = self.phase + a - self.start_radius / b
         return ca.DM(self.center) + b * a * ca.vertcat(ca.cos(angle), ca.sin(angle))
 
 
 def _settle_center(reference: CircleReference | SpiralReference) -> None:
     center = vector("center", reference.center, 2, ReferenceSignalError)
-    object.__setattr__(reference, "center", tuple(float(value) for value in center))
+    object.__setattr__(reference, "center", tuple(center.tolist()))

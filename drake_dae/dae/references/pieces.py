@@ -5,17 +5,18 @@ from bisect import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.reference import Reference, check_continuity
 from drake_dae.errors import ReferenceSignalError
 
 MOST_IN_EXPRESSION = 200
-"""The largest number of polynomials in a symbolic expression; longer references are tables."""
+"""The largest number of polynomials in the expression of most references."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,9 @@ class PiecewiseReference(Reference):
 
     order: int
 
+    most_in_expression: ClassVar[int] = MOST_IN_EXPRESSION
+    """The largest number of polynomials in a symbolic expression; longer references are tables."""
+
     @abstractmethod
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
@@ -90,11 +94,7 @@ class PiecewiseReference(Reference):
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
         self._check(degrees)
         pieces = self.pieces(degrees)
-        return pieces.expression(time) if len(pieces.factors) <= MOST_IN_EXPRESSION else None
+        return pieces.expression(time) if len(pieces.factors) <= self.most_in_expression else None
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        check_continuity(self, self.order, degrees)

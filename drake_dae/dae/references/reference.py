@@ -119,6 +119,19 @@ class FormulaReference(Reference):
         return lambda time: value(time).copy()
 
 
+def check_continuity(reference: Reference, order: int, degrees: Sequence[int]) -> None:
+    """Refuses degrees above the number of continuous derivatives.
+
+    Raises:
+        ReferenceSignalError: A degree is above `order`.
+    """
+    if max(degrees) > order:
+        raise ReferenceSignalError(
+            f"this {type(reference).__name__} has {order} continuous derivatives, the law "
+            f"needs {max(degrees)}: pass order={max(degrees)} or more"
+        )
+
+
 def with_degrees(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> list[tuple[Reference, Sequence[int]]]:

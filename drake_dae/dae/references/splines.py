@@ -200,7 +200,7 @@ def settle_points(reference: Any) -> FloatArray:
             "points must be two or more, as a list of rows of finite numbers, got shape "
             f"{points.shape}"
         )
-    rows = tuple(tuple(map(float, row)) for row in points)
+    rows = tuple(map(tuple, points.tolist()))
     object.__setattr__(reference, "points", rows)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     if not lengths.all():
@@ -218,7 +218,7 @@ def settle_axes(reference: Any) -> None:
     names = ["origin", "along", "up"] + ["press"] * (reference.press is not None)
     for name in names:
         value = vector(name, getattr(reference, name), 2, ReferenceSignalError)
-        object.__setattr__(reference, name, tuple(float(number) for number in value))
+        object.__setattr__(reference, name, tuple(value.tolist()))
     if np.linalg.matrix_rank(np.array([reference.along, reference.up])) < 2:
         raise ReferenceSignalError(
             f"along and up must be two directions, got {reference.along!r} and {reference.up!r}"

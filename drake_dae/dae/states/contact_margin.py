@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -109,27 +110,25 @@ class ContactMargins:
         for part in CLOSER:
             for _ in range(20):
                 factor = _first(best)
-                wanted = part * factor if np.isfinite(factor) else 1e3
-                values = self._with_friction(parameters, wanted * unit / max(unit))
-
-                def slope(
-                    state: FloatArray, values: FloatArray = values
-                ) -> tuple[float, FloatArray]:
-                    reserve, gradient = self._slope(state, values)
-                    if not self._slope.is_finite:
-                        return np.inf, np.zeros(state.size)
-                    return max(float(reserve.item()), 0.0), gradient
-
-                lower = self.at(box.descend(slope, best.state), parameters)
+                size = part * factor if np.isfinite(factor) else 1e3
+                values = self._with_friction(parameters, size * unit / max(unit))
+                lower = self.at(box.descend(partial(self._reserve, values), best.state), parameters)
                 if not _first(lower) < factor:
                     break
                 best = lower
                 yield best
 
+    def _reserve(self, parameters: FloatArray, state: FloatArray) -> tuple[float, FloatArray]:
+        """The margin as far as it is positive, and its gradient."""
+        margin, gradient = self._slope(state, parameters)
+        if not self._slope.is_finite:
+            return np.inf, np.zeros(state.size)
+        return max(float(margin.item()), 0.0), gradient
+
     def _direction(self, parameters: FloatArray) -> FloatArray:
         """The coefficients of friction, or ones if all are zero."""
-        own = parameters[self._places]
-        return own if np.any(own) else np.ones(len(self._places))
+        friction = parameters[self._places]
+        return friction if np.any(friction) else np.ones(len(self._places))
 
     def _with_friction(self, parameters: FloatArray, friction: FloatArray | float) -> FloatArray:
         values = parameters.copy()

@@ -88,12 +88,12 @@ def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = Non
 def surroundings(samples: Samples) -> Region:
     """The box that the states span, within the region that they were drawn from."""
     low, high = samples.states.min(axis=0), samples.states.max(axis=0)
-    given = samples.consistent.region
-    if given is not None:
+    region = samples.consistent.region
+    if region is not None:
         # States without bounds may lie slightly beyond the random ones.
         more = 0.5 * (high - low)
-        low = np.where(np.isfinite(given.low), given.low, low - more)
-        high = np.where(np.isfinite(given.high), given.high, high + more)
+        low = np.where(np.isfinite(region.low), region.low, low - more)
+        high = np.where(np.isfinite(region.high), region.high, high + more)
     return Region(low, high)
 
 

@@ -84,9 +84,9 @@ class ConsistentRegion:
         if region is None:
             return self.project(guess)
         bounded = np.isfinite(region.low)
-        held = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
+        bounded_region = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
         try:
-            state = self.manifold.project(self._newton(held, guess))
+            state = self.manifold.project(self._newton(bounded_region, guess))
         except InconsistentStateError:
             return self.project(guess)
         return state if region.holds(state) else self.project(guess)
@@ -140,18 +140,18 @@ class ConsistentRegion:
         """Against the gradient, along N* and not out of the box, in units of the box."""
         rows = self.manifold.gradients(state) * width
         slope = gradient * width
-        held = np.zeros(state.size, dtype=bool)
+        fixed = np.zeros(state.size, dtype=bool)
         while True:
-            normal = np.vstack([rows, np.eye(state.size)[held]])
+            normal = np.vstack([rows, np.eye(state.size)[fixed]])
             length = np.linalg.norm(normal, axis=1)
             normal = normal[length > 0.0] / length[length > 0.0, None]
             direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
             edge = _SLACK * width
             blocked = (direction < 0.0) & (state <= region.low + edge)
             blocked |= (direction > 0.0) & (state >= region.high - edge)
-            if not np.any(blocked & ~held):
-                return np.where(held, 0.0, direction)
-            held |= blocked
+            if not np.any(blocked & ~fixed):
+                return np.where(fixed, 0.0, direction)
+            fixed |= blocked
 
     @staticmethod
     def _room(region: Region, state: FloatArray, step: FloatArray) -> float:

@@ -149,15 +149,15 @@ def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
     """
     if spread is None:
         return system.nominal_spread
-    given = numbers(f"{system.name}: spread", spread)
-    if given.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(given)):
+    deviations = numbers(f"{system.name}: spread", spread)
+    if deviations.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviations)):
         raise ModelError(
             f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
             f"{spread!r}"
         )
-    if np.any(given < 0.0):
+    if np.any(deviations < 0.0):
         raise ModelError(f"{system.name}: spread must not be negative, got {brief(spread)}")
-    return np.full(system.num_states, given)
+    return np.full(system.num_states, deviations)
 
 
 def as_matrix(value: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminat
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -136,7 +136,7 @@ def find_constraint_structure(
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """The given constraint structure of a system, or that found if none is given.
+    """The constraint structure of a system: the argument if it is one, otherwise found here.
 
     Args:
         owner: The caller's name in messages.
@@ -147,23 +147,16 @@ def constraint_structure_of(
         AssumptionError, InconsistentStateError: It has none; see `find_constraint_structure`.
         ModelError: It is not a structure, or that of another system.
     """
-    return (
-        find_constraint_structure(system)
-        if structure is None
-        else checked_structure(
-            owner,
-            system,
-            structure,
-            ConstraintStructure,
-            "find_structure or find_constraint_structure",
-        )
-    )
+    if structure is None:
+        return find_constraint_structure(system)
+    makers = "find_structure or find_constraint_structure"
+    return checked_structure(owner, system, structure, ConstraintStructure, makers)
 
 
 def checked_structure(
     owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
 ) -> Kind:
-    """The given structure of a system.
+    """The structure, if it is one of this system.
 
     Raises:
         ModelError: It is not a structure of this kind, or that of another system.
@@ -255,28 +248,22 @@ def constraint_violation(structure: ConstraintStructure) -> Violation | None:
     violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
     if margin is None:
         return None
-    matrix = structure.system.frictional_contacts.without_friction(
-        structure.elimination.constraint_matrix
-    )
+    system, elimination = structure.system, structure.elimination
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
     violation = with_numbers(violation, 2, structure.manifold, structure.states, matrix)
     if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
     if violation.cause is not ViolationKind.CONSTRAINT_RANK:
-        return _as_redundant(structure.system, violation)
-    dependence = find_dependence(
-        structure.manifold, structure.elimination, structure.states, margin.state
-    )
-    cause = ViolationKind.CONSTRAINT_RANK
-    if dependence.in_gradients:
-        cause = (
-            ViolationKind.REDUNDANT
-            if dependence.everywhere
-            else ViolationKind.SINGULAR_CONFIGURATION
-        )
-    elif dependence.everywhere:
-        cause = ViolationKind.HIDDEN_DEGREE
-    found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
-    return _as_redundant(structure.system, found_cause)
+        return _as_redundant(system, violation)
+    dependence = find_dependence(structure.manifold, elimination, structure.states, margin.state)
+    cause = {  # By whether it is singular everywhere, and by its gradients.
+        (True, True): ViolationKind.REDUNDANT,
+        (False, True): ViolationKind.SINGULAR_CONFIGURATION,
+        (True, False): ViolationKind.HIDDEN_DEGREE,
+        (False, False): ViolationKind.CONSTRAINT_RANK,
+    }[dependence.everywhere, dependence.in_gradients]
+    violation = replace(violation, cause=cause, combinations=dependence.combinations)
+    return _as_redundant(system, violation)
 
 
 def with_numbers(
@@ -311,8 +298,7 @@ def with_numbers(
         value = function(state, parameters)[0].reshape(matrix.shape)
         if not np.all(np.isfinite(value)):
             return 0.0
-        rows, columns = equilibration(value)
-        scaled = value / rows[:, None] / columns
+        scaled = equilibrated(value)
         if smallest_singular_value(scaled) <= system.least_margin:
             return 0.0
         return float(np.linalg.slogdet(scaled)[0]) if matrix.is_square() else 1.0
@@ -331,10 +317,8 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
 
     Off N* they are overdetermined, and only singular configurations satisfy them.
     """
-    if violation.cause not in (
-        ViolationKind.CONSTRAINT_DEGREE,
-        ViolationKind.SINGULAR_CONFIGURATION,
-    ):
+    possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
+    if violation.cause not in possible:
         return violation
     combinations = find_redundant(system)
     # A gradient that vanishes wherever its constraint holds does not depend on others.

@@ -109,14 +109,14 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
 def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
     """Which of some outputs follow from the constraints, by their gradients."""
     system, manifold = samples.system, samples.manifold
-    known = [signal.name for signal in manifold.residual_signals]
+    constraints = [signal.name for signal in manifold.residual_signals]
     for row, signal in enumerate(system.output_signals):
         if signal.name in names and not system.m[row, :].nnz():
             both = ca.vertcat(manifold.residual_expression, system.l[row])
             values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
             gradients = [_without_residuals(gradient, system.scale) for (gradient,) in values]
-            rows = combinations_of([*known, signal.name], gradients, _ON_MANIFOLD)
-            yield from (one for one in rows if one.name == signal.name)
+            rows = combinations_of([*constraints, signal.name], gradients, _ON_MANIFOLD)
+            yield from (row for row in rows if row.name == signal.name)
 
 
 def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
@@ -136,19 +136,19 @@ def combinations_of(
         least: A row depends on others if its remainder, relative to its length, is below this.
     """
     matrix, lengths = _scaled(values[0])
-    kept: list[int] = []
+    independent: list[int] = []
     combinations = []
     for i, name in enumerate(names):
-        factors, error = _fit(matrix, kept, i)
+        factors, error = _fit(matrix, independent, i)
         if error >= least:
-            kept.append(i)
+            independent.append(i)
             continue
-        used = [j for j, factor in zip(kept, factors, strict=True) if abs(factor) > least]
+        used = [j for j, factor in zip(independent, factors, strict=True) if abs(factor) > least]
         plain = _fit(matrix, used, i)[0] * lengths[i] / lengths[used]
         others = []
         for value in values[1:]:
-            scaled, own = _scaled(value)
-            others.append(_fit(scaled, used, i)[0] * own[i] / own[used])
+            scaled, lengths_there = _scaled(value)
+            others.append(_fit(scaled, used, i)[0] * lengths_there[i] / lengths_there[used])
         constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
         combinations.append(Combination(name, tuple(names[j] for j in used), plain, constant))
     return combinations

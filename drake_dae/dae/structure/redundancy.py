@@ -15,7 +15,7 @@ from drake_dae.dae.structure.dependence import Combination, redundant_constraint
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
-from drake_dae.trace.round_off import equilibration, positive
+from drake_dae.trace.round_off import equilibrated, positive
 
 SEARCH = 200
 """The largest number of steps to a state where all constraints hold; a dozen are enough."""
@@ -131,11 +131,8 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 def independent_constraints(samples: Samples) -> list[int]:
     """The constraints that can stay, chosen so that they are well independent at all samples."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
-    rest = []
-    for (gradient,) in values:
-        rows, columns = equilibration(gradient)
-        rest.append(gradient / rows[:, None] / columns)
-    most = min(int(_rank(gradient)) for (gradient,) in values)
+    rest = [equilibrated(gradient) for (gradient,) in values]
+    most = min(_rank(gradient) for (gradient,) in values)
     kept: list[int] = []
     while len(kept) < most:
         left = np.min([np.linalg.norm(matrix, axis=1) for matrix in rest], axis=0)
@@ -192,9 +189,7 @@ def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
 
 
 def _rank(matrix: FloatArray) -> int:
-    rows, columns = equilibration(matrix)
-    scaled = matrix / rows[:, None] / columns
-    return int(np.linalg.matrix_rank(scaled, DEPENDENT)) if matrix.size else 0
+    return int(np.linalg.matrix_rank(equilibrated(matrix), DEPENDENT)) if matrix.size else 0
 
 
 def _fewer(

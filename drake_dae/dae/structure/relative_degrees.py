@@ -198,14 +198,8 @@ def output_chains(
             )
             raise violation.error()
         undecided = still
-    return OutputChains(
-        chains=tuple(tuple(chain) for chain in chains),
-        drift=drift,
-        control_matrix=control_matrix,
-        highest_derivatives=highest_derivatives,
-        need_force=need_force,
-        round_off=round_off,
-    )
+    every = tuple(tuple(chain) for chain in chains)
+    return OutputChains(every, drift, control_matrix, highest_derivatives, need_force, round_off)
 
 
 def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Sized], list[Sized]]:

@@ -67,19 +67,19 @@ def share_forces(
     """
     weights = _weights(system, compliances or {})
     samples = consistent_samples(system)
-    kept = independent_constraints(samples) if names is None else constraints_kept(system, names)
-    if len(kept) == system.num_constraints:
+    staying = independent_constraints(samples) if names is None else constraints_kept(system, names)
+    if len(staying) == system.num_constraints:
         return system
-    others = [i for i in range(system.num_constraints) if i not in kept]
+    left_out = [i for i in range(system.num_constraints) if i not in staying]
     signals = system.constraint_output_signals
-    check_same_motion(samples, kept, ", ".join(f"'{signals[i].name}'" for i in others))
+    check_same_motion(samples, staying, ", ".join(f"'{signals[i].name}'" for i in left_out))
     inertia = PositiveDefiniteFactorization(system.mass_matrix)
     half = inertia.forward(system.g)
     product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
-    gather = ca.SX(len(kept), system.num_constraints)
-    gather[:, kept] = ca.SX.eye(len(kept))
-    gather[:, others] = PositiveDefiniteFactorization(product[kept, kept]).solve(
-        product[kept, others]
+    gather = ca.SX(len(staying), system.num_constraints)
+    gather[:, staying] = ca.SX.eye(len(staying))
+    gather[:, left_out] = PositiveDefiniteFactorization(product[staying, staying]).solve(
+        product[staying, left_out]
     )
     weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
     sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
@@ -89,10 +89,10 @@ def share_forces(
         gather=gather,
         signals=system.constraint_input_signals,
         undetermined=_undetermined(samples, gather, split),
-        left_out=system.k[others],
-        left_out_signals=tuple(signals[i] for i in others),
+        left_out=system.k[left_out],
+        left_out_signals=tuple(signals[i] for i in left_out),
     )
-    return replace(with_constraints(system, kept), sharing=sharing)
+    return replace(with_constraints(system, staying), sharing=sharing)
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:

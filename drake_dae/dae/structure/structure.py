@@ -172,10 +172,10 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The given structure of a system, or that found if none is given.
+    """The structure of a system: the argument if it is one, otherwise found here.
 
     Args:
-        owner: Who needs it, for messages.
+        owner: The caller's name in messages.
         system: The system (1)-(3).
         structure: The structure, or None to find it.
 
@@ -183,11 +183,9 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
         ModelError: It is not a system, or the structure is that of another one.
     """
-    return (
-        find_structure(system)
-        if structure is None
-        else checked_structure(owner, system, structure, Structure, "find_structure")
-    )
+    if structure is None:
+        return find_structure(system)
+    return checked_structure(owner, system, structure, Structure, "find_structure")
 
 
 def examine_structure(
@@ -203,7 +201,8 @@ def examine_structure(
             output has no degree.
         InconsistentStateError, ModelError: It has no structure; see `find_structure`.
     """
-    _check_counts(system)
+    if why := why_no_law(system):
+        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
     violation = constraint_violation(constrained)
     if violation:
@@ -231,12 +230,6 @@ def why_no_law(system: DaeSystem) -> str:
     return ""
 
 
-def _check_counts(system: DaeSystem) -> None:
-    why = why_no_law(system)
-    if why:
-        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
-
-
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
     """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
 
@@ -254,10 +247,10 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         ca.SX(1, samples.system.num_controls) if degree else elimination.n_star[i, :]
         for i, degree in enumerate(degrees)
     ]
-    known = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
-    known["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
+    attributes = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
+    attributes["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
     return Structure(
-        **known,
+        **attributes,
         output_degrees=degrees,
         output_chains=outputs.chains,
         highest_derivatives=outputs.highest_derivatives,

@@ -101,9 +101,9 @@ class Contacts:
     @property
     def _found(self) -> dict[int, Parameter | None]:
         names = [signal.name for signal in self.inputs]
-        known = {parameter.name: parameter for parameter in self.parameters}
+        by_name = {parameter.name: parameter for parameter in self.parameters}
         return {
-            names.index(contact.force): known[contact.friction] if contact.friction else None
+            names.index(contact.force): by_name[contact.friction] if contact.friction else None
             for contact in self.contacts
             if contact.force in names
         }
@@ -112,8 +112,10 @@ class Contacts:
         """An expression with all coefficients of friction zero."""
         if not self:
             return matrix
-        own = {p.name: p.symbol for p in self.frictions if p}  # Contacts may share a coefficient.
-        symbols = ca.vertcat(*own.values())
+        coefficients = {
+            p.name: p.symbol for p in self.frictions if p
+        }  # Contacts may share a coefficient.
+        symbols = ca.vertcat(*coefficients.values())
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:

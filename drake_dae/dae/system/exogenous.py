@@ -42,13 +42,13 @@ class Exogenous:
         """
         rate = ca.SX(expression.numel(), 1)
         for p in self.moving:
-            known = (p.symbol, *p.derivatives)
-            if ca.depends_on(expression, known[-1]):
+            levels = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, levels[-1]):
                 raise ModelError(
                     f"{self.owner}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
                     "needed"
                 )
-            rate += ca.jtimes(expression, ca.vertcat(*known[:-1]), ca.vertcat(*known[1:]))
+            rate += ca.jtimes(expression, ca.vertcat(*levels[:-1]), ca.vertcat(*levels[1:]))
         return rate
 
     def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:

@@ -87,7 +87,7 @@ def natural_scale(
     """Half the sizes of the states at which the terms of the equations (1)-(3) are equally large.
 
     The equations are expanded in Taylor series around the nominal state. A term c x_i^a x_j^b has
-    the size |c| s_i^a s_j^b, where s are the sizes wanted; a derivative x_i' has the size w s_i
+    the size |c| s_i^a s_j^b, where s are the unknown sizes; a derivative x_i' has the size w s_i
     with a common rate w; inputs and equations have sizes of their own. The logarithms are linear in
     those of the unknowns, so that a fit makes the terms of each equation as alike as they can be.
     The sizes do not depend on the units of states, inputs and equations. Where the equations leave

@@ -194,12 +194,12 @@ def valued(parameter: Parameter, value: ArrayLike) -> Parameter:
     Raises:
         ModelError: The value does not fit, or is out of the parameter's range.
     """
-    given = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
-    if given.shape not in ((1,), parameter.value.shape):
+    entries = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
+    if entries.shape not in ((1,), parameter.value.shape):
         raise ModelError(
             f"parameter '{parameter.name}' has {parameter.value.size} entries, got {value!r}"
         )
-    full = np.broadcast_to(given, parameter.value.shape).copy()
+    full = np.broadcast_to(entries, parameter.value.shape).copy()
     return _same_symbols(parameter, replace(parameter, value=full))
 
 

@@ -127,8 +127,8 @@ class DaeSystem:
     negligible: float = NEGLIGIBLE
 
     def __post_init__(self) -> None:
-        given = {item.name: getattr(self, item.name) for item in fields(self)}
-        for key, value in checked_fields(given).items():
+        arguments = {item.name: getattr(self, item.name) for item in fields(self)}
+        for key, value in checked_fields(arguments).items():
             object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
@@ -423,8 +423,8 @@ class DaeSystem:
         sizes = {p.name: p.value.size for p in other.parameters}
         for p in self.parameters:
             if sizes.get(p.name) == p.value.size:
-                own = self.parameter_slice(p.name)
-                parameters[..., own] = values[..., other.parameter_slice(p.name)]
+                place = self.parameter_slice(p.name)
+                parameters[..., place] = values[..., other.parameter_slice(p.name)]
         return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:

@@ -58,12 +58,12 @@ class AlongCurve:
         reference = ca.SX.sym("R", self.layout.reference_size)
         goal = reference[self.layout.chained.tolist(), :]
         equations = ca.vertcat(residual, structure.chain - goal)
-        given = [state, reference, self.system.parameter_symbol]
+        inputs = [state, reference, self.system.parameter_symbol]
         gradients = ca.densify(ca.jacobian(equations, state))
-        newton = ca.Function("newton", given, ca.cse([ca.densify(equations), gradients]))
+        newton = ca.Function("newton", inputs, ca.cse([ca.densify(equations), gradients]))
         self._newton = ManyPoints(newton, self.system.compiled)
         control, _ = structure.control_for(reference[self.layout.highest.tolist(), :])  # (28)
-        values = ca.Function("along", given, ca.cse([self.limited.values(control)]))
+        values = ca.Function("along", inputs, ca.cse([self.limited.values(control)]))
         self._values = ManyPoints(values, self.system.compiled)
 
     def reference(self, piece: Piece, w: FloatArray, a: FloatArray) -> FloatArray:
@@ -144,11 +144,11 @@ class AlongCurve:
         return states[:, self.limited.states]
 
 
-def _interpolated(places: np.ndarray, values: FloatArray, wanted: np.ndarray) -> FloatArray:
+def _interpolated(places: np.ndarray, values: FloatArray, targets: np.ndarray) -> FloatArray:
     """Values between places by a cubic spline."""
     from scipy.interpolate import CubicSpline  # It takes long to load.
 
-    return np.asarray(CubicSpline(places, values)(wanted))
+    return np.asarray(CubicSpline(places, values)(targets))
 
 
 def _check(structure: Structure) -> None:

@@ -24,7 +24,7 @@ from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.errors import ReferenceSignalError
 
 REST = 1e-9
-"""A reference rests where its speed is below this share of its largest."""
+"""A reference is at rest where its speed is below this fraction of the largest speed."""
 
 TURN = 0.5
 """The cosine between directions of neighbouring samples below which a rest is looked for."""
@@ -200,8 +200,8 @@ class Curve:
         fine = np.linspace(first, last, max(1001, 2 * count + 1))
         middle = self._speed(self.at((fine[1:] + fine[:-1]) / 2.0))
         far = np.concatenate([[0.0], np.cumsum(middle * np.diff(fine))])
-        wanted = far[-1] * (1.0 - np.cos(np.pi * np.arange(count + 1) / count)) / 2.0
-        times = np.interp(wanted, far, fine)
+        close = far[-1] * (1.0 - np.cos(np.pi * np.arange(count + 1) / count)) / 2.0
+        times = np.interp(close, far, fine)
         times[0], times[-1] = first, last
         half = np.diff(times)[:, None] / 2.0
         inner = (times[:-1, None] + half) + half * _NODES

@@ -44,8 +44,8 @@ class ManyPoints:
         results = [np.empty((count, part.shape[1])) for part in self._found]
         for first in range(0, count, BLOCK):
             last = min(first + BLOCK, count)
-            for own, given in zip(self._given, arguments, strict=True):
-                own[: last - first] = given[first:last] if given.ndim == 2 else given
+            for column, argument in zip(self._given, arguments, strict=True):
+                column[: last - first] = argument[first:last] if argument.ndim == 2 else argument
             self._evaluate()
             for result, part in zip(results, self._found, strict=True):
                 result[first:last] = part[: last - first]

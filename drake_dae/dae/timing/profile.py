@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +29,7 @@ from drake_dae.errors import ModelError, ReferenceSignalError
 _PAUSE = LimitRow("pause of the reference", "", "")
 
 PASSES = 40
-"""The most passes where signals are not linear in (a, b)."""
+"""The largest number of passes where signals are not linear in (a, b)."""
 
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
@@ -39,11 +38,11 @@ MOST_POLYNOMIALS = 500
 """The largest number of polynomials of an expression; longer references are tables."""
 
 LOWERINGS = 3
-"""How often limits are lowered where the motion exceeds them."""
+"""The largest number of times that limits are lowered where the motion exceeds them."""
 
 EXCESS = 0.02
-"""The excess over a limit at a few points that is left, as a share of it: less than the share of
-the limits that is left to the feedback."""
+"""The accepted excess over a limit at a few points, as a fraction of it: less than the part of the
+limits that is reserved for the feedback."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class TimeProfile:
     layout: DerivativeLayout
 
     def __repr__(self) -> str:
-        count = sum(not one.piece.is_pause for one in self.pieces)
+        count = sum(not part.piece.is_pause for part in self.pieces)
         return f"TimeProfile({self.duration:.4g} s, {count} motions from rest to rest)"
 
     @property
@@ -96,9 +95,9 @@ class TimeProfile:
     def shares(self) -> dict[str, float]:
         """What limits the motion, with its share of the time, the largest first."""
         sums: dict[str, float] = {}
-        for one in self.pieces:
-            for place, time in zip(one.limiting.tolist(), np.diff(one.times), strict=True):
-                name = self.causes[place].text
+        for part in self.pieces:
+            for cause, time in zip(part.limiting.tolist(), np.diff(part.times), strict=True):
+                name = self.causes[cause].text
                 sums[name] = sums.get(name, 0.0) + float(time) / self.duration
         return dict(sorted(sums.items(), key=lambda item: -item[1]))
 
@@ -115,7 +114,8 @@ class PathTiming:
 
     with m, n, c from the law itself, and so are accelerations; speeds limit b. The largest b is
     found by reachable sets, see `dae.timing.reachable`. Friction makes u nonlinear in b: it is then
-    linearized about the profile before, where it is exact, until this does not change.
+    linearized about the previous profile, at which it is exact, until the profile no longer
+    changes.
 
     Args:
         structure: The structure of the system, `find_structure`: rigid joints, where positions have
@@ -144,9 +144,9 @@ class PathTiming:
     ) -> TimeProfile:
         """The shortest motion along the curve of a reference.
 
-        Forces are commanded as the reference has them at s. Where nothing moves the time passes as
-        in the reference; a pause at the end in which no output changes is left out. Limits of paths
-        of speed and acceleration, `PathLimits`, hold as well; their jerk is not limited.
+        A force is that of the reference at s. Where nothing moves, time passes as in the reference;
+        a pause at the end in which no output changes is omitted. Limits of speed and acceleration
+        of paths, `PathLimits`, hold as well; their jerk is not limited.
 
         Args:
             references: The references of all outputs; or name -> reference, or a number.
@@ -154,13 +154,13 @@ class PathTiming:
             begin: Its first time, in s.
             start: A state near which the motion begins, shape (n,); the nominal one if None.
             parameters: Values of all parameters; the defaults if None.
-            largest_rate: The largest rate of the reference's time, 1 to be nowhere faster than the
-                reference itself; None for no limit.
+            largest_rate: The largest rate of the reference's time: with 1 the motion is nowhere
+                faster than the reference; None for no limit.
             points: The number of intervals of the grid.
 
         Raises:
-            ReferenceSignalError: A rest on the curve is not within the limits, which are named with
-                the place; nothing limits the motion; nothing moves; the curve is out of reach.
+            ReferenceSignalError: The system is not within the limits at rest on the curve; nothing
+                limits the motion; nothing moves; or the curve is out of reach.
             ModelError: A number makes no sense.
         """
         check_whole_number("points", points, 20)
@@ -173,10 +173,10 @@ class PathTiming:
         names = [signal.name for signal in system.output_signals]
         if isinstance(references, Mapping):
             references = references_by_name(references, names, along.layout.degrees)
-        covered = sum(reference.size for reference in references)
-        if covered != len(names):
+        size = sum(reference.size for reference in references)
+        if size != len(names):
             raise ReferenceSignalError(
-                f"the references cover {covered} outputs, the system has {len(names)}"
+                f"the references cover {size} outputs, the system has {len(names)}"
             )
         curve = Curve(references, along.layout, begin, end, points)
         guess = system.nominal_state if start is None else vector("start", start, system.num_states)
@@ -206,6 +206,7 @@ class TimeOptimalReference(PiecewiseReference):
     """
 
     is_table = True
+    most_in_expression = MOST_POLYNOMIALS
 
     profile: TimeProfile
     order: int = field(default=2, init=False)
@@ -217,24 +218,20 @@ class TimeOptimalReference(PiecewiseReference):
     @cached_property
     def table(self) -> PiecewisePolynomials:
         """The polynomials of r, one row for each output."""
-        parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
         layout = self.profile.layout
+        parts = [(part.piece, part.times, part.b, part.a) for part in self.profile.pieces]
         table = time_table(parts, layout, self.profile.start_time)
         return at_rest_outside(coarser(table, layout.dynamic))
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         return stacked(self.table, degrees)
 
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        self._check(degrees)
-        pieces = self.pieces(degrees)
-        return pieces.expression(time) if len(pieces.factors) <= MOST_POLYNOMIALS else None
-
     def _check(self, degrees: Sequence[int]) -> None:
-        for i, (needed, own) in enumerate(zip(degrees, self.profile.layout.degrees, strict=True)):
-            if needed > own:
+        pairs = zip(degrees, self.profile.layout.degrees, strict=True)
+        for i, (needed, degree) in enumerate(pairs):
+            if needed > degree:
                 raise ReferenceSignalError(
-                    f"row {i} of this TimeOptimalReference has {own} derivatives, the law needs "
+                    f"row {i} of this TimeOptimalReference has {degree} derivatives, the law needs "
                     f"{needed}; make its profile with the structure of that law"
                 )
 
@@ -257,7 +254,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
     """The fastest motion along a piece.
 
     Where the acceleration changes from one interval to the next, as where n of a limit passes
-    through zero, smoothing exceeds the limit a little. It is lowered there if that is too much.
+    through zero, the smoothed motion exceeds the limit a little. If by too much, the limit is
+    lowered there.
 
     Raises:
         ReferenceSignalError: Nothing limits the motion, or it cannot leave a rest.
@@ -287,7 +285,7 @@ def _settled(
     factor: FloatArray,
     before: FloatArray | None,
 ) -> tuple[FastestMotion, FloatArray | None]:
-    """The fastest motion with all limits divided by a factor, and b about which it is exact."""
+    """The fastest motion with all limits divided by a factor, and the b of their linearization."""
     for number in range(1 if rows.is_linear else PASSES):
         lines = rows.lines(before)
         lowered = LinearLimits(lines.alpha * factor[:, None], lines.beta * factor[:, None])

@@ -71,15 +71,15 @@ def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray)
     stopping = double[:, None] * of_two
     upper = np.where(alpha > 0.0, 1.0 / alpha, np.inf)
     falls = np.where(alpha > 0.0, beta / alpha, 0.0)
-    own = np.minimum(largest[:-1], np.where(alpha >= 0.0, stopping, np.inf).min(axis=1))
-    own = _with_both(alpha, beta, own)
+    at_point = np.minimum(largest[:-1], np.where(alpha >= 0.0, stopping, np.inf).min(axis=1))
+    at_point = _with_both(alpha, beta, at_point)
     stopping = np.where(alpha < 0.0, stopping, np.inf)
 
     highest, brake = np.zeros(points.size), np.full(points.size, -1, dtype=np.intp)
     for i in range(points.size - 2, -1, -1):
         can = stopping[i] + braking[i] * highest[i + 1]
         place = int(can.argmin())
-        highest[i], brake[i] = min((can[place], place), (own[i], -1))
+        highest[i], brake[i] = min((can[place], place), (at_point[i], -1))
         highest[i] = max(highest[i], 0.0)  # Of round-off.
 
     b, a = np.zeros(points.size), np.zeros(double.size)

@@ -20,7 +20,7 @@ SLOW = 0.01
 """The slowest speed at which friction is evaluated, as a share of the largest."""
 
 CHECKED = 20
-"""One point in so many is tested for that."""
+"""Every n-th point is tested, with this n."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class LimitRows:
 
     @property
     def names(self) -> tuple[LimitRow, ...]:
-        """What may limit: all lines, then what limits b alone."""
+        """The possible causes of a limit: all lines, then those that limit only b."""
         limited = self.along.limited
         pairs = [*zip(limited.signals, limited.low, limited.high, strict=True)]
         rows = [LimitRow(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
@@ -126,8 +126,8 @@ class LimitRows:
             room = np.where(slope > 0.0, limited.state_high - rest, limited.state_low - rest)
             room = room / slope
         room = np.where(slope == 0.0, np.inf, room)
-        own = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
-        columns = [room**2, *(tool.largest[:, None] for tool in self.tools), own[:, None] ** 2]
+        of_rate = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
+        columns = [room**2, *(tool.largest[:, None] for tool in self.tools), of_rate[:, None] ** 2]
         together = np.hstack(columns)
         least = together.argmin(axis=1)
         first = len(self.names) - together.shape[1]

@@ -186,10 +186,10 @@ def unstable_from(
         The lowest up to a factor of two; None if all are stable.
     """
     for share in STIFFNESSES.tolist():
-        own = frequency * share**0.5
-        added = integral * own * sample_time
-        shown = own * sample_time < np.pi
-        if not (shown and _radius(_step(own, sample_time), damping, delay, added) < 1.0):
+        natural = frequency * share**0.5
+        added = integral * natural * sample_time
+        shown = natural * sample_time < np.pi
+        if not (shown and _radius(_step(natural, sample_time), damping, delay, added) < 1.0):
             return share
     return None
 

@@ -114,14 +114,16 @@ class FeedbackGains:
         lengths, which = np.unique(steps, return_inverse=True)
         result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
         orders, owner = self.layout.orders, self.layout.owners
-        for block in _coupled(self.layout, self.matrix):
-            rows = np.flatnonzero(np.isin(owner, block))
-            own = matrix[np.ix_(rows, rows)]
+        for outputs in _coupled(self.layout, self.matrix):
+            rows = np.flatnonzero(np.isin(owner, outputs))
+            block = matrix[np.ix_(rows, rows)]
             # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
             # sizes.
-            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(own))))))
+            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(block))))))
             scale = rate ** orders[rows]
-            transitions = scipy.linalg.expm(lengths[:, None, None] * (own / scale[:, None] * scale))
+            transitions = scipy.linalg.expm(
+                lengths[:, None, None] * (block / scale[:, None] * scale)
+            )
             current = coordinates[rows] / scale
             response = np.zeros((moments.size, rows.size))
             for place, index in zip(order, which, strict=True):
@@ -171,14 +173,14 @@ def gain_coefficients(
         chosen: list[tuple[str, int, float | Sequence[float]]]
         chosen = _per_output(values, names, degrees)
         for name, degree, row in chosen:
-            given = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
-            if given.shape != (degree,):
+            entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
+            if entries.shape != (degree,):
                 raise GainError(
                     f"output '{name}' has degree {degree} and takes {degree} coefficients "
-                    f"K_i1, ..., K_i{degree}, got {given.size}"
+                    f"K_i1, ..., K_i{degree}, got {entries.size}"
                 )
             start = int(starts[name])
-            matrix[list(names).index(name), start : start + degree] = given
+            matrix[list(names).index(name), start : start + degree] = entries
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design

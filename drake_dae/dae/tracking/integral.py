@@ -49,12 +49,12 @@ class IntegralAction:
             GainError: A name is not that of an output, occurs twice, or is that of a force with
                 mu_i = 0 that is not measured.
         """
-        known = [signal.name for signal in system.output_signals]
+        names_of_outputs = [signal.name for signal in system.output_signals]
         integrated = []
         for name in names:
-            if name not in known:
-                raise GainError(f"integral: {unknown_name('output', name, known)}")
-            i = known.index(name)
+            if name not in names_of_outputs:
+                raise GainError(f"integral: {unknown_name('output', name, names_of_outputs)}")
+            i = names_of_outputs.index(name)
             if i in integrated:
                 raise GainError(f"integral: '{name}' occurs twice")
             if degrees[i] == 0 and (measured is None or i not in measured.inputs):
@@ -66,7 +66,9 @@ class IntegralAction:
             integrated.append(i)
         chosen = tuple(sorted(integrated))
         signals = tuple(
-            Signal(f"integral of {known[i]}", f"{system.output_signals[i].unit or '1'} s")
+            Signal(
+                f"integral of {names_of_outputs[i]}", f"{system.output_signals[i].unit or '1'} s"
+            )
             for i in chosen
         )
         return cls(chosen, tuple(degrees), signals, ca.SX.sym("integral", len(chosen)))

@@ -119,7 +119,7 @@ class TrackingLaw:
         errors = chain - reference[layout.chained.tolist(), :]
         ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
-        # By the model; outputs with direct feedthrough have their wanted values.
+        # By the model; outputs with direct feedthrough have their reference values.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
@@ -150,23 +150,23 @@ class TrackingLaw:
     def wanted(self, reference: ca.SX) -> ca.SX:
         """ubar of (28) for a reference, in terms of state and parameters, shape (p, 1).
 
-        A measured force is taken as wanted, and integrals as 0.
+        A measured force is assumed to equal its reference, and integrals to be 0.
 
         Args:
             reference: R, an expression of shape (sum (mu_i + 1), 1).
         """
-        given = {"reference": ca.densify(reference)}
+        values = {"reference": ca.densify(reference)}
         if self.measured_force is not None:
             force = ca.SX.zeros(self._inputs["measured_force"].numel())
             for output, place in self.measured_force.inputs.items():
                 force[place] = reference[int(self.layout.lowest[output])]
-            given["measured_force"] = force
+            values["measured_force"] = force
         if self.integral.outputs:
-            given["integral"] = ca.SX.zeros(len(self.integral.outputs))
+            values["integral"] = ca.SX.zeros(len(self.integral.outputs))
         return ca.substitute(
             self._wanted,
-            ca.vertcat(*[self._inputs[name] for name in given]),
-            ca.vertcat(*given.values()),
+            ca.vertcat(*[self._inputs[name] for name in values]),
+            ca.vertcat(*values.values()),
         )
 
     def trace_motion(self) -> TracedFunction | None:
@@ -283,9 +283,9 @@ class TrackingLaw:
             measured.append(self._integrals(integral))
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
 
-    def _integrals(self, given: ArrayLike | None) -> FloatArray:
+    def _integrals(self, integral: ArrayLike | None) -> FloatArray:
         size = len(self.integral.outputs)
-        return vector("integral", np.zeros(size) if given is None else given, size, GainError)
+        return vector("integral", np.zeros(size) if integral is None else integral, size, GainError)
 
     def error_coordinates(
         self,

@@ -36,7 +36,7 @@ AFAR = 64.0
 state."""
 
 STRAIGHT = 0.1
-"""Tested at states that the projection onto Z(R) moves by less than this fraction of the
+"""The rate is tested where the projection onto Z(R) moves a state by less than this fraction of its
 distance."""
 
 
@@ -149,12 +149,12 @@ class _Rest:
         flat at the state, like exp(-x), grows farther away.
         """
         noise = max(self._noise[index], ROUNDED * self._usual(index))
-        seen = GROWTH * max(self._left[index], noise)
+        visible = GROWTH * max(self._left[index], noise)
         radius = None
         for distance in RADII:
             # On both sides: a function that grows on one and decreases on the other does not
             # vanish.
-            if not min(self._at_distance(index, distance)) > seen:
+            if not min(self._at_distance(index, distance)) > visible:
                 break
             radius = distance
         if radius is not None or self._left[index] > GROWTH * noise:
@@ -162,10 +162,10 @@ class _Rest:
         longest = max(AFAR, 2.0 * float(np.max(np.abs(self._state) / self._scale)))
         distances = 2.0 ** np.arange(1, np.log2(longest) + 1)
         far = (max(self._at_distance(index, float(distance))) for distance in distances)
-        return None if any(rate > seen for rate in far) else np.inf
+        return None if any(rate > visible for rate in far) else np.inf
 
     def _at_distance(self, index: int, distance: float) -> tuple[float, float]:
-        """The size of the rate on both sides of a direction; 0 where it is not known."""
+        """The size of the rate on both sides; 0 where no state on Z(R) is near."""
         rates = []
         for side in (distance, -distance):
             aside = self._beside(index, side)

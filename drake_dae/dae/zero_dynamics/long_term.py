@@ -119,7 +119,7 @@ def watch(
     """The long-term behavior of the motion from a state.
 
     Args:
-        flow: Of a reference that can be asked at all times.
+        flow: The flow of a reference that is defined at all times.
         state: The state, shape (n,).
         begin, end: The interval of observation, in s; the second half decides.
         period: The period of the reference; None if it is constant.
@@ -195,7 +195,7 @@ def leave(
     """The long-term behavior of the motions that leave an unstable one, on both sides.
 
     Args:
-        flow: Of a reference that can be asked at all times.
+        flow: The flow of a reference that is defined at all times.
         state: A state of the unstable motion, shape (n,).
         time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.

@@ -209,8 +209,8 @@ class _Pursuit:
         """R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
         layout = self._pinned.layout
         try:
-            given = result_of("reference", self._reference, time)
-            goal = numbers(f"reference({time:g})", given).reshape(-1)
+            value = result_of("reference", self._reference, time)
+            goal = numbers(f"reference({time:g})", value).reshape(-1)
         except NonFiniteError as error:
             ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
             raise _MotionEnded(ending) from error

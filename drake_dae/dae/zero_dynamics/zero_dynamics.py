@@ -156,7 +156,7 @@ class ZeroDynamics:
             state: x, shape (n,).
             parameters: Values of all parameters.
             outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
-                state does not determine, are chosen such that x' is smallest. Give them if this
+                state does not determine, are those with the smallest x'. Give them if this
                 choice is not unique, as for a force that does not affect the motion.
 
         Returns:

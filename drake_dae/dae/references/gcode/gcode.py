@@ -36,10 +36,11 @@ SHARE = 0.5
 """The share of the acceleration that is for speeding up and for arcs; the rest is for corners."""
 
 NODES = 4000
-"""So many places of the path its speed and its distance from the spline are determined at."""
+"""The number of points of a path at which its speed and its distance from the spline are
+computed."""
 
 _SAMPLES = 8
-"""So many chords of a span its distance from the path is measured to."""
+"""The number of chords that replace a span of the spline when its distance is measured."""
 
 
 @checked(ReferenceSignalError)

@@ -49,7 +49,7 @@ class PinnedMotion:
     """The motion with the outputs on a reference, as far as there is one.
 
     Attributes:
-        times: The wanted times that were reached, in s, shape (k,).
+        times: The requested times that were reached, in s, shape (k,).
         states: x at these times, shape (k, n).
         controls: u at these times, shape (k, p).
         constraint_inputs: v at these times, shape (k, m).

@@ -209,9 +209,9 @@ class PinnedOutputs:
     ) -> FloatArray:
         """The sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
         point = self.point(state, reference, parameters)
-        given = (point.rate, point.control, point.constraint_input, parameters)
+        values = (point.rate, point.control, point.constraint_input, parameters)
         n, inputs = state.size, point.constraint_input.size + point.control.size
-        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *given))
+        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *values))
         moved = [
             self._input_slope.evaluate(state, reference, dx, parameters)[0].reshape(inputs).copy()
             for dx in np.eye(n)
