@@ -46,7 +46,7 @@ STATEMENTS = (
     "u acts on z_i first in derivative mu_i",
     "B(x) has rank p, so u can control all outputs",
 )
-"""What Assumptions (1) to (5) ask for, in a line each."""
+"""Assumptions (1) to (5), in a line each."""
 
 
 @checked(ModelError)

@@ -61,8 +61,7 @@ class ExaminedStates:
     def given(
         cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
     ) -> "ExaminedStates":
-        """The given states, and a few close to the first, since an expression may vanish at one
-        state.
+        """The states of the user, and a few close to the first one.
 
         Raises:
             ModelError: The states are not finite numbers of shape (k, n).
@@ -101,8 +100,8 @@ def check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArr
 
     Args:
         manifold: N*.
-        given: The given states, shape (k, n).
-        taken: Those of them that are consistent and inside the domain, shape (l, n).
+        states: The given states, shape (k, n).
+        projected: Those of them that are consistent and inside the domain, shape (l, n).
 
     Raises:
         InconsistentStateError: A state is not consistent; the message says which, and why.

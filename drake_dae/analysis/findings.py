@@ -158,12 +158,12 @@ class Findings:
         if self.region is None:
             return ()
         return tuple(
-            one
-            for one in self.equilibria
-            if one.verdict is Verdict.UNSTABLE
-            and one is not self.decisive
-            and one.state is not None
-            and self.region.holds(one.state)
+            equilibrium
+            for equilibrium in self.equilibria
+            if equilibrium.verdict is Verdict.UNSTABLE
+            and equilibrium is not self.decisive
+            and equilibrium.state is not None
+            and self.region.holds(equilibrium.state)
         )
 
     @property
@@ -200,11 +200,11 @@ class Findings:
         if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
             place = "along the reference " if decisive is self.zero_dynamics_along else ""
             sentences.append(f"Assumption 2.2: {place}{decisive.reason}")
-        for one in self.unstable_inside:
-            if one.state is not None:
-                place = named_values(self.system.state_signals, one.state)
+        for equilibrium in self.unstable_inside:
+            if equilibrium.state is not None:
+                place = named_values(self.system.state_signals, equilibrium.state)
                 sentences.append(
-                    f"Assumption 2.2: inside the region, at rest at {place}: {one.reason}"
+                    f"Assumption 2.2: inside the region, at rest at {place}: {equilibrium.reason}"
                 )
         if self.motion is not None and self.motion.ending is not None:
             sentences.append(str(self.motion.ending))

@@ -164,11 +164,11 @@ class Derivatives:
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
     def inverse(
-        self, expression: ca.SX, wanted: ca.SX, shown: ca.SX | None = None
+        self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
         """The control for which an expression of the motion takes desired values.
 
-        The equations of the motion and `expression = wanted` are solved together for the control
+        The equations of the motion and `expression = desired` are solved together for the control
         and for the unknowns that it moves, block by block along their structure (Dulmage and
         Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
         it is inverse dynamics.
@@ -190,7 +190,7 @@ class Derivatives:
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
         still = [i for i, moves in enumerate(moved) if not moves]
         unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
-        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - wanted)
+        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - desired)
         involved = ca.which_depends(equations, unknowns, 1, True)
         used_rows = [i for i, involves in enumerate(involved) if involves]
         equations = equations[used_rows]
@@ -219,12 +219,12 @@ class Derivatives:
         uses = nonzeros(ca.jacobian_sparsity(ca.vertcat(ca.SX(0, 1), *solutions), unknowns))
         needed, pivot, last = [self.control, shown], ca.SX(1), len(uses)
         is_needed = np.any(nonzeros(ca.jacobian_sparsity(ca.vertcat(*needed), unknowns)), axis=0)
-        for columns, solution, own_pivot in reversed(blocks):
+        for columns, solution, block_pivot in reversed(blocks):
             last -= len(columns)
             if is_needed[columns].any():
                 is_needed |= uses[last : last + len(columns)].any(axis=0)
                 needed.append(solution)
-                pivot = ca.fmin(pivot, own_pivot)
+                pivot = ca.fmin(pivot, block_pivot)
         if still and ca.depends_on(ca.vertcat(*needed), symbols[still]):
             pivot = ca.fmin(pivot, self.pivot)
         _, results = ca.substitute_inplace(
@@ -305,15 +305,10 @@ class Derivatives:
 
     def _inline(self, expression: ca.SX, orders: int) -> ca.SX:
         """An expression with the values of the first `orders` unknowns put in."""
-        return (
-            ca.substitute(
-                expression,
-                ca.vertcat(*self._symbols[1 : orders + 1]),
-                ca.vertcat(*self._values[:orders]),
-            )
-            if orders
-            else expression
-        )
+        if not orders:
+            return expression
+        symbols = ca.vertcat(*self._symbols[1 : orders + 1])
+        return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
 
 
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
@@ -330,12 +325,12 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
         x = system.nominal_state + deviation * random.standard_normal(system.num_states)
         numbers = [random.standard_normal(u.numel()) for u in unknowns]
         changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
-        one, other = (v.full() for v in function(x, *numbers, changed))
-        if not (np.all(np.isfinite(one)) and np.all(np.isfinite(other))):
+        a, b = (v.full() for v in function(x, *numbers, changed))
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
             continue  # Out of the domain of one of the functions.
         finite += 1
         # By columns: constraints may have very different units.
-        size = np.abs(one).max(axis=0, initial=0.0) + np.abs(other).max(axis=0, initial=0.0)
-        if not np.all(np.abs(one - other) <= 1e-9 * np.abs(other) + 1e-11 * size):
+        size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
+        if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
             return False
     return finite > 0

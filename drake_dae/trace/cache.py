@@ -20,7 +20,7 @@ from pathlib import Path
 from drake_dae.errors import MachineCodeError, MachineCodeWarning
 
 SUFFIX = ".so"
-"""The suffix of compiled code, also on macOS, where a library may have any."""
+"""The suffix of compiled code, also on macOS, where any suffix works."""
 
 _OURS = re.compile(rf"[0-9a-f]{{32}}-[0-9a-f]{{32}}{re.escape(SUFFIX)}|new-\w+")
 
@@ -58,16 +58,17 @@ def open_cache(create: bool = False) -> Path | None:
         MachineCodeError: It belongs to another user, or others can write it; or it cannot be made.
     """
     folder = cache_folder()
-    try:
+    with _explained(folder):
         if create:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with suppress(FileExistsError):
                 folder.mkdir(0o700)
-        status = folder.stat()
-    except OSError as error:
-        if isinstance(error, FileNotFoundError) and not create:
+        try:
+            status = folder.stat()
+        except FileNotFoundError:
+            if create:
+                raise
             return None
-        raise MachineCodeError(_message(folder, error)) from None
     if not stat.S_ISDIR(status.st_mode):
         raise MachineCodeError(f"the cache {folder} is no folder; remove it")
     if status.st_uid != os.getuid():
@@ -95,15 +96,11 @@ def find(key: str) -> Path | None:
     folder = open_cache()
     if folder is None:
         return None
-    try:
+    with _explained(folder):
         path = next(folder.glob(f"{key}-*{SUFFIX}"), None)
-        if path is None:
-            return None
-        if path.name == _name(key, path.read_bytes()):
+        if path is None or path.name == _name(key, path.read_bytes()):
             return path
         path.unlink()
-    except OSError as error:
-        raise MachineCodeError(_message(folder, error)) from None
     warnings.warn(f"{path} was damaged, and is removed", MachineCodeWarning, stacklevel=1)
     return None
 
@@ -116,16 +113,12 @@ def workplace() -> Iterator[Path]:
         MachineCodeError: The cache cannot be trusted or written.
     """
     folder = open_cache(create=True)
-    try:
-        place = tempfile.mkdtemp(prefix="new-", dir=folder)
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
-    try:
-        yield Path(place)
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
+    with _explained(cache_folder()):
+        temporary = tempfile.mkdtemp(prefix="new-", dir=folder)
+        try:
+            yield Path(temporary)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def store(key: str, file: Path) -> Path:
@@ -143,11 +136,9 @@ def contents() -> list[Path]:
         MachineCodeError: The cache cannot be trusted or read.
     """
     folder = open_cache()
-    try:
+    with _explained(cache_folder()):
         paths = sorted(folder.iterdir()) if folder is not None else []
-        return [path for path in paths if _OURS.fullmatch(path.name)]
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
+    return [path for path in paths if _OURS.fullmatch(path.name)]
 
 
 def clear() -> None:
@@ -157,18 +148,22 @@ def clear() -> None:
         MachineCodeError: The cache cannot be trusted or written.
     """
     for path in contents():
-        try:
+        with _explained(path):
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
-        except OSError as error:
-            raise MachineCodeError(_message(path, error)) from None
 
 
 def _name(key: str, code: bytes) -> str:
     return f"{key}-{hashlib.sha256(code).hexdigest()[:32]}{SUFFIX}"
 
 
-def _message(path: Path, error: OSError) -> str:
-    return f"the cache {path} cannot be used: {error.strerror or error}"
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turns an OSError into a MachineCodeError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise MachineCodeError(f"the cache {path} cannot be used: {reason}") from None

@@ -68,16 +68,15 @@ def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
         compiled: The choice.
         operations: The number of operations of the function.
     """
-    if compiled == "auto":
-        level = _level(compiled, operations)
-        if not operations:
-            return []
-        seconds = STARTING + COMPILING[level] * operations if level else 0.0
-        pays = (
-            [CompilationAttempt(int(seconds / (INTERPRETED * operations)), True)] if level else []
-        )
-        return [CompilationAttempt(LOOK, False), *pays]
-    return [CompilationAttempt(1, True)] if compiled else []
+    if compiled != "auto":
+        return [CompilationAttempt(1, True)] if compiled else []
+    if not operations:
+        return []
+    result = [CompilationAttempt(LOOK, False)]
+    if level := _level(compiled, operations):
+        seconds = STARTING + COMPILING[level] * operations
+        result.append(CompilationAttempt(int(seconds / (INTERPRETED * operations)), True))
+    return result
 
 
 def check_choice(owner: str, compiled: Any) -> None:
@@ -125,7 +124,7 @@ def library(
         operations: The approximate number of operations, for the expected time to compile.
         compiled: The choice, True or "auto".
         make: Whether to make it where the cache has none.
-        options: Options of the compiler, which outdo others.
+        options: Options of the compiler, which override others.
 
     Warns:
         MachineCodeWarning: It should be made and cannot be.
@@ -194,7 +193,7 @@ def _level(compiled: Compiled, operations: int) -> str:
     """The optimization level for a function; empty if compilation would take too long."""
     if compiled is True:
         return "-O1"
-    fast = (level for level, each in COMPILING.items() if each * operations < LIMIT)
+    fast = (level for level, seconds in COMPILING.items() if seconds * operations < LIMIT)
     return next(fast, "")
 
 

@@ -1,4 +1,4 @@
-"""The available C compiler: which one, its options, and how it is run."""
+"""The available C compiler, its options, and its calls."""
 
 import os
 import platform
@@ -113,7 +113,7 @@ class Compiler(NamedTuple):
 
 
 def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:
-    """What a compiler says that fails."""
+    """The message for a compiler that fails, with its first error."""
     lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
     wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
     said = wrong[0].replace(f"{folder}/", "").strip()

@@ -164,8 +164,8 @@ def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
         row = rest = ca.densify(rows[i, :])
         for direction in basis:
             rest -= ca.dot(direction, rest) * direction
-        left = ca.norm_2(rest)
-        basis.append(rest / left)
+        length_left = ca.norm_2(rest)
+        basis.append(rest / length_left)
         whole = ca.fmax(ca.norm_2(row), length)
-        smallest = ca.fmin(smallest, ca.if_else(whole > 0, left / whole, 0))
+        smallest = ca.fmin(smallest, ca.if_else(whole > 0, length_left / whole, 0))
     return smallest

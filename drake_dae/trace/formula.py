@@ -1,4 +1,4 @@
-"""Formulas given as text: parsed, never executed as Python."""
+"""Formulas as text: parsed, never executed as Python."""
 
 import ast
 import operator

@@ -42,12 +42,14 @@ def numpy_explained(what: str) -> Iterator[None]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
-    for one in caught:
-        text = str(one.message)
-        if one.category is FutureWarning and "casadi" in text and "numpy" in text:
+    for warning in caught:
+        text = str(warning.message)
+        if warning.category is FutureWarning and "casadi" in text and "numpy" in text:
             _warn(what)
         else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )
 
 
 @cache

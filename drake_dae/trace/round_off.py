@@ -35,8 +35,8 @@ def multiply(
     row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
     column_noise = negligible * np.max(column, axis=0, keepdims=True, initial=0.0)
     left = np.where(row > row_noise, left, 0.0)
-    kept = np.abs(value) / scale[:, None] > column_noise
-    value, size = np.where(kept, value, 0.0), np.where(column > column_noise, size, 0.0)
+    significant = np.abs(value) / scale[:, None] > column_noise
+    value, size = np.where(significant, value, 0.0), np.where(column > column_noise, size, 0.0)
     return without_round_off(left @ value, np.abs(left) @ size)
 
 
@@ -53,6 +53,11 @@ def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
 def positive(sizes: FloatArray) -> FloatArray:
     """Sizes to divide by: 1 in place of 0."""
     return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def unit_rows(matrix: FloatArray) -> FloatArray:
+    """A matrix with rows of length one; rows of zeros stay zero."""
+    return matrix / positive(np.linalg.norm(matrix, axis=-1, keepdims=True))
 
 
 def smallest_singular_value(matrix: FloatArray) -> float:

@@ -184,8 +184,10 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
         best = (_best(situation, parts, roughness / 2.0**0.5) for parts in tried)
         if (contact := next(filter(None, best), None)) is None:
             continue
-        left = (roughness**2 - contact.roughness**2) ** 0.5
-        if (free := _best(situation, [_free(situation, w, fast) for w in rates], left)) is not None:
+        remaining = (roughness**2 - contact.roughness**2) ** 0.5
+        if (
+            free := _best(situation, [_free(situation, w, fast) for w in rates], remaining)
+        ) is not None:
             candidates.append((free, contact, fast))
     if not candidates:
         raise GainError(_reason(situation, rates, roughness / 2.0**0.5, highest))

@@ -200,7 +200,9 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
         # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
         power = ca.fmin(ca.mtimes(velocity.T, force), -_TINY)
         across = plane - ca.mtimes(force, ca.mtimes(velocity.T, plane)) / power
-        sizes = [ca.mmax(ca.sum1(each * ca.mtimes(metric, each))) for each in (across, plane)]
+        sizes = [
+            ca.mmax(ca.sum1(columns * ca.mtimes(metric, columns))) for columns in (across, plane)
+        ]
         across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
         matched = ca.mtimes(metric, beside(across, metric, force))
         square = ca.fmax(ca.dot(matched, force), _TINY)
@@ -246,15 +248,15 @@ def _wanted(
     if len(starts) < len(steered):
         return None, moving
     reference, ahead = ca.SX.sym("R", layout.reference_size), ca.SX.sym("t")
-    kept = DerivativeLayout(structure.constraint_degrees).ends.tolist()
-    left = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
-    left += [structure.manifold.residual_expression[kept, :]]
-    slope = ca.jacobian(ca.vertcat(*left), system.state[list(rows), :])
+    velocity_rows = DerivativeLayout(structure.constraint_degrees).ends.tolist()
+    errors = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
+    errors += [structure.manifold.residual_expression[velocity_rows, :]]
+    slope = ca.jacobian(ca.vertcat(*errors), system.state[list(rows), :])
     if slope.shape[0] != slope.shape[1]:
         return None, moving
     factors = Factorization(slope)
     state = ca.SX(system.state)
-    state[list(rows), :] -= factors.solve(ca.vertcat(*left))
+    state[list(rows), :] -= factors.solve(ca.vertcat(*errors))
     inputs = {"reference": reference, "ahead": ahead}
     wanted = system.trace("wanted velocities", {"state": state}, inputs, factors.pivot, often=False)
     return wanted, moving

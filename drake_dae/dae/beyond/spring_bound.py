@@ -98,8 +98,8 @@ def spring_error_bound(
     late = (delay + period / 2.0) * np.gradient(control, moments, axis=0)
     driven = np.zeros_like(tau)
     for k, matrix in enumerate(moves):
-        left = loop.rate**2 * np.eye(p) + K @ select @ matrix
-        error = -np.linalg.solve(left, bends[k] + K @ np.linalg.solve(B, late[k]))
+        stiffness_of_error = loop.rate**2 * np.eye(p) + K @ select @ matrix
+        error = -np.linalg.solve(stiffness_of_error, bends[k] + K @ np.linalg.solve(B, late[k]))
         driven[k] = traced[k][2].reshape(p, p) @ error
     # Differences at both ends are one-sided.
     inner = slice(2, -2)

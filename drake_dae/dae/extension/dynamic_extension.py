@@ -268,16 +268,14 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
         last = explicit.k[i]
         for _ in range(system.num_states):
             gradient = samples.values(gradient=ca.jacobian(last, x))[0][0]
-            by_force = multiply(gradient, samples.field("g")[0], samples.scale, system.negligible)[
-                0
-            ]
-            by_control = multiply(
-                gradient, samples.field("h")[0], samples.scale, system.negligible
-            )[0]
+            by_force, by_control = (
+                multiply(gradient, samples.field(key)[0], samples.scale, system.negligible)[0]
+                for key in "gh"
+            )
             if by_force.any():
                 break
             if by_control.any():
-                early.update(int(j) for j in np.flatnonzero(by_control))
+                early.update(np.flatnonzero(by_control).tolist())
                 break
             last = lie_derivative(last, explicit.f, x)
     return sorted(early)

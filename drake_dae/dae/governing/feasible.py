@@ -53,7 +53,7 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
                 f"{system.name}: each control needs a limit of its magnitude, '{signal.name}' has "
                 f"{least:g} to {most:g} {signal.unit}"
             )
-    wanted, scale = ca.SX.sym("wanted", system.num_controls), ca.DM(high)
+    desired, scale = ca.SX.sym("wanted", system.num_controls), ca.DM(high)
     matrix = ca.densify(structure.control_matrix)  # (16)
     inputs_of_matrix = [system.state, system.parameter_symbol]
     usual = ca.Function("B", inputs_of_matrix, [matrix])(
@@ -64,20 +64,20 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     metric = ca.mtimes(effect.T, effect)
     metric /= ca.trace(metric) / high.size
     rows, bounds = _forces(structure, limits, scale)
-    goal = wanted / scale
+    goal = desired / scale
     nearest = nearest_within(metric, goal, rows, bounds, SOFTNESS)
     over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(rows, goal) - bounds)
     is_limited = ca.mmax(over) > WITHIN
-    limited_control = ca.if_else(is_limited, nearest * scale, wanted)
+    limited_control = ca.if_else(is_limited, nearest * scale, desired)
     control = ca.fmax(-scale, ca.fmin(scale, limited_control))
-    excess = ca.if_else(is_limited, wanted - control, 0.0)
+    excess = ca.if_else(is_limited, desired - control, 0.0)
     outputs = {
         "control": control,
         "excess": excess,
         "departure": -ca.mtimes(matrix, excess),
         "is_limited": is_limited,
     }
-    inputs = {"state": system.state, "control": wanted, "parameters": system.parameter_symbol}
+    inputs = {"state": system.state, "control": desired, "parameters": system.parameter_symbol}
     name = f"{system.name} feasible control"
     return TracedFunction(name, inputs, outputs, compiled=system.compiled)
 

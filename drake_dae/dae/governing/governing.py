@@ -1,4 +1,4 @@
-"""The rate of a reference, slowed by what the present state needs."""
+"""The rate of a reference, lowered so that limits hold at the present state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.functions import TracedFunction
 
 RATE = 20.0
-"""How fast the rate of the reference returns to 1, and how fast it may fall to 0, in 1/s."""
+"""The rate in 1/s at which s' returns to 1, and the largest at which it falls to 0."""
 
 APPROACH = 100.0
-"""How fast speeds may approach their limits, in 1/s."""
+"""The largest rate at which speeds approach their limits, in 1/s."""
 
 AHEAD = 0.02
-"""How far ahead limits are met, in s."""
+"""Limits are satisfied at a time that is ahead by this, in s."""
 
 FREE = 1e6
 """The largest |s''| where nothing limits it, in 1/s."""
@@ -73,10 +73,7 @@ class Governing:
 
     @cached_property
     def function(self) -> TracedFunction:
-        """The function of the class."""
-        return self._traced()
-
-    def _traced(self) -> TracedFunction:
+        """The governed reference as a function; see the class."""
         law, layout = self.law, self.law.layout
         if any(degree not in (0, 2) for degree in law.degrees) or law.exogenous_degrees:
             raise ReferenceSignalError(
@@ -91,11 +88,11 @@ class Governing:
         still = ca.SX(rows)
         still[(moving + 1).tolist()] = first * rate
         still[(moving + 2).tolist()] = second * rate**2
-        wanted = law.wanted(still)
+        commanded = law.commanded_derivatives(still)
         now, ahead = ca.SX.zeros(len(law.degrees)), ca.SX.zeros(len(law.degrees))
         now[layout.dynamic.tolist()] = first
         ahead[layout.dynamic.tolist()] = first + 2.0 * AHEAD * rate * second
-        intervals = self._intervals(wanted, now, ahead)
+        intervals = self._intervals(commanded, now, ahead)
         chosen = most = RATE * (1.0 - rate)
         for low, high in intervals:
             chosen = _within(chosen, low, high)
@@ -124,7 +121,7 @@ class Governing:
             rows.append(row)
         return ca.vertcat(*rows)
 
-    def _intervals(self, wanted: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+    def _intervals(self, commanded: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
         """The least and the largest s'' by speeds, by other limits ahead of time, and now.
 
         Args:
@@ -134,9 +131,9 @@ class Governing:
         """
         structure = self.law.structure
         limited = LimitedSignals(structure, self.limits)
-        control, _ = structure.control_for(wanted)
+        control, _ = structure.control_for(commanded)
         slope_now, slope = (
-            structure.control_for(wanted + effect)[0] - control for effect in (now, ahead)
+            structure.control_for(commanded + effect)[0] - control for effect in (now, ahead)
         )
         free, by = limited.by_control()
         values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope)

@@ -4,15 +4,15 @@ import casadi as ca
 
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-STEPS, LARGER = 10, 5
-"""The number of steps, and for how many unknowns there is one more: so errors of about one fall
-below 1e-6, of 14 unknowns below 1e-5."""
+INTERIOR_POINT_STEPS, UNKNOWNS_PER_STEP = 10, 5
+"""The number of steps, and the number of unknowns for which one more is taken. Errors of about one
+fall below 1e-6; with 14 unknowns below 1e-5."""
 
 CLOSEST = 1e-13
 """The least distance from a bound."""
 
 DONE = 1e-12
-"""The mean of the products of slacks and multipliers at which x does not change any more."""
+"""The mean of the products of slacks and multipliers below which x is not changed any more."""
 
 BOUNDARY = 0.995
 """The largest step, relative to the distance to the nearest bound."""
@@ -46,7 +46,7 @@ def nearest_within(
     step = ca.Function("step", list(symbols.values()), after, {"cse": True})
     iterate = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
     iterate.append(ca.SX.ones(count))
-    for _ in range(STEPS + size // LARGER):
+    for _ in range(INTERIOR_POINT_STEPS + size // UNKNOWNS_PER_STEP):
         iterate = list(step(metric, goal, rows, bounds, *iterate))
     return iterate[0]
 
@@ -102,6 +102,6 @@ def _step(
     # At round-off products vanish; then nothing changes any more.
     t, goes_on = BOUNDARY * length(*step), mean > DONE
     return [
-        one + ca.if_else(goes_on, t * change, 0.0)
-        for one, change in zip((x, s, u, l, z), step, strict=True)
+        value + ca.if_else(goes_on, t * change, 0.0)
+        for value, change in zip((x, s, u, l, z), step, strict=True)
     ]

@@ -227,16 +227,16 @@ class _PlantModel:
         x, v = system.state, symbols["constraint_input"]
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, symbols["control"])
         balance -= ca.mtimes(system.mass_matrix, symbols["rate"])
-        kept = ca.mtimes(structure.elimination.constraint_gradient, symbols["rate"])
-        kept += self._carried
+        constraint_rate = ca.mtimes(structure.elimination.constraint_gradient, symbols["rate"])
+        constraint_rate += self._carried
         outputs = {
             "balance": ca.jacobian(balance, x),
-            "kept": ca.jacobian(kept, x),
+            "kept": ca.jacobian(constraint_rate, x),
             "k": ca.jacobian(system.k, x),
             "z": ca.jacobian(system.outputs(v), x),
             "m": system.m,
         }
-        slope, kept_slope, k_slope, z_slope, z_force = self._values(
+        slope, constraint_slope, k_slope, z_slope, z_force = self._values(
             outputs,
             rate=point.rate,
             constraint_input=point.constraint_input,
@@ -255,7 +255,7 @@ class _PlantModel:
             E, A + B @ feedback, B @ forward, C, no_feedthrough, unknowns, *signals
         )
         # On N*: (dx', dv) = moved dx + by_control du, and dv out of du.
-        moved = self._solve(np.vstack([slope, -kept_slope]))
+        moved = self._solve(np.vstack([slope, -constraint_slope]))
         of_x, of_v = feedback[:, :n], feedback[:, n:]
         around = np.eye(p) - of_v @ self.by_control[n:]
         control_by_state = np.linalg.solve(around, of_x + of_v @ moved[n:])

@@ -123,13 +123,13 @@ class ConsistentStateSearch:
         for _ in range(ITERATIONS):
             state = x * self._residual.scale
             gradients = self._residual.gradients(state, parameters) * self._residual.scale
-            left = self._residual.function(state, parameters)[0]
-            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(left))):
+            residual = self._residual.function(state, parameters)[0]
+            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(residual))):
                 return None
             length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._residual.lengths))
-            if norm(left / length) > SMALL * size:
+            if norm(residual / length) > SMALL * size:
                 return None
-            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (left / length)
+            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (residual / length)
             x = x - step
             if norm(step) <= ROUND_OFF * size:
                 return x * self._residual.scale

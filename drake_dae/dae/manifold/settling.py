@@ -45,7 +45,7 @@ class Settling:
             if all(moves):
                 return state
         state = start.copy()
-        moves = (_settle_level(self._residual, state, *each, parameters) for each in self._levels)
+        moves = (_settle_level(self._residual, state, *level, parameters) for level in self._levels)
         return state if all(moves) else None
 
 
@@ -74,17 +74,17 @@ def _settle_level(
         x[columns] = scale * z
         return x
 
-    def left(z: FloatArray) -> FloatArray:
+    def level_residual(z: FloatArray) -> FloatArray:
         return residual.function(filled(z), parameters)[0][rows]
 
     def linearize(z: FloatArray) -> NewtonModel | None:
         x = filled(z)
         gradients = residual.gradients(x, parameters)[np.ix_(rows, columns)]
         if energy is None:
-            return shortest_steps(gradients * scale, left)
+            return shortest_steps(gradients * scale, level_residual)
         kinetic, depth = energy
         directions = kinetic.directions(x, parameters, gradients, depth)
-        return steps_along(gradients * scale, directions / scale[:, None], left)
+        return steps_along(gradients * scale, directions / scale[:, None], level_residual)
 
     z, converged = newton(state[columns] / scale, linearize)
     state[columns] = scale * z

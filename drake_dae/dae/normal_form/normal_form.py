@@ -172,14 +172,14 @@ class NormalForm:
         # Powers of 2, so that nothing is rounded.
         scale = np.exp2(np.ceil(np.log2(np.maximum(self._scale, np.abs(state)))))
 
-        def left(z: FloatArray) -> FloatArray:
+        def distance(z: FloatArray) -> FloatArray:
             return target - self._coordinates.evaluate(scale * z, parameters)[0]
 
         def linearize(z: FloatArray) -> NewtonModel | None:
             solve = _solver(self._at(scale * z, parameters)[1] * scale)
             if solve is None:
                 return None
-            return NewtonModel(lambda z: solve(left(z)), True)
+            return NewtonModel(lambda z: solve(distance(z)), True)
 
         solution, converged = newton(state / scale, linearize)
         return scale * solution if converged else None
@@ -194,13 +194,13 @@ class NormalForm:
     ) -> InconsistentStateError:
         """Names the coordinate that weak directions of the Jacobian keep from its target."""
         values, jacobian = self._at(state, parameters)
-        left = target - values
+        missing = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale
         rows[rows == 0.0] = 1.0
         weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
         weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
-        kept = weakest @ (weakest.T @ (left / rows))
-        worst = int(np.argmax(np.abs(kept * left / rows)))
+        kept = weakest @ (weakest.T @ (missing / rows))
+        worst = int(np.argmax(np.abs(kept * missing / rows)))
         message = (
             f"{self.system.name}: no way from the guess to the given coordinates: "
             f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
@@ -220,7 +220,7 @@ class NormalForm:
                 )
         else:
             message += "Start from a guess that is nearer, in the domain of the functions"
-        return InconsistentStateError(message, left)
+        return InconsistentStateError(message, missing)
 
     def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Phi and its Jacobian at a state."""

@@ -178,8 +178,5 @@ class Family:
         except InconsistentStateError:
             return None
         fields = fields_at(self._system, consistent, parameters)
-        return (
-            (consistent, parameters)
-            if all(np.all(np.isfinite(f)) for f in fields.values())
-            else None
-        )
+        is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
+        return (consistent, parameters) if is_finite else None

@@ -41,7 +41,7 @@ class ConsistentRegion:
     """The consistent states in a region, with the default parameters.
 
     Args:
-        manifold: N*, or what is known of it.
+        manifold: N*, or the constraints known so far.
         region: The region; None for the whole of N*.
     """
 
@@ -75,7 +75,7 @@ class ConsistentRegion:
     def draw(self, guess: FloatArray) -> FloatArray:
         """A consistent state with the bounded states of a guess, if there is one.
 
-        So random values cover the bounds, whatever the constraints change.
+        So random values cover the region, although the projection changes other states.
 
         Raises:
             InconsistentStateError: No consistent state is found in the region.
@@ -186,8 +186,8 @@ def _bounded_step(
     """A short dx with C dx + r = 0; components are limited by the bounds."""
     step, free = np.zeros(low.size), low < high
     while free.any():
-        left = residual + gradient[:, ~free] @ step[~free]
-        step[free] = -np.linalg.lstsq(gradient[:, free], left)[0]
+        remaining = residual + gradient[:, ~free] @ step[~free]
+        step[free] = -np.linalg.lstsq(gradient[:, free], remaining)[0]
         past = free & ((step < low) | (step > high))
         if not past.any():
             break

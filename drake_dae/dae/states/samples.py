@@ -142,7 +142,7 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
 
 
 def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
-    """A spread as shape (n,): one that is given, a number for all, or the system's own if None.
+    """A spread as shape (n,), also from one number for all; the default of the system if None.
 
     Raises:
         ModelError: The shape is wrong, or a number is not finite.

@@ -91,7 +91,7 @@ class Violation:
     least: float | None = None
 
     def __str__(self) -> str:
-        text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
+        text = f"Assumption ({self.assumption}): {self._statement()}. {self.cause.value}"
         if self.deciding is None or self.cause in (ViolationKind.NUMBERS, ViolationKind.BOUNDS):
             return text
         acts = {
@@ -108,7 +108,7 @@ class Violation:
         """The exception for this violation."""
         return AssumptionError(str(self), self.assumption, self.state, self)
 
-    def _found(self) -> str:
+    def _statement(self) -> str:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"

@@ -120,8 +120,8 @@ class Passage:
         for _ in range(3):
             c_rate, c_second, slope, _, _ = self._along(state, rate, parameters)
             rows = np.vstack([kept.T @ gradient, null.T @ slope])
-            left = np.concatenate([kept.T @ c_rate, null.T @ c_second])
-            step = np.linalg.lstsq(rows @ ways, -left)[0]
+            residuals = np.concatenate([kept.T @ c_rate, null.T @ c_second])
+            step = np.linalg.lstsq(rows @ ways, -residuals)[0]
             rate = rate + ways @ step
             v = v + kept @ step[: kept.shape[1]]
         bending = self._along(state, rate, parameters)[4] @ null
@@ -149,14 +149,14 @@ class Passage:
             n = null + kept @ mixed
             matrix = np.zeros((kept.shape[1] + count * size, size + mixed.size))
             matrix[: kept.shape[1], :size] = kept.T @ gradient
-            left = [kept.T @ k]
+            residuals = [kept.T @ k]
             for j in range(count):
                 rows = slice(kept.shape[1] + j * size, kept.shape[1] + (j + 1) * size)
                 columns = slice(size + j * kept.shape[1], size + (j + 1) * kept.shape[1])
                 matrix[rows, :size] = np.tensordot(n[:, j], turning, 1)
                 matrix[rows, columns] = gradient.T @ kept
-                left.append(gradient.T @ n[:, j])
-            step = -np.linalg.lstsq(matrix, np.concatenate(left))[0]
+                residuals.append(gradient.T @ n[:, j])
+            step = -np.linalg.lstsq(matrix, np.concatenate(residuals))[0]
             x[used] += step[:size]
             mixed = mixed + step[size:].reshape(count, -1).T
             if not np.all(np.isfinite(x)):

@@ -95,23 +95,23 @@ class _Redundant(Manifold):
         z = self.system.state_vector(state) / scale
         gradients = self.gradients(scale * z, parameters) * scale
         length = positive(np.linalg.norm(gradients, axis=1))
-        left = self.residual(scale * z, parameters) / length
+        residual = self.residual(scale * z, parameters) / length
         damping = 1.0
         for _ in range(SEARCH):
-            size = float(np.linalg.norm(left))
+            size = float(np.linalg.norm(residual))
             u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
-            step = (u.T @ left) * s / positive(s * s + damping * size) @ v
+            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
             following = self.residual(scale * (z - step), parameters) / length
             if not np.linalg.norm(following) < size:
                 if size <= ROUND_OFF * (1.0 + np.linalg.norm(z)):
                     return np.asarray(scale * z)
                 damping *= 4.0
                 continue
-            z, left, damping = z - step, following, 1.0
+            z, residual, damping = z - step, following, 1.0
             gradients = self.gradients(scale * z, parameters) * scale
         raise InconsistentStateError(
             f"{self.system.name}: no state found near the given one at which all constraints hold",
-            left * length,
+            residual * length,
         )
 
 
@@ -131,18 +131,18 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 def independent_constraints(samples: Samples) -> list[int]:
     """The constraints that can stay, chosen so that they are well independent at all samples."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
-    rest = [equilibrated(gradient) for (gradient,) in values]
+    remainders = [equilibrated(gradient) for (gradient,) in values]
     most = min(_rank(gradient) for (gradient,) in values)
-    kept: list[int] = []
-    while len(kept) < most:
-        left = np.min([np.linalg.norm(matrix, axis=1) for matrix in rest], axis=0)
-        left[kept] = 0.0
-        chosen = int(np.argmax(left >= PREFERRED * left.max()))
-        kept.append(chosen)
-        for matrix in rest:
+    staying: list[int] = []
+    while len(staying) < most:
+        independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
+        independence[staying] = 0.0
+        chosen = int(np.argmax(independence >= PREFERRED * independence.max()))
+        staying.append(chosen)
+        for matrix in remainders:
             direction = matrix[chosen] / np.linalg.norm(matrix[chosen])
             matrix -= np.outer(matrix @ direction, direction)
-    return sorted(kept)
+    return sorted(staying)
 
 
 def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:

@@ -79,7 +79,7 @@ class Structure(ConstraintStructure):
         """The output chains below each other, as `layout` stacks them, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
-    def motion_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
+    def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
         """x' and v under the control of `control_for`, solved for along with it.
 
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
@@ -96,14 +96,14 @@ class Structure(ConstraintStructure):
             return None
         motion = self.derivatives
         shown = ca.vertcat(motion.rate, motion.constraint_input)
-        solution = motion.inverse(self.highest_derivatives, wanted, shown)
+        solution = motion.inverse(self.highest_derivatives, commanded, shown)
         if solution is None:
             return None
         size = self.system.num_states
         return solution[2][:size, :], solution[2][size:, :], solution[1]
 
-    def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
+    def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
 
         If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
@@ -115,15 +115,15 @@ class Structure(ConstraintStructure):
         """
         solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
-            solution = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
+            solution = self.derivatives.inverse(self.highest_derivatives, commanded)  # (28)
         if solution is None:  # L_h* of an output vanishes, but not by structure.
-            solution = self.control_by_matrix(wanted)
+            solution = self.control_by_matrix(commanded)
         control, pivot, *_ = solution
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
 
-    def control_by_matrix(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
+    def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
         """The control of `control_for` by B(x) itself, where A(x) is regular.
 
         Args:
@@ -132,7 +132,7 @@ class Structure(ConstraintStructure):
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
         """
-        needed, metric = wanted - self.drift, self.system.control_metric  # (28)
+        needed, metric = commanded - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
         factors = Factorization(self.control_matrix)

@@ -16,10 +16,10 @@ from drake_dae.trace.compiled import check_choice
 
 
 def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a system, converted from the given ones.
+    """The fields of a system, converted and checked.
 
     Args:
-        given: Every field by its name; see `DaeSystem`.
+        arguments: Name -> value of every field; see `DaeSystem`.
 
     Raises:
         ModelError: They do not form a system; see `DaeSystem`.
@@ -41,16 +41,14 @@ def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
                 f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
                 f"{brief(arguments[key])}"
             )
-    if not (
-        isinstance(arguments["contacts"], (list, tuple))
-        and all(isinstance(contact, UnilateralInput) for contact in arguments["contacts"])
+    contacts = arguments["contacts"]
+    if not isinstance(contacts, (list, tuple)) or not all(
+        isinstance(contact, UnilateralInput) for contact in contacts
     ):
-        raise ModelError(
-            f"{name}: contacts must be a list of Contacts, got {brief(arguments['contacts'])}"
-        )
+        raise ModelError(f"{name}: contacts must be a list of Contacts, got {brief(contacts)}")
     state = ca.vec(state)
     parameters = _parameters(name, arguments["parameters"])
-    for contact in arguments["contacts"]:
+    for contact in contacts:
         if contact.friction is not None:
             parameter_slice(name, parameters, contact.friction)
     expressions = _expressions(arguments, state, parameters)
@@ -81,7 +79,7 @@ def _parameters(name: str, argument: Any) -> tuple[Parameter, ...]:
 def _expressions(
     arguments: Mapping[str, Any], state: ca.SX, parameters: Sequence[Parameter]
 ) -> dict[str, ca.SX]:
-    """The functions of (1)-(3), E, and how the control is chosen, as expressions that fit."""
+    """The functions of (1)-(3), E, the control metric and u_0, as expressions of right shapes."""
     functions = {key: arguments[key] for key in ("f", "g", "h", "k", "l", "m")}
     mass = arguments["mass_matrix"]
     functions["mass_matrix"] = ca.SX.eye(state.numel()) if mass is None else mass
@@ -93,7 +91,7 @@ def _expressions(
 def _signals(
     name: str, key: str, argument: Sequence[Any], count: int, letter: str
 ) -> tuple[Signal, ...]:
-    """Names and units of a vector, made up where not given."""
+    """Names and units of a vector, with default names such as x0, x1."""
     signals = as_signals(f"{name}: {key}", argument or [f"{letter}{i}" for i in range(count)])
     if len(signals) != count:
         raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
@@ -102,7 +100,7 @@ def _signals(
 
 
 def _numbers(name: str, arguments: Mapping[str, Any], size: int) -> dict[str, FloatArray]:
-    """The nominal state, and how large states are where that is given."""
+    """The nominal state, and the scale of the states if there is one."""
     start = np.zeros(size) if arguments["nominal_state"] is None else arguments["nominal_state"]
     arrays = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
     if arguments["state_scale"] is not None:

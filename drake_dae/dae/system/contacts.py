@@ -92,14 +92,14 @@ class Contacts:
 
     @property
     def rows(self) -> list[int]:
-        return list(self._found)
+        return list(self._friction_of_rows)
 
     @property
     def frictions(self) -> list[Parameter | None]:
-        return list(self._found.values())
+        return list(self._friction_of_rows.values())
 
     @property
-    def _found(self) -> dict[int, Parameter | None]:
+    def _friction_of_rows(self) -> dict[int, Parameter | None]:
         names = [signal.name for signal in self.inputs]
         by_name = {parameter.name: parameter for parameter in self.parameters}
         return {
@@ -112,10 +112,8 @@ class Contacts:
         """An expression with all coefficients of friction zero."""
         if not self:
             return matrix
-        coefficients = {
-            p.name: p.symbol for p in self.frictions if p
-        }  # Contacts may share a coefficient.
-        symbols = ca.vertcat(*coefficients.values())
+        # Contacts may share a coefficient.
+        symbols = ca.vertcat(*{p.name: p.symbol for p in self.frictions if p}.values())
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:
@@ -132,9 +130,9 @@ class Contacts:
             A scalar. Where it is not positive, only its sign has a meaning.
         """
         smallest = ca.SX(1)
-        kept = [i for i in range(matrix.shape[0]) if i not in self.rows]
+        others = [i for i in range(matrix.shape[0]) if i not in self.rows]
         both = [matrix, self.without_friction(matrix)]
-        for i in kept:  # Positive without friction, of which these constraints have none.
+        for i in others:  # These constraints have no friction, so their pivots are positive.
             both = [_eliminated(part, i) for part in both]
         for minor, without in zip(*(_minors(part, self.rows) for part in both), strict=True):
             smallest = ca.fmin(smallest, minor / without)
@@ -142,7 +140,7 @@ class Contacts:
 
 
 def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
-    """The Schur complement after row and column i, which stay where they are."""
+    """The Schur complement of entry (i, i), in the shape of the matrix."""
     return matrix - ca.mtimes(matrix[:, i], matrix[i, :]) / matrix[i, i]
 
 
@@ -155,7 +153,7 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
     Args:
         matrix: A, shape (m, m).
         rows: The rows.
-        before: What minors are multiplied by: the pivots of rows that are eliminated.
+        before: The product of the pivots of eliminated rows, by which minors are multiplied.
     """
     if rows:
         first, *others = rows

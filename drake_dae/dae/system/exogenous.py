@@ -68,12 +68,12 @@ class Exogenous:
             degrees: d_1, d_2, ..., one for each entry of w.
         """
         start, following = 0, sum(p.value.size for p in self.parameters)
-        places, left = [], iter(degrees)
+        places, remaining = [], iter(degrees)
         for p in self.parameters:
             size = p.value.size
             if p.exogenous:
                 for i in range(size):
-                    rates = range(next(left))
+                    rates = range(next(remaining))
                     places += [start + i, *(following + order * size + i for order in rates)]
                 following += size * len(p.derivatives)
             start += size

@@ -22,7 +22,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 
     Args:
         owner: The name of the system, for messages.
-        key: What the value is, for messages.
+        key: The name of the value, for messages.
         value: A list of lists is a matrix, row by row.
 
     Raises:
@@ -47,11 +47,11 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 def as_functions(
     owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """The given functions of (1)-(3) and others as expressions of the right shapes.
+    """The functions of (1)-(3) and others as expressions of the right shapes.
 
     Args:
         owner: The name of the system, for messages.
-        given: Name of a function -> what `as_expression` takes.
+        functions: Name -> what `as_expression` takes.
         state: x, shape (n, 1).
         parameters: The symbols of all parameters, below each other.
 

@@ -148,25 +148,25 @@ def _alike(comparisons: list[_Comparison]) -> FloatArray:
     The sum of sqrt(1 + residual^2) is minimized, which is robust against a few outliers.
     """
     unknowns, logarithms, equation, weight, is_plain = map(np.array, zip(*comparisons, strict=True))
-    kept: Booleans = is_plain
+    relevant: Booleans = is_plain
     solution = np.zeros(unknowns.shape[1])
     for _ in range(SELECTIONS):
-        weights = kept * weight
+        weights = relevant * weight
         for _ in range(REPETITIONS):
             factors, last = np.sqrt(weights), solution
             solution = np.linalg.lstsq(
                 factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9
             )[0]
-            left = unknowns @ solution + logarithms
-            weights = kept * weight / np.sqrt(1.0 + left * left)
+            residuals = unknowns @ solution + logarithms
+            weights = relevant * weight / np.sqrt(1.0 + residuals * residuals)
             if np.max(np.abs(solution - last)) < CONVERGED:
                 break
         largest = np.zeros(unknowns.shape[1])
-        np.maximum.at(largest, equation, left)
-        significant = left > largest[equation] + NEGLIGIBLE
-        if np.array_equal(significant, kept):
+        np.maximum.at(largest, equation, residuals)
+        significant = residuals > largest[equation] + NEGLIGIBLE
+        if np.array_equal(significant, relevant):
             break
-        kept = significant
+        relevant = significant
     return solution
 
 

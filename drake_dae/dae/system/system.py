@@ -288,14 +288,7 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name, or bounds are not valid.
         """
-        for name in bounds:
-            self.parameter_slice(name)
-        return replace(
-            self,
-            parameters=tuple(
-                bounded(p, bounds[p.name]) if p.name in bounds else p for p in self.parameters
-            ),
-        )
+        return self._with_parameters(bounded, bounds)
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
@@ -307,14 +300,17 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name, or a value does not fit.
         """
+        return self._with_parameters(valued, values)
+
+    def _with_parameters(
+        self, changed: Callable[[Parameter, Any], Parameter], values: Mapping[str, Any]
+    ) -> "DaeSystem":
         for name in values:
             self.parameter_slice(name)
-        return replace(
-            self,
-            parameters=tuple(
-                valued(p, values[p.name]) if p.name in values else p for p in self.parameters
-            ),
-        )
+        parameters = [
+            changed(p, values[p.name]) if p.name in values else p for p in self.parameters
+        ]
+        return replace(self, parameters=tuple(parameters))
 
     @property
     def parameter_box(self) -> tuple[FloatArray, FloatArray]:

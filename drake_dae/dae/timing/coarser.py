@@ -58,13 +58,13 @@ def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomial
                 return None
         return coefficients
 
-    kept, rows, i = [0], [], 0
+    breaks_kept, rows, i = [0], [], 0
     while i < len(factors):
-        place, row = _furthest(joined, i, len(factors))
+        reached, row = _furthest(joined, i, len(factors))
         rows.append(factors[i] if row is None else row)
-        kept.append(place)
-        i = place
-    return PiecewisePolynomials(breaks[kept], np.stack(rows))
+        breaks_kept.append(reached)
+        i = reached
+    return PiecewisePolynomials(breaks[breaks_kept], np.stack(rows))
 
 
 def _furthest(

@@ -36,7 +36,7 @@ Times = Callable[[FloatArray], FloatArray]
 
 def at_times(references: Sequence[Reference], layout: DerivativeLayout) -> Times:
     """References as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
-    parts = [_one_at_times(*each) for each in with_degrees(references, layout.degrees)]
+    parts = [_one_at_times(*part) for part in with_degrees(references, layout.degrees)]
     return lambda times: np.hstack([part(times) for part in parts])
 
 

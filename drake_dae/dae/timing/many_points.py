@@ -23,11 +23,11 @@ class ManyPoints:
         if compiled:
             function = machine_code(function, compiled, compiled is True) or function
         self._buffer, self._evaluate = function.map(BLOCK).buffer()
-        self._given = [np.zeros((BLOCK, function.nnz_in(i))) for i in range(function.n_in())]
-        self._found = [np.zeros((BLOCK, rows * columns)) for rows, columns in self._shapes]
-        for index, array in enumerate(self._given):
+        self._arguments = [np.zeros((BLOCK, function.nnz_in(i))) for i in range(function.n_in())]
+        self._results = [np.zeros((BLOCK, rows * columns)) for rows, columns in self._shapes]
+        for index, array in enumerate(self._arguments):
             self._buffer.set_arg(index, array.reshape(-1).data)
-        for index, array in enumerate(self._found):
+        for index, array in enumerate(self._results):
             self._buffer.set_res(index, array.reshape(-1).data)
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
@@ -41,13 +41,13 @@ class ManyPoints:
             For each result an array of shape (k, size), or (k, rows, columns) of a matrix.
         """
         count = len(arguments[0])
-        results = [np.empty((count, part.shape[1])) for part in self._found]
+        results = [np.empty((count, part.shape[1])) for part in self._results]
         for first in range(0, count, BLOCK):
             last = min(first + BLOCK, count)
-            for column, argument in zip(self._given, arguments, strict=True):
+            for column, argument in zip(self._arguments, arguments, strict=True):
                 column[: last - first] = argument[first:last] if argument.ndim == 2 else argument
             self._evaluate()
-            for result, part in zip(results, self._found, strict=True):
+            for result, part in zip(results, self._results, strict=True):
                 result[first:last] = part[: last - first]
         return [
             array if columns == 1 else array.reshape(count, columns, rows).transpose(0, 2, 1)

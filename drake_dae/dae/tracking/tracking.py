@@ -131,7 +131,7 @@ class TrackingLaw:
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
-        self._wanted = ubar
+        self._ubar = ubar
         self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
         return TracedFunction(
             f"{self.system.name} tracking law",
@@ -147,7 +147,7 @@ class TrackingLaw:
         """The symbols that `function` takes, by their names."""
         return dict(self._inputs)
 
-    def wanted(self, reference: ca.SX) -> ca.SX:
+    def commanded_derivatives(self, reference: ca.SX) -> ca.SX:
         """ubar of (28) for a reference, in terms of state and parameters, shape (p, 1).
 
         A measured force is assumed to equal its reference, and integrals to be 0.
@@ -163,11 +163,8 @@ class TrackingLaw:
             values["measured_force"] = force
         if self.integral.outputs:
             values["integral"] = ca.SX.zeros(len(self.integral.outputs))
-        return ca.substitute(
-            self._wanted,
-            ca.vertcat(*[self._inputs[name] for name in values]),
-            ca.vertcat(*values.values()),
-        )
+        symbols = ca.vertcat(*[self._inputs[name] for name in values])
+        return ca.substitute(self._ubar, symbols, ca.vertcat(*values.values()))
 
     def trace_motion(self) -> TracedFunction | None:
         """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
@@ -175,7 +172,7 @@ class TrackingLaw:
         Returns:
             A function of what `function` takes; None where there is none.
         """
-        motion = self.structure.motion_for(self._wanted) if self._model is self.structure else None
+        motion = self.structure.motion_for(self._ubar) if self._model is self.structure else None
         if motion is None:
             return None
         rate, force, pivot = motion
@@ -328,9 +325,9 @@ class TrackingLaw:
 
 
 def _measured_force(
-    system: DaeSystem, layout: DerivativeLayout, wanted: bool, gain: ArrayLike
+    system: DaeSystem, layout: DerivativeLayout, is_measured: bool, gain: ArrayLike
 ) -> ForceMeasurement | None:
-    if wanted:
+    if is_measured:
         return ForceMeasurement.of(system, layout, gain)
     if numbers("force_gain", gain, GainError).any():
         raise GainError("force_gain needs measured_force=True")

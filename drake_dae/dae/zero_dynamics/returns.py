@@ -113,7 +113,7 @@ def close(
         missed = float(np.linalg.norm(gap))
         if not patient and missed > max(0.5 * before, CLOSED):
             return None  # For example if the motion drifts.
-        matrix, left, before = monodromy - np.eye(gap.size), -gap, missed
+        matrix, right, before = monodromy - np.eye(gap.size), -gap, missed
         if free:
             # A little later, and not along the motion.
             rate = flow.pinned.rate(passage.state, flow.goal(begin), flow.parameters(begin))
@@ -124,8 +124,8 @@ def close(
             matrix = np.block(
                 [[matrix, onward[:, None] / size], [onward[None] / size, np.zeros((1, 1))]]
             )
-            left = np.append(left, 0.0)
-        change = np.linalg.lstsq(matrix, left, rcond=CARRIED)[0]
+            right = np.append(right, 0.0)
+        change = np.linalg.lstsq(matrix, right, rcond=CARRIED)[0]
         later = float(change[gap.size]) / size if free else 0.0
         step = basis @ change[: gap.size]
         if np.max(np.abs(step) / scale, initial=0.0) <= CLOSED and abs(later) <= CLOSED * period:
@@ -154,7 +154,7 @@ def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Pe
     """
     periods = islice(_near(flow, state, duration), CROSSINGS)
     motions = (close(flow, state, 0.0, period, free=True) for period in periods)
-    return next((one for one in motions if one is not None), None)
+    return next((motion for motion in motions if motion is not None), None)
 
 
 def find_multiple(
@@ -162,7 +162,7 @@ def find_multiple(
 ) -> PeriodicMotion | None:
     """The attracting motion near a state whose period is a multiple of the reference's."""
     motions = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
-    return next((one for one in motions if one is not None and one.attracts), None)
+    return next((motion for motion in motions if motion is not None and motion.attracts), None)
 
 
 def _near(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Iterator[float]:
