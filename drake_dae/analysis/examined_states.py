@@ -76,19 +76,19 @@ class ExaminedStates:
         around = system.usual_spread(rows[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
         return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
 
-    def describe(self, kept: int, noun: str) -> str:
+    def describe(self, count: int, noun: str) -> str:
         """Which states were examined, in words.
 
         Args:
-            kept: How many of the drawn ones were inside the domain and on N*.
+            count: How many of the drawn ones were inside the domain and on N*.
             noun: What they are called.
         """
         if self.num_given:
             return f"{count_of(self.num_given, noun)} as given"
-        place = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
-        left_out = len(self.guesses) - kept
+        region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
+        left_out = len(self.guesses) - count
         missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
-        return f"{count_of(kept, noun)} {place}{missing}"
+        return f"{count_of(count, noun)} {region}{missing}"
 
     def describe_region(self) -> str:
         """The bounds as "x in [0, 1], ..."."""

@@ -175,7 +175,7 @@ class Derivatives:
 
         Args:
             expression: Of the state and of the unknowns, shape (p, 1).
-            wanted: The desired values, shape (p, 1).
+            desired: The desired values, shape (p, 1).
             shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
 
         Returns:
@@ -188,7 +188,7 @@ class Derivatives:
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
-        still = [i for i, moves in enumerate(moved) if not moves]
+        unmoved = [i for i, moves in enumerate(moved) if not moves]
         unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
         equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - desired)
         involved = ca.which_depends(equations, unknowns, 1, True)
@@ -225,11 +225,11 @@ class Derivatives:
                 is_needed |= uses[last : last + len(columns)].any(axis=0)
                 needed.append(solution)
                 pivot = ca.fmin(pivot, block_pivot)
-        if still and ca.depends_on(ca.vertcat(*needed), symbols[still]):
+        if unmoved and ca.depends_on(ca.vertcat(*needed), symbols[unmoved]):
             pivot = ca.fmin(pivot, self.pivot)
         _, results = ca.substitute_inplace(
-            [symbols[still], *(unknowns[columns] for columns, _, _ in blocks)],
-            [values[still], *solutions],
+            [symbols[unmoved], *(unknowns[columns] for columns, _, _ in blocks)],
+            [values[unmoved], *solutions],
             [self.control, pivot, shown],
         )
         return results[0], results[1], results[2]

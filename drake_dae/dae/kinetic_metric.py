@@ -31,14 +31,14 @@ class KineticMetric:
         orders, degrees = layout.orders, np.array(layout.degrees, dtype=int)
         owners = np.repeat(np.arange(degrees.size), degrees)
         # The number of further derivatives of a row until the constraint inputs act.
-        left = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
+        further = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
         groups = _groups(system, int(max(degrees, default=0)))
         self.levels: list[tuple[Indices, Indices, int]] = [
-            (np.flatnonzero(left == depth), groups[depth], depth)
+            (np.flatnonzero(further == depth), groups[depth], depth)
             for depth in reversed(range(len(groups)))
-            if np.any(left == depth)
+            if np.any(further == depth)
         ]
-        self._last = np.flatnonzero(left == 0)
+        self._last = np.flatnonzero(further == 0)
         self.is_known = len(groups) == int(max(degrees, default=0)) and bool(groups)
         if not self.is_known:
             return
@@ -69,11 +69,11 @@ class KineticMetric:
         forces = self._values(state, parameters)[1]
         across = gradients[np.ix_(self._last, self._groups[0])].T
         lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
-        if not all(np.all(np.isfinite(one)) and np.all(one > 0.0) for one in lengths):
+        if not all(np.all(np.isfinite(length)) and np.all(length > 0.0) for length in lengths):
             return False
         basis, unit = across / lengths[0], forces / lengths[1]
-        left = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
-        return bool(np.max(np.abs(left)) <= ALONG)
+        residual = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
+        return bool(np.max(np.abs(residual)) <= ALONG)
 
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int

@@ -159,15 +159,15 @@ def _library(
     level = _level(compiled, operations)
     if not (make and level):
         return None
-    with files.workplace() as place:
+    with files.workplace() as folder:
         usual = STARTING + COMPILING[level] * operations
         seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
         try:
-            compiler.compile(source, place / "code", level, seconds, options)
+            compiler.compile(source, folder / "code", level, seconds, options)
         except CompilerHangs as error:
             give_up(compiler, error)
             raise
-        return files.store(_key(source, compiler, level, options), place / "code.so")
+        return files.store(_key(source, compiler, level, options), folder / "code.so")
 
 
 def without_branches(source: str) -> str:

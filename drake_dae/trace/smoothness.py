@@ -99,7 +99,7 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFla
         elif operation == ca.OP_INPUT:
             moves = inputs[0] == 0
         else:
-            moves = any(moving[place] for place in inputs)
+            moves = any(moving[i] for i in inputs)
             if moves and operation in _KINKS:
                 return SmoothnessFlaw(_KINKS[operation])
         moving[function.instruction_output(i)[0]] = moves

@@ -97,7 +97,7 @@ class SensedContact:
         stiffness = share * self.stiffness
         return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
 
-    def seen(self, lever: float) -> SensorNoise:
+    def noise_of(self, lever: float) -> SensorNoise:
         """The noise of a distance that follows from noisy angles."""
         noise = self.noise
         position, velocity = lever * noise.position, lever * noise.velocity
@@ -258,9 +258,9 @@ def _contact_rates(
 
 def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:
     rates = _free_rates(w, fast)
-    loop = sampled_loop(situation.free(), rates, situation.seen(situation.lever))
+    loop = sampled_loop(situation.free(), rates, situation.noise_of(situation.lever))
     error, _ = loop.deviations()
-    _, jump = sampled_loop(situation.free(), rates, situation.seen(1.0)).deviations()
+    _, jump = sampled_loop(situation.free(), rates, situation.noise_of(1.0)).deviations()
     step = MODEL_ERROR * situation.free_mobility * _rms(loop)
     return _Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
 
@@ -269,7 +269,7 @@ def _contact(
     situation: SensedContact, w: float, fast: float | None, share: float = _SLOWER[-1]
 ) -> _Part:
     rates = _contact_rates(situation, w, fast, share)
-    loop = sampled_loop(situation.contact(), rates, situation.seen(situation.contact_lever))
+    loop = sampled_loop(situation.contact(), rates, situation.noise_of(situation.contact_lever))
     error, jump = loop.deviations()
     step = MODEL_ERROR * situation.mobility * _rms(loop)
     ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
@@ -307,7 +307,7 @@ def _roughest_sensor(situation: SensedContact) -> str:
     def without(name: str) -> float:
         quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
         loop = sampled_loop(
-            quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.seen(1.0)
+            quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.noise_of(1.0)
         )
         return loop.deviations()[1]
 

@@ -187,43 +187,25 @@ def spring_loop_radius(
     one, none = np.eye(p), np.zeros((p, p))
     inverse = np.linalg.inv(B)
     # (d, d', the integral of d, u).
-    A = np.zeros((4 * p, 4 * p))
-    A[:p, p : 2 * p] = one
-    A[p : 2 * p, :p] = -s * (inverse + L) @ K
-    A[p : 2 * p, 3 * p :] = inverse
-    A[2 * p : 3 * p, :p] = one
+    stiff = -s * (inverse + L) @ K
+    A = np.block([[none, one, none, none], [stiff, none, none, inverse], [one, none, none, none]])
+    A = np.vstack([A, np.zeros((p, 4 * p))])
     step = scipy.linalg.expm(A * T)
     # The measured state gives the next control, with the observer's f_o (its sign as added).
     w, zeta, gain = loop.rate, loop.damping, -np.expm1(-loop.motor_rate * T)
-    feedback = K - w**2 * B, -2.0 * zeta * w * B
-    size = (3 + delay + 1) * p  # d, d', f_o, then the controls on their way, the next one first.
-    matrix = np.zeros((size, size))
-    at = [slice(i * p, (i + 1) * p) for i in range(3 + delay + 1)]
-    law = {0: feedback[0], 1: feedback[1], 2: one}
-    parts = [step[i * p : (i + 1) * p] for i in range(3)]
-    rows: list[dict[int, FloatArray]] = []
-    for part in parts:
-        columns = {0: part[:, :p], 1: part[:, p : 2 * p]}
-        by_control = part[:, 3 * p :]
-        acting = {3: one} if delay else law
-        for place, block in acting.items():
-            columns[place] = columns.get(place, none) + by_control @ block
-        rows.append(columns)
-    for row, columns in zip((0, 1), rows[:2], strict=True):
-        for place, block in columns.items():
-            matrix[at[row], at[place]] += block
+    # The rows that select d, d', f_o, and the delayed controls, of which the next to act is first.
+    d, rate, friction, *delayed = np.split(np.eye((3 + delay) * p), 3 + delay)
+    law = (K - w**2 * B) @ d - 2.0 * zeta * w * B @ rate + friction
+    control, *delayed = [*delayed, law]
+    next_d, next_rate, integral = (
+        part[:, :p] @ d + part[:, p : 2 * p] @ rate + part[:, 3 * p :] @ control
+        for part in np.split(step, 4)[:3]
+    )
     # The observer takes the mean of K d at both ends, and the momentum has that of s K d.
-    matrix[at[2], at[2]] += (1.0 - gain) * one
-    matrix[at[2], at[0]] -= gain * K / 2.0
-    for place, block in rows[0].items():
-        matrix[at[2], at[place]] -= gain * K @ block / 2.0
-    for place, block in rows[2].items():
-        matrix[at[2], at[place]] += gain * s * K @ block / T
-    for i in range(3, 3 + delay):
-        for place, block in ({i + 1: one} if i + 1 < 3 + delay else law).items():
-            matrix[at[i], at[place]] += block
-    used = size - p
-    return float(np.abs(np.linalg.eigvals(matrix[:used, :used])).max())
+    observed = s * K @ integral / T - K @ (d + next_d) / 2.0
+    friction = friction + gain * (observed - friction)
+    matrix = np.vstack([next_d, next_rate, friction, *delayed])
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def stable_scales(

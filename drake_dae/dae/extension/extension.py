@@ -146,7 +146,7 @@ def integrated(
     Args:
         system: The system (1)-(3).
         columns: The columns of the q controls.
-        held, following: Names of the new states and controls.
+        added, following: Names of the new states and controls.
         nominal: Values of the new states, shape (q,).
         mixing: The matrix b(x), shape (q, p - q); zero if None.
     """

@@ -125,7 +125,7 @@ class Governing:
         """The least and the largest s'' by speeds, by other limits ahead of time, and now.
 
         Args:
-            wanted: ubar of (28) for s'' = 0, shape (p, 1).
+            commanded: ubar of (28) for s'' = 0, shape (p, 1).
             now: d ubar / d s'', shape (p, 1).
             ahead: The same with its effect AHEAD of time.
         """

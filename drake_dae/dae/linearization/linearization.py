@@ -53,8 +53,8 @@ def linearize(
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     plant = _PlantModel(structure, state, system.parameter_vector(parameters))
     point = plant.at(u)
-    still = np.zeros((p, system.num_states + system.num_constraints))
-    return plant.linearization(point, still, np.eye(p), system.control_signals)
+    no_feedback = np.zeros((p, system.num_states + system.num_constraints))
+    return plant.linearization(point, no_feedback, np.eye(p), system.control_signals)
 
 
 @checked(ModelError)

@@ -161,14 +161,14 @@ class ConsistentStateSearch:
                 "domain of the constraints"
             )
         worst = int(np.argmax(np.abs(residual)))
-        left = (
+        text = (
             f"{name}: no consistent state found near the given one; "
             f"{self._residual.signals[worst].name} = {residual[worst]:.3g} is left where Newton's "
             "method ends. "
         )
         if are_dependent(self._residual.gradients(state, parameters) * self._residual.scale):
-            return left + (
+            return text + (
                 "The gradients of the constraints depend on each other there: the constraints "
                 "contradict each other, or start away from this state"
             )
-        return left + "Start nearer to the constraint, away from its singular states"
+        return text + "Start nearer to the constraint, away from its singular states"

@@ -199,8 +199,8 @@ class NormalForm:
         rows[rows == 0.0] = 1.0
         weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
         weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
-        kept = weakest @ (weakest.T @ (missing / rows))
-        worst = int(np.argmax(np.abs(kept * missing / rows)))
+        blocked = weakest @ (weakest.T @ (missing / rows))
+        worst = int(np.argmax(np.abs(blocked * missing / rows)))
         message = (
             f"{self.system.name}: no way from the guess to the given coordinates: "
             f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "

@@ -102,12 +102,12 @@ def assigned(
     if not isinstance(reference, Reference):
         reference = ConstantReference([reference] * len(places))
     if reference.size != len(places):
-        listed = ", ".join(outputs[place] for place in places)
+        listed = ", ".join(outputs[i] for i in places)
         raise ReferenceSignalError(
             f"{reference.size} value{'s' * (reference.size > 1)} for {len(places)} "
             f"output{'s' * (len(places) > 1)}: {listed}"
         )
-    reference.derivatives([degrees[place] for place in places])
+    reference.derivatives([degrees[i] for i in places])
     return Assigned(name, reference, places)
 
 
@@ -165,7 +165,7 @@ def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int
         ReferenceSignalError: It has none.
     """
     parts = [part.strip() for part in name.split(",")]
-    return [place for part in parts for place in _meant(part, outputs, degrees)]
+    return [i for part in parts for i in _meant(part, outputs, degrees)]
 
 
 def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:

@@ -162,10 +162,10 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
     values = numbers_of(file, header, cells, names)
     steps = np.diff(values[:, 0])
     if not np.all(steps > 0):
-        place = int(np.argmin(steps > 0))
+        row = int(np.argmin(steps > 0))
         raise ReferenceSignalError(
-            f"'{file}': {names[0]} must increase, row {place + 3} has {values[place + 1, 0]:g} "
-            f"after {values[place, 0]:g}"
+            f"'{file}': {names[0]} must increase, row {row + 3} has {values[row + 1, 0]:g} "
+            f"after {values[row, 0]:g}"
         )
     values[:, 0] -= values[0, 0]
     return values
@@ -198,8 +198,8 @@ def numbers_of(
     places = [header.index(name) for name in names]
     values = np.empty((len(cells), len(names)))
     for index, row in enumerate(cells):
-        for column, place in enumerate(places):
-            cell = row[place] if place < len(row) else ""
+        for column, index_in_row in enumerate(places):
+            cell = row[index_in_row] if index_in_row < len(row) else ""
             values[index, column] = _number(cell, f"'{file}', row {index + 2}, {names[column]}")
     if len(values) < 2:
         raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")

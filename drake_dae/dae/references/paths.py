@@ -54,7 +54,7 @@ class PathReference(FormulaReference):
         travel = rest_to_rest(self.length, self.limits, self.order)
         time = ca.SX.sym("t")
         _, *derivatives = self._derivatives(travel.derivatives(time, 3))
-        peaks = ca.Function("peaks", [time], [ca.norm_2(one) for one in derivatives])
+        peaks = ca.Function("peaks", [time], [ca.norm_2(derivative) for derivative in derivatives])
         end, ramp = travel.duration, travel.ramp
         shares = np.linspace(0.0, 1.0, 401)
         moments = np.concatenate(

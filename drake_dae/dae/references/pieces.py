@@ -40,18 +40,18 @@ class PiecewisePolynomials:
         first, last = breaks[0], breaks[-1]
 
         def evaluate(time: float) -> FloatArray:
-            place = bisect(breaks, time, 1, len(factors)) - 1
-            x = (min(max(time, first), last) - breaks[place]) / (breaks[place + 1] - breaks[place])
-            return factors[place] @ x**powers
+            piece = bisect(breaks, time, 1, len(factors)) - 1
+            x = (min(max(time, first), last) - breaks[piece]) / (breaks[piece + 1] - breaks[piece])
+            return factors[piece] @ x**powers
 
         return evaluate
 
     def at_all(self, times: FloatArray) -> FloatArray:
         """The values at times in s, shape (len(times), rows)."""
         inside = np.clip(times, self.breaks[0], self.breaks[-1])
-        place = np.searchsorted(self.breaks[1:-1], inside, "right")
-        x = (inside - self.breaks[place]) / np.diff(self.breaks)[place]
-        return np.einsum("trp,tp->tr", self.factors[place], x[:, None] ** self._powers)
+        piece = np.searchsorted(self.breaks[1:-1], inside, "right")
+        x = (inside - self.breaks[piece]) / np.diff(self.breaks)[piece]
+        return np.einsum("trp,tp->tr", self.factors[piece], x[:, None] ** self._powers)
 
     def expression(self, time: ca.SX) -> ca.SX:
         """The values at a symbolic time, shape (rows, 1)."""

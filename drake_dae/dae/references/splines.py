@@ -59,8 +59,8 @@ class TimeSpline:
     @cached_property
     def differences(self) -> list[FloatArray]:
         """Delta^j c / step^j for j = 0, ..., order; the first and the last point repeated."""
-        rest = self.degree - 1
-        orders = [np.pad(self.points, ((rest, rest), (0, 0)), mode="edge")]
+        repeated = self.degree - 1
+        orders = [np.pad(self.points, ((repeated, repeated), (0, 0)), mode="edge")]
         while len(orders) <= self.order:
             orders.append(np.diff(orders[-1], axis=0) / self.step)
         return orders
@@ -126,9 +126,9 @@ def spline_within(
         order: How many derivatives are continuous.
         among: The number of columns with limits; None for all.
     """
-    rest = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
+    padded = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
     steps = [
-        (np.linalg.norm(np.diff(rest, j, axis=0), axis=1).max() / limit) ** (1 / j)
+        (np.linalg.norm(np.diff(padded, j, axis=0), axis=1).max() / limit) ** (1 / j)
         for j, limit in enumerate(limits.values, start=1)
     ]
     return TimeSpline(points, float(max(steps)), start_time, order)
@@ -204,8 +204,8 @@ def settle_points(reference: Any) -> FloatArray:
     object.__setattr__(reference, "points", rows)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     if not lengths.all():
-        place = int(np.argmin(lengths))
-        raise ReferenceSignalError(f"points {place} and {place + 1} are the same, {rows[place]}")
+        i = int(np.argmin(lengths))
+        raise ReferenceSignalError(f"points {i} and {i + 1} are the same, {rows[i]}")
     return points
 
 

@@ -154,12 +154,12 @@ def combinations_of(
     return combinations
 
 
-def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, float]:
+def _fit(matrix: FloatArray, others: list[int], row: int) -> tuple[FloatArray, float]:
     """The factors of rows whose combination is nearest to another row, and the remainder."""
-    if not kept:
+    if not others:
         return np.zeros(0), float(np.linalg.norm(matrix[row]))
-    factors = scipy.linalg.lstsq(matrix[kept].T, matrix[row])[0]
-    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[kept]))
+    factors = scipy.linalg.lstsq(matrix[others].T, matrix[row])[0]
+    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[others]))
 
 
 def _scaled(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

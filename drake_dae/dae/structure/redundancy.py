@@ -47,17 +47,17 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
     samples = consistent_samples(system)
     if names is None:
         names = [combination.name for combination in redundant_constraints(samples)]
-    kept = constraints_kept(system, names)
-    if len(kept) == system.num_constraints:
+    remaining = constraints_kept(system, names)
+    if len(remaining) == system.num_constraints:
         return system
     gone = ", ".join(f"'{name}'" for name in names)
-    if system.m[:, [i for i in range(system.num_constraints) if i not in kept]].nnz():
+    if system.m[:, [i for i in range(system.num_constraints) if i not in remaining]].nnz():
         raise ModelError(
             f"{system.name}: an output is the force of {gone}, which is not determined where "
             "constraints are redundant; choose other outputs, or leave out other constraints"
         )
-    check_same_motion(samples, kept, gone)
-    return with_constraints(system, kept)
+    check_same_motion(samples, remaining, gone)
+    return with_constraints(system, remaining)
 
 
 def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
@@ -133,35 +133,35 @@ def independent_constraints(samples: Samples) -> list[int]:
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
     remainders = [equilibrated(gradient) for (gradient,) in values]
     most = min(_rank(gradient) for (gradient,) in values)
-    staying: list[int] = []
-    while len(staying) < most:
+    remaining: list[int] = []
+    while len(remaining) < most:
         independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
-        independence[staying] = 0.0
+        independence[remaining] = 0.0
         chosen = int(np.argmax(independence >= PREFERRED * independence.max()))
-        staying.append(chosen)
+        remaining.append(chosen)
         for matrix in remainders:
             direction = matrix[chosen] / np.linalg.norm(matrix[chosen])
             matrix -= np.outer(matrix @ direction, direction)
-    return sorted(staying)
+    return sorted(remaining)
 
 
-def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
+def with_constraints(system: DaeSystem, remaining: list[int]) -> DaeSystem:
     """A system with some of its constraints and their inputs alone."""
-    signals = tuple(system.constraint_input_signals[i] for i in kept)
+    signals = tuple(system.constraint_input_signals[i] for i in remaining)
     names = {signal.name for signal in signals}
     return replace(
         system,
-        g=system.g[:, kept],
-        k=system.k[kept],
-        m=system.m[:, kept],
+        g=system.g[:, remaining],
+        k=system.k[remaining],
+        m=system.m[:, remaining],
         contacts=tuple(contact for contact in system.contacts if contact.force in names),
         constraint_input_signals=signals,
-        constraint_output_signals=tuple(system.constraint_output_signals[i] for i in kept),
-        implicit=_fewer(system, kept),
+        constraint_output_signals=tuple(system.constraint_output_signals[i] for i in remaining),
+        implicit=_fewer(system, remaining),
     )
 
 
-def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
+def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None:
     """Refuses to leave out constraints that are not redundant."""
     system = samples.system
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
@@ -169,19 +169,19 @@ def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
         gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
     )
     for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
-        if _rank(gradient[kept]) < _rank(gradient):
+        if _rank(gradient[remaining]) < _rank(gradient):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its gradients are no combinations of "
                 "the gradients of the remaining constraints"
             )
         both = np.hstack([gradient, moved])
-        if _rank(both[kept]) < _rank(both):
+        if _rank(both[remaining]) < _rank(both):
             names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: where the exogenous signals {names} "
                 "move, the constraints left out are no longer implied by the remaining ones"
             )
-        if _rank(fields["g"].T[kept]) < _rank(fields["g"].T):
+        if _rank(fields["g"].T[remaining]) < _rank(fields["g"].T):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: the constraint inputs of the same "
                 "numbers act in directions in which no other one does"
@@ -193,7 +193,7 @@ def _rank(matrix: FloatArray) -> int:
 
 
 def _fewer(
-    system: DaeSystem, kept: list[int]
+    system: DaeSystem, remaining: list[int]
 ) -> Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None:
     """The implicit form of a system, if it has one, for the remaining inputs and outputs."""
     whole = system.implicit
@@ -202,8 +202,8 @@ def _fewer(
 
     def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
         every = ca.SX(system.num_constraints, 1)
-        every[kept] = constraint_input
+        every[remaining] = constraint_input
         rest, constraint_rate = whole(rate, every)
-        return rest, constraint_rate[kept]
+        return rest, constraint_rate[remaining]
 
     return implicit

@@ -67,19 +67,21 @@ def share_forces(
     """
     weights = _weights(system, compliances or {})
     samples = consistent_samples(system)
-    staying = independent_constraints(samples) if names is None else constraints_kept(system, names)
-    if len(staying) == system.num_constraints:
+    remaining = (
+        independent_constraints(samples) if names is None else constraints_kept(system, names)
+    )
+    if len(remaining) == system.num_constraints:
         return system
-    left_out = [i for i in range(system.num_constraints) if i not in staying]
+    left_out = [i for i in range(system.num_constraints) if i not in remaining]
     signals = system.constraint_output_signals
-    check_same_motion(samples, staying, ", ".join(f"'{signals[i].name}'" for i in left_out))
+    check_same_motion(samples, remaining, ", ".join(f"'{signals[i].name}'" for i in left_out))
     inertia = PositiveDefiniteFactorization(system.mass_matrix)
     half = inertia.forward(system.g)
     product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
-    gather = ca.SX(len(staying), system.num_constraints)
-    gather[:, staying] = ca.SX.eye(len(staying))
-    gather[:, left_out] = PositiveDefiniteFactorization(product[staying, staying]).solve(
-        product[staying, left_out]
+    gather = ca.SX(len(remaining), system.num_constraints)
+    gather[:, remaining] = ca.SX.eye(len(remaining))
+    gather[:, left_out] = PositiveDefiniteFactorization(product[remaining, remaining]).solve(
+        product[remaining, left_out]
     )
     weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
     sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
@@ -92,7 +94,7 @@ def share_forces(
         left_out=system.k[left_out],
         left_out_signals=tuple(signals[i] for i in left_out),
     )
-    return replace(with_constraints(system, staying), sharing=sharing)
+    return replace(with_constraints(system, remaining), sharing=sharing)
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:

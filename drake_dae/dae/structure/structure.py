@@ -85,7 +85,7 @@ class Structure(ConstraintStructure):
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
@@ -108,7 +108,7 @@ class Structure(ConstraintStructure):
         If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
@@ -127,7 +127,7 @@ class Structure(ConstraintStructure):
         """The control of `control_for` by B(x) itself, where A(x) is regular.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.

@@ -215,10 +215,10 @@ def painleve_outcome(
             force[used] = np.linalg.solve(matrix[np.ix_(used, used)], -free[used])
         except np.linalg.LinAlgError:
             return None
-        kept = np.isin(rows, used)
+        closed = np.isin(rows, used)
         rate = (matrix @ force + free)[rows]
-        if np.all(force[rows][kept] >= 0.0) and np.all(rate[~kept] >= 0.0):
-            fitting.append(kept)
+        if np.all(force[rows][closed] >= 0.0) and np.all(rate[~closed] >= 0.0):
+            fitting.append(closed)
     if not fitting:
         return PainleveOutcome.INCONSISTENT
     if len(fitting) > 1:
@@ -228,7 +228,7 @@ def painleve_outcome(
 
 def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
     """Every set of contacts, each together with all bilateral constraints."""
-    kept = [i for i in range(size) if i not in rows]
+    always = [i for i in range(size) if i not in rows]
     counts = range(0 if with_none else 1, len(rows) + 1)
     for chosen in chain.from_iterable(combinations(rows, count) for count in counts):
-        yield [*kept, *chosen]
+        yield [*always, *chosen]

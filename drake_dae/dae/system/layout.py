@@ -95,19 +95,11 @@ class DerivativeLayout:
 
     def chain_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Names and units of a chain's elements."""
-        return tuple(
-            signal.derivative(order)
-            for signal, degree in zip(signals, self.degrees, strict=True)
-            for order in range(degree)
-        )
+        return _derivatives(signals, self.degrees)
 
     def reference_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Names and units of a reference's elements."""
-        return tuple(
-            signal.derivative(order)
-            for signal, degree in zip(signals, self.degrees, strict=True)
-            for order in range(degree + 1)
-        )
+        return _derivatives(signals, [degree + 1 for degree in self.degrees])
 
     def values(self, reference: ArrayLike) -> FloatArray:
         """The values r_1, ..., r_p of a reference, shape (p,)."""
@@ -118,3 +110,12 @@ class DerivativeLayout:
         reference = np.zeros(self.reference_size)
         reference[self.lowest] = values
         return reference
+
+
+def _derivatives(signals: Sequence[Signal], counts: Sequence[int]) -> tuple[Signal, ...]:
+    """The first derivatives of signals, the signals included, as many as counted."""
+    return tuple(
+        signal.derivative(order)
+        for signal, count in zip(signals, counts, strict=True)
+        for order in range(count)
+    )

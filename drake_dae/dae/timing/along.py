@@ -85,8 +85,8 @@ class AlongCurve:
             ReferenceSignalError: A point is out of reach, or the path leads through a singular
                 configuration.
         """
-        count, still = len(piece.times) - 1, np.zeros(len(piece.times))
-        rest = self.reference(piece, still, still)
+        count, zero = len(piece.times) - 1, np.zeros(len(piece.times))
+        rest = self.reference(piece, zero, zero)
         places = np.unique(np.linspace(0, count, COARSE + 1).astype(int))
         coarse = []
         for row, time in zip(rest[places], piece.times[places], strict=True):
@@ -102,7 +102,7 @@ class AlongCurve:
             finer = np.unique(np.linspace(0, count, number + 1).astype(int))
             start = _interpolated(places, states, finer)
             states, places = self.states(rest[finer], start, parameters), finer
-        moving = self.reference(piece, still + 1.0, still) - rest
+        moving = self.reference(piece, zero + 1.0, zero) - rest
         moving[:, self.layout.lowest[self.layout.dynamic] + 2] = 0.0
         _, gradients = self._newton(states, rest, parameters)
         goals = np.zeros(states.shape)

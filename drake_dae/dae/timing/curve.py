@@ -110,8 +110,8 @@ class Curve:
         fine = np.linspace(begin, end, max(2001, 2 * count + 1))
         values = self.at(fine)
         if not np.isfinite(values).all():
-            place = fine[int(np.argmin(np.isfinite(values).all(axis=1)))]
-            raise ReferenceSignalError(f"the reference is not finite at t = {place:g} s")
+            worst = fine[int(np.argmin(np.isfinite(values).all(axis=1)))]
+            raise ReferenceSignalError(f"the reference is not finite at t = {worst:g} s")
         spread = np.ptp(values[:, layout.lowest[self.moving]], axis=0)
         moves = spread > 1e-12 * np.abs(values[:, layout.lowest[self.moving]]).max(axis=0)
         if not moves.any():
@@ -123,11 +123,11 @@ class Curve:
         self._rest = REST * float(speeds.max())
         ranges = list(self._ranges(fine, values, speeds))
         # Between rests points are spread as the time is that a motion at full acceleration takes.
-        shares = np.array([0.0 if still else length**0.5 for *_, length, still in ranges])
+        shares = np.array([0.0 if is_pause else length**0.5 for *_, length, is_pause in ranges])
         counts = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 20)
         self.pieces = tuple(
-            self._pause(first, last) if still else self._piece(first, last, int(number))
-            for (first, last, _, still), number in zip(ranges, counts, strict=True)
+            self._pause(first, last) if is_pause else self._piece(first, last, int(number))
+            for (first, last, _, is_pause), number in zip(ranges, counts, strict=True)
         )
 
     def _speed(self, values: FloatArray) -> FloatArray:
@@ -165,30 +165,30 @@ class Curve:
             [[0.0], np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2)]
         )
         return [
-            (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), still)
-            for a, b, still in ranges
+            (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), is_pause)
+            for a, b, is_pause in ranges
         ]
 
     def _turn(self, times: FloatArray, rates: FloatArray, k: int, after: int) -> float | None:
         """The time between two samples at which the reference rests and turns."""
         from scipy.optimize import brentq, minimize_scalar  # It takes long to load.
 
-        one, other = rates[k], rates[after]
-        if one @ other > TURN * np.linalg.norm(one) * np.linalg.norm(other):
+        rate, next_rate = rates[k], rates[after]
+        if rate @ next_rate > TURN * np.linalg.norm(rate) * np.linalg.norm(next_rate):
             return None
 
         def along(time: float) -> float:
-            return float(self._weights * self.at(np.array([time]))[0, self._first] @ one)
+            return float(self._weights * self.at(np.array([time]))[0, self._first] @ rate)
 
         def speed(time: float) -> float:
             return float(self._speed(self.at(np.array([time])))[0])
 
-        if one @ other < 0.0:
-            place = float(brentq(along, times[k], times[after], xtol=1e-15, rtol=1e-15))
+        if rate @ next_rate < 0.0:
+            turn = float(brentq(along, times[k], times[after], xtol=1e-15, rtol=1e-15))
         else:
             limits = (times[k], times[after])
-            place = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
-        return place if speed(place) < 1e3 * self._rest else None
+            turn = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
+        return turn if speed(turn) < 1e3 * self._rest else None
 
     def _pause(self, first: float, last: float) -> Piece:
         times = np.linspace(first, last, 21)
@@ -225,7 +225,7 @@ class Curve:
         tangents = first / safe
         curvatures = (second - tangents * slope) / safe**2
         curvatures[rests] = 0.0
-        for place, other in ((0, 1), (-1, -2)):
-            if rests[place]:
-                tangents[place] = tangents[other]
+        for end, neighbour in ((0, 1), (-1, -2)):
+            if rests[end]:
+                tangents[end] = tangents[neighbour]
         return tangents, curvatures, np.where(rests, 0.0, rho)

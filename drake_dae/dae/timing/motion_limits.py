@@ -117,9 +117,9 @@ class MotionLimits:
         for name, (least, most) in getattr(self, kind).items():
             if name not in names:
                 raise ModelError(f"{kind}: {unknown_name('signal', name, names)}")
-            place = names.index(name)
-            low[place] = -inf if least is None else least
-            high[place] = inf if most is None else most
+            i = names.index(name)
+            low[i] = -inf if least is None else least
+            high[i] = inf if most is None else most
         return low, high
 
     def check(self, system: DaeSystem) -> None:

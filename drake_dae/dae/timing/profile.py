@@ -296,9 +296,9 @@ def _settled(
             )
         moves = fastest.b[1:] + fastest.b[:-1] > 0.0
         if not moves.all():
-            place = float(piece.times[int(np.argmin(moves))])
+            stop = float(piece.times[int(np.argmin(moves))])
             raise ReferenceSignalError(
-                f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses "
+                f"the motion cannot go on from t = {stop:.4g} s of the reference: rest there uses "
                 "all of a limit"
             )
         if before is not None and np.abs(fastest.b - before).max() <= SETTLED * fastest.b.max():

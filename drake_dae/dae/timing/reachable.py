@@ -78,18 +78,18 @@ def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray)
     highest, brake = np.zeros(points.size), np.full(points.size, -1, dtype=np.intp)
     for i in range(points.size - 2, -1, -1):
         can = stopping[i] + braking[i] * highest[i + 1]
-        place = int(can.argmin())
-        highest[i], brake[i] = min((can[place], place), (at_point[i], -1))
+        line = int(can.argmin())
+        highest[i], brake[i] = min((can[line], line), (at_point[i], -1))
         highest[i] = max(highest[i], 0.0)  # Of round-off.
 
     b, a = np.zeros(points.size), np.zeros(double.size)
     active, brakes = np.full(double.size, -1, dtype=np.intp), np.zeros(double.size, dtype=bool)
     for i in range(double.size):
         room = upper[i] - falls[i] * b[i]
-        place = int(room.argmin())
+        line = int(room.argmin())
         most = (highest[i + 1] - b[i]) / double[i]
-        if room[place] <= most:
-            a[i], active[i] = room[place], place
+        if room[line] <= most:
+            a[i], active[i] = room[line], line
         else:
             a[i], active[i], brakes[i] = most, brake[i], True
         b[i + 1] = min(max(b[i] + double[i] * a[i], 0.0), highest[i + 1])

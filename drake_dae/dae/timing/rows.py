@@ -120,18 +120,18 @@ class LimitRows:
             rate: The largest rate of the reference's time.
         """
         limited = self.along.limited
-        rest = self.along.limited_states(self.at_rest)
+        at_rest = self.along.limited_states(self.at_rest)
         slope = self.along.limited_states(self.moving)
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(slope > 0.0, limited.state_high - rest, limited.state_low - rest)
+            room = np.where(slope > 0.0, limited.state_high - at_rest, limited.state_low - at_rest)
             room = room / slope
         room = np.where(slope == 0.0, np.inf, room)
-        of_rate = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
+        of_rate = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(at_rest), np.inf)
         columns = [room**2, *(tool.largest[:, None] for tool in self.tools), of_rate[:, None] ** 2]
         together = np.hstack(columns)
         least = together.argmin(axis=1)
         first = len(self.names) - together.shape[1]
-        return together[np.arange(len(rest)), least], least + first
+        return together[np.arange(len(at_rest)), least], least + first
 
     def _values(self, speed: FloatArray, a: FloatArray) -> FloatArray:
         """The limited signals at given speeds and accelerations, shape (N + 1, k)."""
@@ -220,9 +220,9 @@ def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: Flo
     )
     for signals, low, high, values in both:
         if not np.isfinite(values).all():
-            place = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
+            time = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
             raise ReferenceSignalError(
-                f"the path has no control at t = {place:.4g} s of the reference: it leads through "
+                f"the path has no control at t = {time:.4g} s of the reference: it leads through "
                 "a singular configuration"
             )
         room = np.minimum(high - values, values - low)

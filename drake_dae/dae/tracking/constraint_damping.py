@@ -78,15 +78,15 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
     moving = system.outputs(derivatives.constraint_input)
     for order in range(max(degrees, default=0) + 1):
         values, _ = derivatives.by_control(moving)
-        for place, i in enumerate(rows):
+        for row, i in enumerate(rows):
             if degrees[i] == order:
-                highest[i] = moving[place]
+                highest[i] = moving[row]
             else:
-                chains[i].append(values[place])
-        still = [place for place, i in enumerate(rows) if degrees[i] > order]
-        rows = [rows[place] for place in still]
+                chains[i].append(values[row])
+        remaining = [row for row, i in enumerate(rows) if degrees[i] > order]
+        rows = [rows[row] for row in remaining]
         if rows:
-            moving = derivatives.derivative(moving[still])
+            moving = derivatives.derivative(moving[remaining])
     drift, control_matrix = derivatives.by_control(highest)
     elimination = eliminate(derivatives)
     return replace(

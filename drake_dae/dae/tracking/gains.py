@@ -126,9 +126,9 @@ class FeedbackGains:
             )
             current = coordinates[rows] / scale
             response = np.zeros((moments.size, rows.size))
-            for place, index in zip(order, which, strict=True):
+            for row, index in zip(order, which, strict=True):
                 current = transitions[index] @ current
-                response[place] = current
+                response[row] = current
             result[:, owner[rows[orders[rows] == 0]]] = response[:, orders[rows] == 0]
         return result
 

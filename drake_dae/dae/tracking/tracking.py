@@ -158,8 +158,8 @@ class TrackingLaw:
         values = {"reference": ca.densify(reference)}
         if self.measured_force is not None:
             force = ca.SX.zeros(self._inputs["measured_force"].numel())
-            for output, place in self.measured_force.inputs.items():
-                force[place] = reference[int(self.layout.lowest[output])]
+            for output, i in self.measured_force.inputs.items():
+                force[i] = reference[int(self.layout.lowest[output])]
             values["measured_force"] = force
         if self.integral.outputs:
             values["integral"] = ca.SX.zeros(len(self.integral.outputs))

@@ -264,8 +264,8 @@ class ZeroDynamics:
             ModelError: A shape is wrong, or a number is not finite.
         """
         if self.dimension == 0:
-            still = without_dynamics(self.structure)
-            return StabilityAlong(still.verdict, still.reason)
+            at_rest = without_dynamics(self.structure)
+            return StabilityAlong(at_rest.verdict, at_rest.reason)
         p, n = self.system.parameter_vector(parameters), self.system.num_states
         if motion.states.shape != (motion.times.size, n):
             raise ModelError(
@@ -280,10 +280,10 @@ class ZeroDynamics:
         if period == 0.0:
             begin = float(motion.times[0])
             outputs = self._pinned.layout.values(flow.goal(begin))
-            still = self.stability(motion.states[0], moving(begin), outputs)
-            rates = still.eigenvalues.real.copy()
+            at_rest = self.stability(motion.states[0], moving(begin), outputs)
+            rates = at_rest.eigenvalues.real.copy()
             return StabilityAlong(
-                still.verdict, still.reason, 0.0, exponents=rates, state=still.state
+                at_rest.verdict, at_rest.reason, 0.0, exponents=rates, state=at_rest.state
             )
         return judge_along(flow, motion, period)
 

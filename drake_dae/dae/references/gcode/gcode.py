@@ -149,7 +149,7 @@ class GCodeReference(SplineReference):
             step = sqrt(allowed * peak / (reach * at_corners))
             change = sqrt(allowed * at_corners / (reach * peak))
             bend = sqrt(24.0 * allowed / (self.order + 2)) / step
-            path = _Path(self.program.moves, [self._speed(one) for one in self.program.moves])
+            path = _Path(self.program.moves, [self._speed(move) for move in self.program.moves])
             times = path.times(change, bend, SHARE * acceleration)
             if times[-1] / step > MOST_POINTS:
                 raise ReferenceSignalError(
