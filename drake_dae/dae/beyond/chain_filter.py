@@ -30,13 +30,11 @@ class ChainFilter:
     Attributes:
         gain: K, shape (3, 1), or (3, 2) with a measured v.
         covariance: That of (q, v, a) after a correction, relative to sigma^2, shape (3, 3).
-        predicted: That before it.
         period: T in s.
     """
 
     gain: FloatArray
     covariance: FloatArray
-    predicted: FloatArray
     period: float
 
     @classmethod
@@ -78,7 +76,7 @@ class ChainFilter:
         after = before - gain @ shown @ before
         both = np.outer(1.0 / size, 1.0 / size)
         units = size[: len(shown)] / size[:, None]
-        return cls(gain * units, after * both, before * both, period)
+        return cls(gain * units, after * both, period)
 
 
 def transition(period: float) -> FloatArray:

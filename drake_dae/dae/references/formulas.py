@@ -63,12 +63,10 @@ class SinusoidReference(FormulaReference):
     frequencies: ArrayLike
     phases: ArrayLike = 0.0
 
+    size = 1
+
     def __post_init__(self) -> None:
         settle(self, "amplitudes", "frequencies", "phases")
-
-    @property
-    def size(self) -> int:
-        return 1
 
     def rows(self, time: ca.SX) -> ca.SX:
         terms = np.transpose([self.amplitudes, self.frequencies, self.phases])

@@ -171,6 +171,8 @@ class CircleReference(PathReference):
     start_time: float = 0.0
     order: int = 4
 
+    size = 2
+
     def __post_init__(self) -> None:
         _settle_center(self)
         positive("radius", self.radius, ReferenceSignalError)
@@ -182,10 +184,6 @@ class CircleReference(PathReference):
             )
         if self.period == 0.0 or self.turns == 0.0:
             raise ReferenceSignalError("period and turns must not be zero")
-
-    @property
-    def size(self) -> int:
-        return 2
 
     @property
     def length(self) -> float:
@@ -243,6 +241,8 @@ class SpiralReference(PathReference):
     start_time: float = 0.0
     order: int = 4
 
+    size = 2
+
     def __post_init__(self) -> None:
         _settle_center(self)
         positive("pitch", self.pitch, ReferenceSignalError)
@@ -252,10 +252,6 @@ class SpiralReference(PathReference):
                 "start_radius and end_radius must differ and not be negative, got "
                 f"{self.start_radius:g} and {self.end_radius:g}"
             )
-
-    @property
-    def size(self) -> int:
-        return 2
 
     @property
     def length(self) -> float:

@@ -41,14 +41,12 @@ class FastestMotion:
         a: s'' between them, shape (N,).
         highest: H, shape (N + 1,).
         active: The line that limits each interval, shape (N,); -1 for the largest b of a point.
-        brakes: Whether the motion is on H between two points, shape (N,).
     """
 
     b: FloatArray
     a: FloatArray
     highest: FloatArray
     active: Indices
-    brakes: np.typing.NDArray[np.bool_]
 
 
 @np.errstate(all="ignore")  # Without any limit b is infinite.
@@ -83,7 +81,7 @@ def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray)
         highest[i] = max(highest[i], 0.0)  # Of round-off.
 
     b, a = np.zeros(points.size), np.zeros(double.size)
-    active, brakes = np.full(double.size, -1, dtype=np.intp), np.zeros(double.size, dtype=bool)
+    active = np.full(double.size, -1, dtype=np.intp)
     for i in range(double.size):
         room = upper[i] - falls[i] * b[i]
         line = int(room.argmin())
@@ -91,9 +89,9 @@ def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray)
         if room[line] <= most:
             a[i], active[i] = room[line], line
         else:
-            a[i], active[i], brakes[i] = most, brake[i], True
+            a[i], active[i] = most, brake[i]
         b[i + 1] = min(max(b[i] + double[i] * a[i], 0.0), highest[i + 1])
-    return FastestMotion(b, a, highest, active, brakes)
+    return FastestMotion(b, a, highest, active)
 
 
 def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatArray:

@@ -44,16 +44,13 @@ class PeriodicMotion:
     Attributes:
         state: Its start, shape (n,).
         period: Its period, in s.
-        monodromy: The transition matrix of disturbances over the period, in the basis at the start,
-            shape (d, d).
-        multipliers: Its eigenvalues, the largest first; for autonomous motions without the one that
-            is 1 along the motion.
+        multipliers: The eigenvalues of the transition matrix of disturbances over the period, the
+            largest first; for autonomous motions without the one that is 1 along the motion.
         errors: The error bound of each.
     """
 
     state: FloatArray
     period: float
-    monodromy: FloatArray
     multipliers: ComplexArray
     errors: FloatArray
 
@@ -192,4 +189,4 @@ def _judged(state: FloatArray, period: float, monodromy: FloatArray, free: bool)
         along = int(np.argmin(np.abs(values - 1.0)))
         values, errors = np.delete(values, along), np.delete(errors, along)
     order = np.argsort(-np.abs(values), kind="stable")
-    return PeriodicMotion(state, period, monodromy, values[order], errors[order])
+    return PeriodicMotion(state, period, values[order], errors[order])

@@ -53,7 +53,7 @@ class GCodeReference(SplineReference):
     uniform B-spline over points that this motion passes a step h apart. A corner at which the
     velocity changes by dv is then rounded by g h dv with the acceleration b dv / h, where b and g
     belong to the order; the step makes dv as large as tolerance and acceleration allow. `remark`
-    tells the rounding and the duration. With `press` there is a third output, a force that is
+    reports the rounding and the duration. With `press` there is a third output, a force that is
     smaller in G0 moves.
 
     A .csv has the points of a path without times in place of a program: x and y in mm, and the
