@@ -13,14 +13,13 @@ from drake_dae.dae.manifold.search import CONSISTENT, ConsistentStateSearch
 from drake_dae.dae.manifold.settling import Settling
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import norm
 
 FLOOR = 1e-12
 """A distance from N* that is round-off even if all states are zero."""
 
 
-class Manifold:
+class Manifold(Residual):
     """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
 
     Args:
@@ -28,20 +27,15 @@ class Manifold:
         chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
 
     Attributes:
-        residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
-        residual_signals: Its names and units.
-        residual_function: The same as a function of state and parameters.
+        searched: `project` where `first_steps` did not converge; see `ConsistentStateSearch`. For
+            the other attributes see `Residual`.
     """
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
-        self.system = system
-        self._residual = Residual(system, chains)
-        self.residual_expression = self._residual.expression
-        self.residual_signals = self._residual.signals
-        self.residual_function = self._residual.function
-        self._first_steps = trace_first_steps(self._residual)
-        self._search = ConsistentStateSearch(self._residual, self._first_steps)
-        self._settling = Settling(system, self._residual)
+        super().__init__(system, chains)
+        self._first_steps = trace_first_steps(self)
+        self.searched = ConsistentStateSearch(self, self._first_steps).searched
+        self._settling = Settling(system, self)
 
     @property
     def dimension(self) -> int:
@@ -57,18 +51,6 @@ class Manifold:
         """
         return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
-    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
-        return self._residual.gradients(state, parameters)
-
-    @property
-    def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale.
-
-        A function of the state, a second state at which the gradients are taken, and parameters.
-        """
-        return self._residual.newton_step
-
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
         """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.
 
@@ -77,9 +59,9 @@ class Manifold:
         x, p = self._state(state), self.system.parameter_vector(parameters)
         reach = float(self._first_steps.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
-            return reach <= CONSISTENT * norm(x / self._residual.scale) + FLOOR
+            return reach <= CONSISTENT * norm(x / self.scale) + FLOOR
         # Dependent gradients, a residual of zero, or one that no state changes.
-        return self._residual.size(x, p) <= CONSISTENT
+        return self.relative_size(x, p) <= CONSISTENT
 
     def project(
         self,
@@ -139,21 +121,6 @@ class Manifold:
         if is_valid and outcome == FOUND:
             return moved
         return start if outcome == STAYS and function.is_finite else None
-
-    def searched(
-        self,
-        start: FloatArray,
-        p: FloatArray,
-        crosses: Callable[[FloatArray], bool] | None = None,
-    ) -> FloatArray:
-        """`project` where `first_steps` did not converge.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-            crosses: As for `project`.
-        """
-        return self._search.searched(start, p, crosses)
 
     def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """The consistent state next to a start that a user gave, found level by level.

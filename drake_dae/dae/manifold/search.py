@@ -72,7 +72,7 @@ class ConsistentStateSearch:
         if (
             is_finite
             and sizes.item(1) == 0.0
-            and not self._residual.function.evaluate(start, p)[0].any()
+            and not self._residual.residual_function.evaluate(start, p)[0].any()
         ):
             return start
         consistent = moved.copy() if is_finite and sizes.item(0) == FOUND else None
@@ -91,9 +91,9 @@ class ConsistentStateSearch:
         if converged and not np.array_equal(state, start):
             return state
         # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self._residual.size(state, p) <= CONSISTENT:
+        if self._residual.relative_size(state, p) <= CONSISTENT:
             return state
-        residual = self._residual.function.evaluate(state, p)[0].copy()
+        residual = self._residual.residual_function.evaluate(state, p)[0].copy()
         if converged and self._first_steps.evaluate(state, p)[1].any():
             return state
         raise InconsistentStateError(self._why(state, p, residual), residual)
@@ -123,7 +123,7 @@ class ConsistentStateSearch:
         for _ in range(ITERATIONS):
             state = x * self._residual.scale
             gradients = self._residual.gradients(state, parameters) * self._residual.scale
-            residual = self._residual.function(state, parameters)[0]
+            residual = self._residual.residual_function(state, parameters)[0]
             if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(residual))):
                 return None
             length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._residual.lengths))
@@ -142,7 +142,7 @@ class ConsistentStateSearch:
         length = positive(np.linalg.norm(gradients, axis=1))
 
         def residual(z: FloatArray) -> FloatArray:
-            return self._residual.function(scale * z, parameters)[0]
+            return self._residual.residual_function(scale * z, parameters)[0]
 
         def measure(z: FloatArray) -> float:
             return float(np.linalg.norm(residual(z) / length))
@@ -153,7 +153,7 @@ class ConsistentStateSearch:
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Why a Newton iteration that ended at a state failed, in words."""
         name = self._residual.system.name
-        values = zip(self._residual.signals, residual, strict=True)
+        values = zip(self._residual.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]
         if bad:
             return (
@@ -163,8 +163,8 @@ class ConsistentStateSearch:
         worst = int(np.argmax(np.abs(residual)))
         text = (
             f"{name}: no consistent state found near the given one; "
-            f"{self._residual.signals[worst].name} = {residual[worst]:.3g} is left where Newton's "
-            "method ends. "
+            f"{self._residual.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
+            "Newton's method ends. "
         )
         if are_dependent(self._residual.gradients(state, parameters) * self._residual.scale):
             return text + (

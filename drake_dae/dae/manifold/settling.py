@@ -75,7 +75,7 @@ def _settle_level(
         return x
 
     def level_residual(z: FloatArray) -> FloatArray:
-        return residual.function(filled(z), parameters)[0][rows]
+        return residual.residual_function(filled(z), parameters)[0][rows]
 
     def linearize(z: FloatArray) -> NewtonModel | None:
         x = filled(z)
