@@ -60,16 +60,9 @@ class Extension:
 
     @cached_property
     def _control(self) -> TracedFunction:
-        control = ca.SX.sym("w", self.system.num_controls)
-        return TracedFunction(
-            f"{self.original.name} control",
-            {
-                "state": self.system.state,
-                "control": control,
-                "parameters": self.system.parameter_symbol,
-            },
-            {"control": self.control_offset + ca.mtimes(self.control_matrix, control)},
-        )
+        w = ca.SX.sym("w", self.system.num_controls)
+        outputs = {"control": self.control_offset + ca.mtimes(self.control_matrix, w)}
+        return self.system.trace("original control", outputs, {"control": w}, often=False)
 
 
 @checked(ModelError)

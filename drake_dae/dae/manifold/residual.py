@@ -75,7 +75,7 @@ class Residual:
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
-        """The norm of the residual, each entry divided by its gradient over the scale of the states."""
+        """The norm of the residual, each entry over its gradient by states over their scale."""
         residual = self.residual_function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0
