@@ -73,7 +73,7 @@ def from_symbolic(
     parameters: Mapping[Variable, float] | None = None,
     **labels: Any,
 ) -> DaeSystem:
-    """A system (1)-(3) whose functions are expressions of `pydrake.symbolic`.
+    """Builds a system (1)-(3) from expressions of `pydrake.symbolic`.
 
     These share no subexpressions, so repeated subexpressions are translated repeatedly.
 
@@ -131,7 +131,7 @@ def from_symbolic(
 
 
 def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True) -> ca.SX:
-    """A scalar expression of `pydrake.symbolic`, or a number, as a CasADi expression.
+    """Converts a scalar expression of `pydrake.symbolic`, or a number, to CasADi.
 
     Args:
         expression: The expression, or a Formula in it.

@@ -62,7 +62,7 @@ def analyze(
     count: int = 50,
     seed: int = 0,
 ) -> Analysis:
-    """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, and the way along a reference.
+    """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
     Numbers are decided at consistent states with the default parameters: at those given, or at
     random ones in a region or around `system.nominal_state`. Degrees must be the same for all
@@ -188,7 +188,7 @@ def _equilibria(
     states: FloatArray,
     outputs: FloatArray | None,
 ) -> tuple[Stability, ...]:
-    """All equilibria with the outputs of the one that was judged, that one first."""
+    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
     if not dynamics.dimension:
         return ()
     if stability.state is not None:
@@ -202,7 +202,7 @@ def _equilibria(
 def _examine(
     constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
 ) -> Analysis:
-    """All but the zero dynamics and the reference: degrees at some samples, margins at others."""
+    """Examines degrees at some samples and margins at others, without zero dynamics."""
     system, elimination = samples.system, constrained.elimination
     results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
@@ -254,7 +254,7 @@ def _assumptions(
     margins: Mapping[int, RankMargin] | None = None,
     not_examined: str = "",
 ) -> tuple[Assumption, ...]:
-    """Assumptions (1)-(5); one that is neither satisfied nor violated was not examined."""
+    """Returns Assumptions (1)-(5); those neither satisfied nor violated were not examined."""
     violated = {violation.assumption: violation for violation in violations}
     before = f"Assumption ({violations[0].assumption}) is violated" if violations else not_examined
     result = []
@@ -272,7 +272,7 @@ def _assumptions(
 
 
 def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
-    """The margin of the row vectors of Theorem 2.1."""
+    """Returns the margin of the row vectors of Theorem 2.1."""
     functions = ca.vertcat(structure.manifold.residual_expression, structure.chain)
     if not functions.numel():
         return None

@@ -40,7 +40,7 @@ class ExaminedStates:
     def drawn(
         cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
     ) -> "ExaminedStates":
-        """The nominal state first, then random ones, in a region or around the nominal one.
+        """Draws random states in a region or around the nominal state, which comes first.
 
         Raises:
             ModelError: A name is not that of a state, or an interval is not two finite ordered
@@ -61,7 +61,7 @@ class ExaminedStates:
     def given(
         cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
     ) -> "ExaminedStates":
-        """The states of the user, and a few close to the first one.
+        """Returns the states of the user and a few close to the first one.
 
         Raises:
             ModelError: The states are not finite numbers of shape (k, n).
@@ -77,7 +77,7 @@ class ExaminedStates:
         return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
 
     def describe(self, count: int, noun: str) -> str:
-        """Which states were examined, in words.
+        """Returns a text that says which states were examined.
 
         Args:
             count: How many of the drawn ones were inside the domain and on N*.
@@ -91,12 +91,12 @@ class ExaminedStates:
         return f"{count_of(count, noun)} {region}{missing}"
 
     def describe_region(self) -> str:
-        """The bounds as "x in [0, 1], ..."."""
+        """Returns the bounds as "x in [0, 1], ..."."""
         return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
 
 
 def check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
-    """Refuses given states that are not consistent, or that are outside the domain.
+    """Checks that the user's states are consistent and inside the domain of the system.
 
     Args:
         manifold: N*.

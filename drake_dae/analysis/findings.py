@@ -19,7 +19,7 @@ from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
 
 class Finding(StrEnum):
-    """The verdict on an assumption."""
+    """The verdicts on an assumption."""
 
     SATISFIED = "satisfied"
     VIOLATED = "violated"
@@ -30,7 +30,7 @@ class Finding(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """One of Assumptions (1)-(5) and the verdict on it.
+    """One of Assumptions (1)-(5), with the verdict on it.
 
     Attributes:
         number: Its number in the paper.
@@ -61,7 +61,7 @@ OF_VERDICT = {
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the theory says about one system, as values.
+    """The statements of the theory on one system, as values.
 
     Values that are not known, since an assumption is violated, are None.
 
@@ -140,7 +140,7 @@ class Findings:
 
     @property
     def decisive(self) -> Stability | StabilityAlong | None:
-        """What decides Assumption 2.2: the verdict along the reference, otherwise that at rest.
+        """The verdict that decides Assumption 2.2: along the reference, otherwise at rest.
 
         If the reference is not periodic, an unstable equilibrium decides as well, since the
         reference ends.
@@ -154,7 +154,7 @@ class Findings:
 
     @property
     def unstable_inside(self) -> tuple[Stability, ...]:
-        """Further unstable equilibria inside the given region."""
+        """Other unstable equilibria inside the requested region."""
         if self.region is None:
             return ()
         return tuple(
@@ -168,14 +168,14 @@ class Findings:
 
     @property
     def zero_dynamics_finding(self) -> Finding:
-        """The verdict on Assumption 2.2: the decisive one, or a violation inside the region."""
+        """The verdict on Assumption 2.2; violated if an equilibrium in the region is unstable."""
         if self.unstable_inside:
             return Finding.VIOLATED
         return Finding.NOT_EXAMINED if self.decisive is None else OF_VERDICT[self.decisive.verdict]
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The violations, one text each; empty if there are none."""
+        """One text for each violation; empty if there are none."""
         sentences = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
         # Where an assumption is violated, the theorem adds nothing.
         if not sentences and self.independence is not None and self.independence.is_singular:

@@ -18,7 +18,7 @@ from drake_dae.dae.zero_dynamics.stability import ComplexArray, Stability, Verdi
 
 
 def as_dict(findings: Findings) -> dict[str, Any]:
-    """The printed results as plain numbers, lists and texts, with the states of the margins."""
+    """Returns the findings as plain numbers, lists and texts."""
     system = findings.system
     zero, motion = findings.zero_dynamics, findings.motion
     along = findings.zero_dynamics_along
@@ -76,7 +76,7 @@ def as_dict(findings: Findings) -> dict[str, Any]:
 
 
 def parts_of(findings: Findings) -> list[Part]:
-    """The paragraphs and tables of the findings, without the problems."""
+    """Returns the paragraphs and tables of the report, without the problems."""
     system = findings.system
     counts = (
         count_of(system.num_states, "state"),

@@ -17,7 +17,7 @@ def check_reference(
     reference: Callable[[float], FloatArray],
     times: ArrayLike,
 ) -> None:
-    """Refuses a reference whose derivatives are not those of its values.
+    """Checks that each entry of a reference is the derivative of the entry before it.
 
     They are compared with central differences of two step sizes. Where these disagree, as at a kink
     of the highest derivative, nothing is checked.

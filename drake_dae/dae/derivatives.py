@@ -29,7 +29,7 @@ from drake_dae.trace.factorization import (
 
 
 class Derivatives:
-    """The motion of a system on N* and its time derivatives, the control held constant.
+    """The motion of a system on N* and its time derivatives, for a constant control.
 
     Args:
         system: The system (1)-(3).
@@ -99,7 +99,7 @@ class Derivatives:
         return self._rates[0]
 
     def derivative(self, expression: ca.SX) -> ca.SX:
-        """The time derivative of an expression along the motion.
+        """Returns the time derivative of an expression along the motion.
 
         Args:
             expression: Of the state and of the unknowns, shape (k, 1).
@@ -112,11 +112,11 @@ class Derivatives:
         return self._total_derivative(expression)
 
     def expand(self, expression: ca.SX) -> ca.SX:
-        """An expression in terms of state, control and parameters alone."""
+        """Returns an expression in terms of only state, control and parameters."""
         return self._inline(expression, len(self._values))
 
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """a(x) and B(x) of an expression a(x) + B(x) u of the motion, as (9)-(14) and (16) read.
+        """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion.
 
         B is formed by the chain rule over the unknowns, which takes far fewer operations than
         differentiating the expanded expression.
@@ -160,13 +160,13 @@ class Derivatives:
         return slope
 
     def has_unknowns(self, expression: ca.SX) -> bool:
-        """Whether an expression holds unknowns, so that A(x) must be regular for it."""
+        """Returns whether an expression contains unknowns, so that A(x) must be regular."""
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
     def inverse(
         self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """The control for which an expression of the motion takes desired values.
+        """Returns the control for which an expression of the motion has desired values.
 
         The equations of the motion and `expression = desired` are solved together for the control
         and for the unknowns that it moves, block by block along their structure (Dulmage and
@@ -312,7 +312,7 @@ class Derivatives:
 
 
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-    """Whether two expressions have the same values at random states around the nominal one.
+    """Returns whether two expressions agree at random states around the nominal state.
 
     The parameters are varied as well: expressions that agree at their defaults alone are different.
     """

@@ -19,7 +19,7 @@ ALONG = 1e-6
 
 
 class KineticMetric:
-    """Directions in which states move onto N* with least kinetic energy.
+    """The directions in which states move onto N* with least kinetic energy.
 
     Args:
         system: The system (1)-(3).
@@ -57,7 +57,7 @@ class KineticMetric:
     def does_no_work(
         self, state: FloatArray, parameters: FloatArray, gradients: FloatArray
     ) -> bool:
-        """Whether all forces of constraints are along their gradients at a state.
+        """Returns whether all constraint forces are along their gradients at a state.
 
         Args:
             state: x, shape (n,).
@@ -78,7 +78,7 @@ class KineticMetric:
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int
     ) -> FloatArray:
-        """W^-1 C^T of some rows of C, where W is the metric of the states of a level.
+        """Returns W^-1 C^T of some rows of C, where W is the metric of the states of a level.
 
         Args:
             state: x, shape (n,).
@@ -104,7 +104,7 @@ class KineticMetric:
 
 
 def _groups(system: DaeSystem, count: int) -> list[Indices]:
-    """The states whose rates hold constraint inputs, those whose rates hold these, and so on."""
+    """Returns the states whose rates contain constraint inputs, then those that depend on these."""
     mass = nonzeros(system.mass_matrix.sparsity())
     moved = nonzeros(system.g.sparsity()).any(axis=1)
     while True:

@@ -26,7 +26,7 @@ _OURS = re.compile(rf"[0-9a-f]{{32}}-[0-9a-f]{{32}}{re.escape(SUFFIX)}|new-\w+")
 
 
 def cache_folder() -> Path:
-    """The folder, whether it exists or not: DRAKE_DAE_CACHE if it is set.
+    """Returns the path of the cache, also if it does not exist: DRAKE_DAE_CACHE if it is set.
 
     Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
     macOS and ~/.cache elsewhere.
@@ -49,7 +49,7 @@ def cache_folder() -> Path:
 
 
 def open_cache(create: bool = False) -> Path | None:
-    """The folder, if it can be trusted; None if there is none.
+    """Returns the folder of the cache if it can be trusted; None if it does not exist.
 
     Args:
         create: Makes one where there is none, mode 0700.
@@ -85,7 +85,7 @@ def open_cache(create: bool = False) -> Path | None:
 
 
 def find(key: str) -> Path | None:
-    """The code stored under a key; None if there is none.
+    """Returns the code that is stored under a key; None if there is none.
 
     Warns:
         MachineCodeWarning: The file is damaged, and was removed.
@@ -107,7 +107,7 @@ def find(key: str) -> Path | None:
 
 @contextmanager
 def workplace() -> Iterator[Path]:
-    """A temporary folder in the cache, removed at the end.
+    """Creates a temporary folder in the cache and removes it at the end.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or written.
@@ -122,7 +122,7 @@ def workplace() -> Iterator[Path]:
 
 
 def store(key: str, file: Path) -> Path:
-    """Moves a file from the `workplace` to its place, under a key for `find`."""
+    """Moves a file from the `workplace` into the cache, under a key for `find`."""
     path = file.parents[1] / _name(key, file.read_bytes())
     file.chmod(0o700)
     os.replace(file, path)
@@ -130,7 +130,7 @@ def store(key: str, file: Path) -> Path:
 
 
 def contents() -> list[Path]:
-    """The files of the cache, and temporary folders of killed processes; nothing else.
+    """Returns the files of the cache, and the temporary folders of killed processes.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or read.

@@ -50,7 +50,7 @@ SLOWEST = 10.0
 
 
 class CompilationAttempt(NamedTuple):
-    """An attempt to get machine code.
+    """When to try to get machine code, and whether to compile.
 
     Attributes:
         calls: The number of calls since the last attempt.
@@ -62,7 +62,7 @@ class CompilationAttempt(NamedTuple):
 
 
 def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
-    """The attempts to get machine code for a function.
+    """Returns the attempts to get machine code for a function.
 
     Args:
         compiled: The choice.
@@ -80,7 +80,7 @@ def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
 
 
 def check_choice(owner: str, compiled: Any) -> None:
-    """Refuses an invalid choice.
+    """Checks the value of the option `compiled`.
 
     Raises:
         ModelError: It is neither True, False nor "auto".
@@ -90,7 +90,7 @@ def check_choice(owner: str, compiled: Any) -> None:
 
 
 def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Function | None:
-    """A function as machine code; None if there is none.
+    """Returns a function as machine code; None if there is none.
 
     It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
 
@@ -117,7 +117,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
 def library(
     source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
 ) -> Path | None:
-    """C source as a shared library in the cache; None if there is none.
+    """Returns a shared library in the cache, compiled from C source; None if there is none.
 
     Args:
         source: The source.
@@ -171,12 +171,12 @@ def _library(
 
 
 def without_branches(source: str) -> str:
-    """The C source of CasADi, changed to write all results unconditionally."""
+    """Changes the C source of CasADi so that it writes all results unconditionally."""
     return re.sub(r"if \(res\[\d+\]!=0\) (?=res\[)", "", source)
 
 
 def generate(*functions: ca.Function) -> str:
-    """The C source of functions, each under its own name."""
+    """Generates the C source of functions, each under its own name."""
     generator = ca.CodeGenerator("code")
     for function in functions:
         generator.add(function)
@@ -184,13 +184,13 @@ def generate(*functions: ca.Function) -> str:
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:
-    """The same function under another name."""
+    """Returns the same function under another name."""
     inputs = function.sx_in()
     return ca.Function(name, inputs, function.call(inputs), {"cse": False})
 
 
 def _level(compiled: Compiled, operations: int) -> str:
-    """The optimization level for a function; empty if compilation would take too long."""
+    """Returns the optimization level for a function; empty if compilation would take too long."""
     if compiled is True:
         return "-O1"
     fast = (level for level, seconds in COMPILING.items() if seconds * operations < LIMIT)

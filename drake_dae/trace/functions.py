@@ -24,7 +24,7 @@ SINGULAR_PIVOT = 1e-12
 
 
 class FailureKind(Enum):
-    """The kind of failure of a function."""
+    """The kinds of failures of a function; the enum value is a description."""
 
     INPUT = "an input is not finite"
     OVERFLOW = "an input is beyond all measure"
@@ -53,7 +53,7 @@ class Failure:
 
 
 class TracedFunction:
-    """CasADi expressions, evaluated on preallocated NumPy arrays.
+    """A compiled or interpreted function of CasADi expressions on preallocated NumPy arrays.
 
     A call goes through CasADi's buffer interface and allocates nothing. It also computes one number
     that says whether its values are valid, see `is_valid`. Only here it is decided whether a
@@ -132,7 +132,7 @@ class TracedFunction:
         self._bind(self._function)
 
     def _bind(self, function: ca.Function) -> None:
-        """Binds a function to the arrays, to be called from now on."""
+        """Binds the function that calls evaluate to the arrays."""
         self.is_machine_code = function is not self._function
         self._buffer, self._evaluate = function.buffer()
         for index, array in enumerate(self.arguments):
@@ -152,7 +152,7 @@ class TracedFunction:
             self._bind(code or self._function)
 
     def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
-        """Calls the function without allocation.
+        """Evaluates the function without allocation.
 
         Args:
             arguments: Arrays of the sizes of the inputs, in their order.
@@ -174,7 +174,7 @@ class TracedFunction:
         return self.outputs
 
     def run(self) -> bool:
-        """Calls the function on its `arguments`; returns whether its `outputs` are valid.
+        """Evaluates the function at its `arguments`; returns whether its `outputs` are valid.
 
         This is the fastest call, for callers that write the arguments in place. It is replaced by
         `_run` when there are no more attempts to compile.
@@ -186,7 +186,7 @@ class TracedFunction:
         return isfinite(self._valid[0])
 
     def nowhere(self) -> tuple[FloatArray, ...]:
-        """New arrays of nan in the shapes of the outputs, for points without a value."""
+        """Returns new arrays of nan in the shapes of the outputs, for failed evaluations."""
         return tuple(np.full_like(output, np.nan) for output in self.outputs)
 
     @property
@@ -214,16 +214,16 @@ class TracedFunction:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the last values are valid apart from the doubt."""
+        """Whether the last values are finite and the matrix is regular; ignores the doubt."""
         return self.is_finite and bool(self._pivot[0] >= SINGULAR_PIVOT)
 
     @property
     def pivot(self) -> float:
-        """The pivot of the last call; 1 where there is none."""
+        """The pivot of the last evaluation; 1 without a matrix."""
         return float(self._pivot[0])
 
     def failure(self) -> Failure:
-        """The failure of the last call, if it was not valid."""
+        """Returns the failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
@@ -240,7 +240,7 @@ class TracedFunction:
         return Failure(self.name, fault, {}, self._regular)
 
     def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":
-        """The derivatives of an output with respect to some inputs, side by side."""
+        """Returns the function of the derivatives of an output by some inputs, side by side."""
         names = self.input_names
         symbols = [ca.SX.sym(name, size) for name, size in zip(names, self.sizes, strict=True)]
         value = ca.vec(self._function(*symbols)[output])
@@ -254,7 +254,7 @@ class TracedFunction:
         )
 
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
-        """Calls the function and returns fresh arrays.
+        """Evaluates the function and returns new arrays.
 
         Raises:
             ModelError: The number of arguments is wrong, or one has a wrong shape or is not
@@ -288,7 +288,7 @@ def _fits(argument: Any, buffer: FloatArray) -> bool:
 
 
 def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
-    """A call without attribute lookups."""
+    """Returns a call without attribute lookups."""
 
     def run() -> bool:
         evaluate()
@@ -298,5 +298,5 @@ def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
 
 
 def _identifier(name: str) -> str:
-    """A name that CasADi accepts: no other characters, no two underscores in a row."""
+    """Returns a name that CasADi accepts: letters, digits and single underscores."""
     return re.sub("[^A-Za-z0-9]+", "_", f"f_{name}")

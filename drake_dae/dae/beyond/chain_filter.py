@@ -45,7 +45,7 @@ class ChainFilter:
         period: float,
         velocity_ratio: float | None = None,
     ) -> "ChainFilter":
-        """The filter of given rates.
+        """Designs the filter for two rates.
 
         Args:
             state_rate: w in 1/s.
@@ -80,5 +80,5 @@ class ChainFilter:
 
 
 def transition(period: float) -> FloatArray:
-    """The step of (q, v, a) over a sample, shape (3, 3)."""
+    """Returns the transition matrix of (q, v, a) over a sample, shape (3, 3)."""
     return np.array([[1.0, period, period**2 / 2.0], [0.0, 1.0, period], [0.0, 0.0, 1.0]])

@@ -56,13 +56,13 @@ class SensedContact:
         delay: The delay of the control in samples.
         stiffness: k of the contact in N/m.
         mobility: J M^-1 J^T of the contact in 1/kg, the largest along the motion.
-        free_mobility: The same for the points that follow a path, in 1/kg.
-        lever, contact_lever: The distance that such a point, and the contact, move per radian of
-            noise of all joints: the length of a row of J, in m/rad.
+        free_mobility: The mobility of the points that follow a path, in 1/kg.
+        lever, contact_lever: The displacement of a point that follows a path, and of the contact,
+            per radian of noise of all joints: the length of a row of J, in m/rad.
         inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
         noise: The noise of a joint's angle and velocity, in rad and rad/s, and of the force in N;
-            and whether velocities are differences.
-        estimates: Whether a `StateEstimator` has the state.
+            with a `velocity_bandwidth` if velocities are filtered finite differences.
+        estimates: Whether the state comes from a `StateEstimator`.
 
     Raises:
         ModelError: A number is not positive, or a noise is negative.
@@ -89,16 +89,16 @@ class SensedContact:
                 raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
     def free(self, mass_error: float = 1.0) -> Direction:
-        """A free direction."""
+        """Returns a free direction."""
         return Direction(self.period, self.delay, mass_error=mass_error)
 
     def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
-        """The direction of the contact, with a share of its stiffness."""
+        """Returns the direction of the contact, with a fraction of its stiffness."""
         stiffness = share * self.stiffness
         return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
 
     def noise_of(self, lever: float) -> SensorNoise:
-        """The noise of a distance that follows from noisy angles."""
+        """Returns the noise of a distance that is computed from noisy angles."""
         noise = self.noise
         position, velocity = lever * noise.position, lever * noise.velocity
         return replace(noise, position=position, velocity=velocity)
@@ -110,7 +110,7 @@ class SensedContact:
 
     @property
     def quiet(self) -> SensorNoise:
-        """No noise, with the lag of differences."""
+        """Measurements without noise, with the lag of differentiated velocities."""
         return SensorNoise(velocity_bandwidth=self.noise.velocity_bandwidth)
 
 
@@ -151,7 +151,7 @@ class _Part:
 
 @checked(ModelError)
 def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
-    """The gains with the least predicted errors, of those that are smooth and stable enough.
+    """Returns the gains with the least predicted errors that are smooth and stable enough.
 
     The gains are those of `contact_gains`, as functions of its rate w, for which free directions
     and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
@@ -283,7 +283,7 @@ def _rms(loop: SampledLoop) -> float:
 
 
 def _reason(situation: SensedContact, rates: list[float], allowed: float, highest: float) -> str:
-    """Why no gains are found."""
+    """Returns why no gains are found."""
     fast = list(_state_rates(situation, highest))[-1]
     for kind, where in ((_free, "in free directions"), (_contact, "along the contact")):
         parts = [kind(situation, w, fast) for w in rates]

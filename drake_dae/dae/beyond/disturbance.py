@@ -30,7 +30,7 @@ _FLAT = 1e-9
 def with_disturbance(
     system: DaeSystem, states: Sequence[str], frictions: Sequence[str] = ()
 ) -> DaeSystem:
-    """The same system with a disturbance d(t) as an exogenous signal:
+    """Returns the same system with a disturbance d(t) as an exogenous signal:
 
         E x' = f + S d + g v + h u,
 
@@ -82,7 +82,7 @@ def with_disturbance(
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The functions that an observer of d evaluates for a system made by `with_disturbance`.
+    """The functions that an observer of d evaluates, for a system made by `with_disturbance`.
 
     With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
     derivative of a measurement is needed.
@@ -119,7 +119,7 @@ class Observation:
 
     @classmethod
     def of(cls, structure: Structure) -> "Observation":
-        """The observation of a system, from its structure.
+        """Derives the functions from the structure of a system.
 
         Raises:
             ModelError: The system has no disturbance, or a mass matrix that depends on the states
@@ -180,7 +180,7 @@ class Observation:
 
 
 def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """The share of each friction force c in d, in the metric of accelerations, shape (c, 1):
+    """Returns the part of d that each friction force c explains, as a factor, shape (c, 1):
 
         (c~^T W d) / (c~^T W c),
 
@@ -211,7 +211,7 @@ def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.S
 
 
 def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """The part of d orthogonal to all T y in the metric of accelerations, in the shape of d.
+    """Returns the part of d that is orthogonal to all T y in the metric of accelerations.
 
     Args:
         planes: T, shape (k, j), of any rank.
@@ -235,7 +235,7 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 def _wanted(
     structure: Structure, rows: Sequence[int]
 ) -> tuple[TracedFunction | None, TracedFunction]:
-    """`wanted` and `moving` of an `Observation`."""
+    """Returns `wanted` and `moving` of an `Observation`."""
     system, layout = structure.system, DerivativeLayout(structure.output_degrees)
     # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]

@@ -68,7 +68,7 @@ class DirectionGains:
 
 @dataclass(frozen=True)
 class SampledLoop:
-    """The next sample is A x + B n, for noise n of deviation 1; the outputs are C x + D n.
+    """A sampled linear loop: x+ = A x + B n with noise n of deviation 1, and outputs C x + D n.
 
     Attributes:
         step, noise: A and B.
@@ -90,7 +90,7 @@ class SampledLoop:
         return float(np.abs(np.linalg.eigvals(self.step)).max())
 
     def deviations(self) -> tuple[float, float]:
-        """The standard deviations of the error, and of the acceleration from sample to sample.
+        """Returns the standard deviations of the error, and of the acceleration's changes.
 
         They are infinite if the loop is not stable.
         """
@@ -108,7 +108,7 @@ class SampledLoop:
         return max(first, 0.0) ** 0.5, max(second, 0.0) ** 0.5
 
     def after_step(self) -> float:
-        """sqrt(sum of squares) of the error after a disturbing acceleration rises from 0 to 1.
+        """Returns sqrt(sum of squares) of the error after a disturbing acceleration steps to 1.
 
         It is infinite if the loop is not stable.
         """
@@ -123,7 +123,7 @@ class SampledLoop:
 
 
 def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
-    """The loop of a law whose model is right, except for the `mass_error` of the direction.
+    """Returns the loop of a law whose model is right, except for the `mass_error`.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
     commands, held for a sample after its delay, and m the mass_error. In a contact the depth moves

@@ -34,7 +34,7 @@ def sampled_poles(
     state: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
 ) -> ComplexArray:
-    """The exact poles of a robot under a sampled law, about an equilibrium.
+    """Returns the exact poles of a robot under a sampled law, about an equilibrium.
 
     The law samples at t_k = k T; its control acts from t_k + d until t_(k+1) + d. About an
     equilibrium a deviation x of the minimal states on N* has x' = A x without the law and x' = (A +
@@ -90,7 +90,7 @@ def sampled_poles(
 
 
 def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A t) and Gamma(t) G."""
+    """Returns exp(A t) and Gamma(t) G."""
     size = len(A)
     both = np.block([[A, G], [np.zeros((size, 2 * size))]])
     transition = scipy.linalg.expm(both * length)
@@ -108,7 +108,7 @@ def sampling_error(
     *,
     parameters: ArrayLike | None = None,
 ) -> FloatArray:
-    """The error that sampling adds to (30), (31), to first order in period and delay.
+    """Returns the error that sampling adds to (30), (31), to first order in period and delay.
 
     For any plant and reference, z_i^(mu_i) = a_i + B_i u gives without approximation
 
@@ -198,7 +198,7 @@ def _delay(delay: float) -> float:
 
 
 def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
-    """Refuses a state that is not an equilibrium."""
+    """Checks that a state is an equilibrium."""
     moves = np.abs(loop.rate) / law.system.scale
     fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
     worst = int(np.argmax(moves))
@@ -212,7 +212,7 @@ def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> No
 
 
 def _course(name: str, values: ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Rows for each time."""
+    """Checks an array with a row for each time."""
     rows = numbers(name, values)
     if rows.shape != shape or not np.isfinite(rows).all():
         raise ModelError(

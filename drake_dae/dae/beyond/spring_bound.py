@@ -30,7 +30,7 @@ def spring_error_bound(
     period: float,
     delay: float = 0.0,
 ) -> FloatArray:
-    """A bound of the errors that springs add to those of a rigid law, by singular perturbation.
+    """Returns a bound of the errors that springs add to those of a rigid law.
 
     The torque of a `TorqueLoop` differs from the desired one by e, where
 
@@ -163,7 +163,7 @@ def spring_loop_radius(
     delay: int,
     scale: float = 1.0,
 ) -> float:
-    """The spectral radius of a sampled `TorqueLoop` about rest, with springs of another stiffness.
+    """Returns the spectral radius of a sampled `TorqueLoop` at rest, for other springs.
 
     The deflections d have, with the mobility L of the links and held torques u of `delay` samples
     before,
@@ -216,7 +216,7 @@ def stable_scales(
     period: float,
     delay: int,
 ) -> tuple[float, float] | None:
-    """The range of stiffnesses, relative to the given ones, for which a `TorqueLoop` is stable.
+    """Returns the range of relative stiffnesses for which a `TorqueLoop` is stable.
 
     Args:
         mobilities: Those of the links, free and held; the other arguments are those of
@@ -242,6 +242,6 @@ def stable_scales(
 
 
 def _square(value: ArrayLike) -> FloatArray:
-    """A diagonal or a matrix as a matrix."""
+    """Converts a diagonal, or a matrix, to a matrix."""
     matrix = np.asarray(value, dtype=float)
     return np.diag(matrix) if matrix.ndim == 1 else matrix

@@ -23,7 +23,7 @@ DAMPING = 0.7
 @checked(ModelError)
 @dataclass(frozen=True)
 class SpringLoop:
-    """The numbers of a loop around springs, which makes their torque tau follow a desired one,
+    """The parameters of a loop around springs, which makes their torque tau follow tau_d,
 
         tau'' + 2 zeta w tau' + w^2 tau = 2 zeta w tau_d' + w^2 tau_d + ...;    see `TorqueLoop`.
 
@@ -53,7 +53,7 @@ class SpringLoop:
 
 
 def spring_loop(period: float, delay: int, damping: float = DAMPING) -> SpringLoop:
-    """The recommended numbers of a loop around springs.
+    """Returns the recommended parameters of a loop around springs.
 
     The velocity of a shaft is controlled with the gain 2 zeta w, which is the crossover frequency
     of its loop. A delay t = (delay + 1/2) period costs the phase 2 zeta w t there, of which 0.2 rad
@@ -81,7 +81,7 @@ def contact_gains_behind(
     delay: int,
     velocity_noise: float,
 ) -> ContactGains:
-    """`contact_gains` of the rigid law of a cascade, for links that a loop around springs moves.
+    """Returns `contact_gains` of the rigid law of a cascade with a loop around springs.
 
     The torque of the springs follows at the rate of the loop. So the outer rate is a ninth of it at
     most, and the gain of the velocity, three times the outer rate, a third. The observer takes the

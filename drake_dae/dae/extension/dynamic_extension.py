@@ -50,10 +50,10 @@ def dynamic_extension(
 
     In each round the controls that act in the dependent rows of B(x) get an integrator. If more
     than q controls act in rows of rank q, a regular static feedback u = beta(x) w is applied first,
-    after which only q controls act in them; see `Extension.integrators`. A round reduces the zero
-    dynamics by the rank deficiency of B(x), so that few rounds decide: when no zero dynamics are
-    left, the outputs depend on each other. A violation of Assumption (3) is repaired on the way;
-    see `extend`.
+    after which only q controls act in them; see `Extension.integrators`. Each round reduces the
+    dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds:
+    if no zero dynamics remain and B(x) is still singular, the outputs are dependent and there is no
+    extension. A violation of Assumption (3) is repaired as well; see `extend`.
 
     Args:
         system: The system (1)-(3).
@@ -105,7 +105,7 @@ def dynamic_extension(
 
 
 class _Chain:
-    """A system on its way from the original to the extended one.
+    """A system between the original and the extended one, with the integrators added so far.
 
     Args:
         system: The original one.
@@ -130,7 +130,7 @@ class _Chain:
         self._bases = [(signal, 0) for signal in system.control_signals]
 
     def beside_nominal(self) -> DaeSystem:
-        """The system with a nominal state at which no sine is accidentally zero.
+        """Returns the system with a nominal state at which no sine is accidentally zero.
 
         Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
         """
@@ -181,7 +181,7 @@ class _Chain:
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
-    """The controls that act in the dependent rows of B(x), and how they must be mixed first.
+    """Returns the controls that act in the dependent rows of B(x), and how to mix them.
 
     Returns:
         Columns and b(x) of `_Chain.integrate`; None if B(x) is regular.
@@ -259,7 +259,7 @@ def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
 
 
 def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
-    """The controls that act on a derivative of a constraint before any constraint input does."""
+    """Returns the controls that act on a constraint's derivative before its inputs do."""
     x, explicit = system.state, system.explicit
     manifold = Manifold(system, [[explicit.k[i]] for i in range(system.num_constraints)])
     samples = Samples(manifold, np.array([violation.state]))

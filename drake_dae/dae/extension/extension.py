@@ -49,7 +49,7 @@ class Extension:
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The control u of the original system, shape (p,).
+        """Returns the control u of the original system, shape (p,).
 
         Args:
             state: x_e, the state of the extended system.
@@ -114,7 +114,7 @@ def extend(
 
 
 def refuse_metric(system: DaeSystem) -> None:
-    """Refuses to put integrators before controls that a metric chooses.
+    """Checks that the system has no `control_metric`.
 
     Raises:
         ModelError: The system has a `control_metric`.
@@ -174,7 +174,7 @@ def integrated(
 
 
 def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
-    """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
+    """Returns the controls at the nominal state, shape (p,), from their names; 0 for others.
 
     Raises:
         ModelError: A name is not that of a control, or a value is not finite.

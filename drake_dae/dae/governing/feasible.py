@@ -18,7 +18,7 @@ WITHIN = 1e-9
 
 
 def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFunction:
-    """The control within limits that moves the outputs most as another control does.
+    """Builds the function that limits a control so that the outputs change least.
 
     By (26), (27) z_i^(mu_i) = a_i + B_i u. With ubar_d = a + B u_d of the control (28) it is
 
@@ -83,7 +83,7 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
 
 
 def _forces(structure: Structure, limits: MotionLimits, scale: ca.DM) -> tuple[ca.SX, ca.SX]:
-    """A and b of A x <= b for u = U x, with rows of length one."""
+    """Returns A and b of A x <= b for u = U x, with rows of length one."""
     limited = LimitedSignals(structure, MotionLimits(forces=limits.forces, cones=limits.cones))
     free, by = limited.by_control()
     slopes, rows, bounds = ca.mtimes(by, ca.diag(scale)), [], []

@@ -33,7 +33,7 @@ SMALL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Governing:
-    """A law and its references, whose time s runs as fast as limits allow at the present state.
+    """The time s of a law's references, which runs as fast as limits allow at the present state.
 
     For any s(t) the reference r(s(t)) is admissible, so that errors obey (30), (31), whatever s
     does. With
@@ -109,7 +109,7 @@ class Governing:
         return TracedFunction(name, inputs, outputs, compiled=law.system.compiled)
 
     def _reference(self, time: ca.SX) -> ca.SX:
-        """R at a symbolic time of the reference."""
+        """Returns R at a symbolic time of the reference."""
         rows = [ca.SX(0, 1)]
         for reference, degrees in with_degrees(self.references, self.law.degrees):
             row = reference.expression(degrees, time)
@@ -122,7 +122,7 @@ class Governing:
         return ca.vertcat(*rows)
 
     def _intervals(self, commanded: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
-        """The least and the largest s'' by speeds, by other limits ahead of time, and now.
+        """Returns the allowed intervals of s'' by speeds, by other limits ahead of time, and now.
 
         Args:
             commanded: ubar of (28) for s'' = 0, shape (p, 1).
@@ -151,7 +151,7 @@ class Governing:
 
 
 def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
-    """A value within an interval; the middle of an empty one."""
+    """Clips a value to an interval; returns the middle of an empty interval."""
     inside = ca.fmax(low, ca.fmin(high, value))
     return ca.if_else(low <= high, inside, (low + high) / 2.0)
 
@@ -159,7 +159,7 @@ def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
 def _interval(
     values: ca.SX, slopes: ca.SX, low: ca.SX, high: ca.SX, sizes: FloatArray
 ) -> tuple[ca.SX, ca.SX]:
-    """The least and the largest a with low <= values + slopes a <= high.
+    """Returns the least and the largest a with low <= values + slopes a <= high.
 
     Args:
         values, slopes, low, high: Expressions, shape (k, 1).

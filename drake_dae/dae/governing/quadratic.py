@@ -21,7 +21,7 @@ BOUNDARY = 0.995
 def nearest_within(
     metric: ca.SX, goal: ca.SX, rows: ca.SX, bounds: ca.SX, softness: float
 ) -> ca.SX:
-    """x next to a goal: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and A x <= b + d z.
+    """Returns x close to g: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and A x <= b + d z.
 
     The last bounds are soft: each gives way by d times its multiplier z. By Mehrotra's primal-dual
     interior-point method (Nocedal and Wright, Numerical Optimization, 2006, section 16.6) from

@@ -33,7 +33,7 @@ def linearize(
     structure: ConstraintStructure | None = None,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """The linear models of a plant from its control u to its controlled outputs z.
+    """Linearizes a plant from its control u to its controlled outputs z.
 
     Exogenous signals are at rest at their parameters' values, unless `parameters` say otherwise.
 
@@ -65,7 +65,7 @@ def linearize_loop(
     *,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """The linear models of a plant under the law (28), from R to the controlled outputs z.
+    """Linearizes a plant under the law (28), from R to the controlled outputs z.
 
     All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With r_i^(j)
     = s^j r_i the transfer matrix is the identity if the plant is the model of the law.

@@ -23,7 +23,7 @@ it is shorter than usual by this factor."""
 
 
 def trace_first_steps(residual: Residual) -> TracedFunction:
-    """The result of the first Newton steps from a state, all with the gradients at that state.
+    """Traces the first Newton steps from a state, all with the gradients at that state.
 
     The outputs are the outcome of `_followed` and the lengths of the steps (in states over their
     scale), the state that they reach, and the first step. The result is not valid where gradients
@@ -53,7 +53,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
 def _followed(
     start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """The state that `newton` reaches from a start by these first steps, and the outcome.
+    """Returns the state that `newton` reaches by these first steps, and the outcome.
 
     Args:
         start: The state, shape (n, 1).

@@ -20,7 +20,7 @@ FLOOR = 1e-12
 
 
 class Manifold(Residual):
-    """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
+    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4).
 
     Args:
         system: The system (1)-(3).
@@ -43,7 +43,7 @@ class Manifold(Residual):
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
+        """Returns the constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
 
         Args:
             state: x, shape (n,).
@@ -52,7 +52,7 @@ class Manifold(Residual):
         return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
-        """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.
+        """Returns whether a state is on N* up to round-off: whether Newton's step is short.
 
         The arguments are those of `residual`.
         """
@@ -69,14 +69,14 @@ class Manifold(Residual):
         parameters: ArrayLike | None = None,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """The consistent state next to a given one, to round-off, by Newton's method.
+        """Returns the consistent state next to a state, to round-off, by Newton's method.
 
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
-            crosses: A function that says whether the system passes a singular configuration near a
-                state. The directions that are lost there are then left out of the projection. None
-                if it passes none.
+            crosses: A function that returns whether the motion crosses a singular configuration
+                close to a state. The projection then ignores the directions in which the
+                constraints lose their rank. None without singular configurations.
 
         Returns:
             The consistent state, shape (n,).
@@ -94,14 +94,14 @@ class Manifold(Residual):
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` without checks of its arguments; the state itself if it is consistent."""
+        """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
         moved = self.first_steps(start, p)
         if moved is None:
             return self.searched(start, p, crosses)
         return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """The first few Newton steps of `project`, for a simulation; the arguments are not checked.
+        """Takes the first few Newton steps of `project`, without checks of arguments.
 
         Args:
             start: The state, shape (n,).
@@ -123,7 +123,7 @@ class Manifold(Residual):
         return start if outcome == STAYS and function.is_finite else None
 
     def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The consistent state next to a start that a user gave, found level by level.
+        """Returns the consistent state next to a user's start, computed level by level.
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no

@@ -16,7 +16,7 @@ from drake_dae.trace.round_off import positive
 
 
 class Residual:
-    """L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, constraint-major, and its gradients.
+    """The residual L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, and its gradients.
 
     Args:
         system: The system (1)-(3).
@@ -51,7 +51,7 @@ class Residual:
         self.lengths: FloatArray = np.linalg.norm(gradients, axis=1)
 
     def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """C, the gradients of the residual at a state, shape (sum r_i, n).
+        """Returns the gradients C of the residual at a state, shape (sum r_i, n).
 
         Args:
             state: x, shape (n,).
@@ -62,7 +62,7 @@ class Residual:
 
     @cached_property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale.
+        """The Newton step of least norm from a state, divided by the scale of the states.
 
         A function of the state, a second state at which the gradients are taken, and parameters.
         """
@@ -75,7 +75,7 @@ class Residual:
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
-        """The norm of the residual, each entry over its gradient by states over their scale."""
+        """Returns the norm of the residual, each entry divided by its scaled gradient."""
         residual = self.residual_function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0

@@ -38,7 +38,7 @@ ITERATIONS = 10
 
 
 class ConsistentStateSearch:
-    """Newton's method, then least squares; at singular configurations a pseudoinverse.
+    """Searches a consistent state by Newton's method, then by least squares or a pseudoinverse.
 
     Args:
         residual: What is zero on N*.
@@ -59,7 +59,7 @@ class ConsistentStateSearch:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` where `first_steps` did not converge.
+        """Acts as `project` from a state from which `first_steps` did not converge.
 
         Args:
             start: The state, shape (n,).
@@ -81,7 +81,7 @@ class ConsistentStateSearch:
         return self._searched(start, p) if consistent is None else consistent
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """The consistent state next to one where the first few steps do not converge."""
+        """Returns the consistent state from Newton's method, or else from least squares."""
         scale = self._residual.scale
         z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
@@ -109,7 +109,7 @@ class ConsistentStateSearch:
     def _is_near(
         self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
     ) -> bool:
-        """Whether the system passes a singular configuration near a state."""
+        """Returns whether the motion crosses a singular configuration close to a state."""
         return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
 
     def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
@@ -151,7 +151,7 @@ class ConsistentStateSearch:
         return None if steps is None else steps._replace(measure=measure)
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """Why a Newton iteration that ended at a state failed, in words."""
+        """Returns in words why a Newton iteration that ended at a state failed."""
         name = self._residual.system.name
         values = zip(self._residual.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]

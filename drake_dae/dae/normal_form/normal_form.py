@@ -95,7 +95,7 @@ class NormalForm:
         return f"NormalForm('{self.system.name}', coordinates={names})"
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Phi(x) = (y, zeta, xi) of (20)-(22).
+        """Returns Phi(x) = (y, zeta, xi) of (20)-(22).
 
         Args:
             state: x, shape (n,), on N* or not.
@@ -107,7 +107,7 @@ class NormalForm:
         return self._coordinates(state, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """dPhi/dx, shape (n, n); singular where Phi is no change of coordinates, see the class.
+        """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates.
 
         Args:
             state: x, shape (n,).
@@ -121,7 +121,7 @@ class NormalForm:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
+        """Returns x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
         The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
         angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
@@ -192,7 +192,7 @@ class NormalForm:
         first: FloatArray,
         parameters: FloatArray,
     ) -> InconsistentStateError:
-        """Names the coordinate that weak directions of the Jacobian keep from its target."""
+        """Returns the error that names the coordinate which does not reach its target."""
         values, jacobian = self._at(state, parameters)
         missing = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale

@@ -22,7 +22,7 @@ from drake_dae.errors import ReferenceSignalError
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ReferenceRows(Reference):
-    """Some rows of a reference, in any order.
+    """A reference that consists of some rows of another one, in any order.
 
     Attributes:
         reference: The reference.
@@ -69,14 +69,14 @@ class ReferenceRows(Reference):
         return [degree_of.get(row, 0) for row in range(self.reference.size)]
 
     def _places(self, degrees: Sequence[int]) -> list[int]:
-        """The places of the chosen rows' values among those of all."""
+        """Returns the indices of the selected rows' values among those of all rows."""
         first = np.cumsum([0, *[degree + 1 for degree in degrees]])
         return [int(first[row]) + k for row in self.rows for k in range(degrees[row] + 1)]
 
 
 @dataclass(frozen=True)
 class Assigned:
-    """A reference, and the indices of its outputs."""
+    """A reference with its name and the indices of its outputs."""
 
     name: str
     reference: Reference
@@ -86,7 +86,7 @@ class Assigned:
 def assigned(
     name: str, reference: Reference | float, outputs: Sequence[str], degrees: Sequence[int]
 ) -> Assigned:
-    """A reference and the outputs of a name; a number is a constant for each of them.
+    """Assigns a reference to the outputs of a name; a number is a constant for each of them.
 
     Args:
         name: The name.
@@ -112,7 +112,7 @@ def assigned(
 
 
 def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Reference]:
-    """References in the order of the outputs; each output needs one.
+    """Sorts references in the order of the outputs; each output needs one.
 
     Raises:
         ReferenceSignalError: An output has none, or two.
@@ -138,7 +138,7 @@ def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Ref
 def references_by_name(
     references: Mapping[str, Reference | float], outputs: Sequence[str], degrees: Sequence[int]
 ) -> list[Reference]:
-    """References in the order of the outputs.
+    """Returns references in the order of the outputs.
 
     Args:
         references: Name -> reference, or a number for a constant.
@@ -159,7 +159,7 @@ def references_by_name(
 
 
 def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The indices of the outputs of a name, shape (k,).
+    """Returns the indices of the outputs that a name denotes, shape (k,).
 
     Raises:
         ReferenceSignalError: It has none.
@@ -169,7 +169,7 @@ def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int
 
 
 def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The same for a single name."""
+    """Returns the indices of the outputs that a name without commas denotes."""
     index = {output: i for i, output in enumerate(outputs)}
     if name in index:
         return [index[name]]
@@ -185,7 +185,7 @@ def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[in
 
 
 def _runs(rows: Sequence[tuple[Assigned, int]]) -> Iterator[Reference]:
-    """The references of rows, as few as possible."""
+    """Generates references for rows; successive rows of one reference are joined."""
     first = 0
     while first < len(rows):
         entry, row = rows[first]

@@ -21,7 +21,7 @@ from drake_dae.trace.given import result_of
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class ConstantReference(FormulaReference):
-    """A reference that stays at given values.
+    """A reference with constant values.
 
     Attributes:
         values: The values in the outputs' units, shape (k,), or one number.
@@ -76,7 +76,7 @@ class SinusoidReference(FormulaReference):
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PointToPointReference(FormulaReference):
-    """A smooth move from rest at `start` to rest at `end`, held before and after.
+    """A smooth move from rest at `start` to rest at `end`; constant before and after.
 
     It is the polynomial of degree 2 order + 1 whose derivatives 1, ..., order vanish at both ends:
     order 2 is the quintic.
@@ -188,7 +188,7 @@ class ExpressionReference(FormulaReference):
 
 
 def settle(reference: Reference, *names: str) -> None:
-    """Makes fields tuples of the same length; a single number serves all.
+    """Converts fields to tuples of the same length; a single number is repeated.
 
     Raises:
         ReferenceSignalError: They are not finite numbers, are empty, or have different lengths.

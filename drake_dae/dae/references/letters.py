@@ -64,7 +64,7 @@ _GLYPHS = {
 
 
 def strokes(text: str) -> Iterator[FloatArray]:
-    """The strokes of a text from left to right, shape (k, 2), in cells of the grid.
+    """Generates the strokes of a text from left to right, shape (k, 2), in cells of the grid.
 
     Small letters are written as capital ones.
 

@@ -40,7 +40,7 @@ class PathReference(FormulaReference):
 
     @abstractmethod
     def point(self, distance: ca.SX) -> ca.SX:
-        """p(s), shape (size, 1)."""
+        """Returns the point p(s) of the path, shape (size, 1)."""
 
     @cached_property
     def travel(self) -> Travel:
@@ -89,7 +89,7 @@ class PathReference(FormulaReference):
 
 
 def check_order(order: int, most: int = 12) -> None:
-    """Refuses an order that a path cannot have.
+    """Checks the number of continuous derivatives of a path.
 
     Raises:
         ReferenceSignalError: It is not from 2 to `most`.

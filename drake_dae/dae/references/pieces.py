@@ -35,7 +35,7 @@ class PiecewisePolynomials:
 
     @cached_property
     def at(self) -> Callable[[float], FloatArray]:
-        """The function of the time in s, shape (rows,)."""
+        """The function that maps a time in s to the values, shape (rows,)."""
         breaks, factors, powers = self.breaks.tolist(), self.factors, self._powers
         first, last = breaks[0], breaks[-1]
 
@@ -47,14 +47,14 @@ class PiecewisePolynomials:
         return evaluate
 
     def at_all(self, times: FloatArray) -> FloatArray:
-        """The values at times in s, shape (len(times), rows)."""
+        """Returns the values at times in s, shape (len(times), rows)."""
         inside = np.clip(times, self.breaks[0], self.breaks[-1])
         piece = np.searchsorted(self.breaks[1:-1], inside, "right")
         x = (inside - self.breaks[piece]) / np.diff(self.breaks)[piece]
         return np.einsum("trp,tp->tr", self.factors[piece], x[:, None] ** self._powers)
 
     def expression(self, time: ca.SX) -> ca.SX:
-        """The values at a symbolic time, shape (rows, 1)."""
+        """Returns the values at a symbolic time, shape (rows, 1)."""
         count, rows, size = self.factors.shape
         passed = [time >= moment for moment in self.breaks[1:-1]]
         chosen = ca.vertcat(1, *passed) - ca.vertcat(*passed, 0)
@@ -85,7 +85,7 @@ class PiecewiseReference(Reference):
 
     @abstractmethod
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         self._check(degrees)

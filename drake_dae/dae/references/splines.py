@@ -66,7 +66,7 @@ class TimeSpline:
         return orders
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
         rows = {
             j: sliding_window_view(self.differences[j], self.degree - j + 1, axis=0)
             @ basis_pieces(self.degree - j).T
@@ -81,7 +81,7 @@ class TimeSpline:
 
 
 def basis_pieces(degree: int) -> FloatArray:
-    """The uniform B-splines on a span: entry (i, k) is the factor of x^i for its k-th point.
+    """Returns the uniform B-splines on a span: entry (i, k) is the factor of x^i for point k.
 
     By the recursion of Cox and de Boor, shape (degree + 1, degree + 1).
     """
@@ -117,7 +117,7 @@ class SplineReference(PiecewiseReference):
 def spline_within(
     points: FloatArray, limits: PathLimits, start_time: float, order: int, among: int | None = None
 ) -> TimeSpline:
-    """The fastest spline over points with derivatives within limits.
+    """Returns the fastest spline over points with derivatives within limits.
 
     Args:
         points: The points, shape (n, k).
@@ -135,7 +135,7 @@ def spline_within(
 
 
 def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[int]]:
-    """Points along straight edges, no farther apart than a spacing, with the corners among them.
+    """Returns points along straight edges, no farther apart than a spacing, with all corners.
 
     Returns:
         The points, shape (n, k), and the edge of each; a corner belongs to the edge before it.
@@ -151,7 +151,7 @@ def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[i
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PolylineReference(SplineReference):
-    """Straight edges between points, with rounded corners, from rest to rest.
+    """A path of straight edges between points, with rounded corners, from rest to rest.
 
     It leaves an edge at the distance `corner` before its end, and joins the next one at the same
     distance. It is a uniform B-spline over points on the edges, 2 corner / order apart: the speed
@@ -188,7 +188,7 @@ class PolylineReference(SplineReference):
 
 
 def settle_points(reference: Any) -> FloatArray:
-    """Makes the field `points` a tuple of rows, and returns it as an array, shape (n, k).
+    """Converts the field `points` to a tuple of rows, and returns it as an array, shape (n, k).
 
     Raises:
         ReferenceSignalError: They are not rows of finite numbers, fewer than two, or two in
@@ -210,7 +210,7 @@ def settle_points(reference: Any) -> FloatArray:
 
 
 def settle_axes(reference: Any) -> None:
-    """Makes the fields of a drawing in a plane, and its two forces, pairs of numbers.
+    """Converts the vector fields of a drawing in a plane to pairs of numbers.
 
     Raises:
         ReferenceSignalError: They are none, or `along` and `up` are not two directions.
@@ -226,7 +226,7 @@ def settle_axes(reference: Any) -> None:
 
 
 def check_spline(corner: float, order: int, length: float) -> None:
-    """Refuses invalid roundings.
+    """Checks the rounding of corners.
 
     Raises:
         ReferenceSignalError: The corner is not positive or very small, or the order out of range.
@@ -242,6 +242,6 @@ def check_spline(corner: float, order: int, length: float) -> None:
 
 
 def rounded_up(value: float) -> str:
-    """A positive number as text with three digits, rounded up."""
+    """Formats a positive number with three digits, rounded up."""
     text = f"{value:.3g}"
     return text if float(text) >= value else f"{1.01 * value:.3g}"

@@ -23,7 +23,7 @@ CLOSER = (0.9, 0.99)
 
 @dataclass(frozen=True, eq=False)
 class ContactMargin:
-    """The distance of contacts from the Painleve paradox, over some states.
+    """The distance of frictional contacts from the Painleve paradox, over some states.
 
     Attributes:
         reserve: The smallest principal minor of A(x) over the contacts, each divided by its value
@@ -47,7 +47,7 @@ class ContactMargin:
 
 
 class ContactMargins:
-    """The margins of a system with frictional contacts at given states.
+    """Computes the contact margins of a system at states.
 
     Args:
         system: The system.
@@ -69,7 +69,7 @@ class ContactMargins:
     def at(
         self, state: FloatArray, parameters: FloatArray, time: float | None = None
     ) -> ContactMargin:
-        """The margin at one state, with values of all parameters."""
+        """Returns the margin at one state, for values of all parameters."""
         without = self._with_friction(parameters, 0.0)
         unit = self._direction(parameters)
         reserve = self._values(state, parameters)[1]
@@ -85,7 +85,7 @@ class ContactMargins:
         return ContactMargin(float(reserve.item()), critical, state, time)
 
     def over(self, samples: Samples, search: bool) -> ContactMargin:
-        """The smallest margin at sampled states and, downhill from the worst, between them."""
+        """Returns the smallest margin at samples and, downhill from the worst, between them."""
         p = self._system.parameter_values
         margins = sorted((self.at(state, p) for state in samples.states), key=_first)
         worst = margins[0]
@@ -98,14 +98,14 @@ class ContactMargins:
         return worst
 
     def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:
-        """The smallest margin along a motion, of which there is at least one state."""
+        """Returns the smallest margin along a motion of at least one state."""
         rows = zip(states, parameters, times.tolist(), strict=True)
         return min((self.at(*row) for row in rows), key=_first)
 
     def _downhill(
         self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray
     ) -> Iterator[ContactMargin]:
-        """States in the Painleve paradox with decreasing friction."""
+        """Generates states in the Painleve paradox with decreasing friction."""
         unit, best = self._direction(parameters), start
         for part in CLOSER:
             for _ in range(20):

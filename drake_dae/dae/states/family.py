@@ -27,7 +27,7 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Deciding:
-    """Parameters for which an expression is zero at the defaults and not for other values.
+    """Parameters for which an expression is not zero, although it is zero at the defaults.
 
     Attributes:
         names: The parameters and derivatives of exogenous signals that decide alone; or, if only
@@ -54,7 +54,7 @@ class Deciding:
 
 
 class Family:
-    """Random members of a system, each a consistent state with its own parameters.
+    """Random members of a system: consistent states, each with parameters of its own.
 
     A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
     from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
@@ -69,7 +69,7 @@ class Family:
         self._system = manifold.system
 
     def deciding(self, acts: Callable[[FloatArray, FloatArray], bool]) -> Deciding | None:
-        """The parameters that decide whether an input acts that does not at the defaults.
+        """Returns the parameters for which an input acts that does not act at the defaults.
 
         Args:
             acts: (state, values of all parameters) -> whether it acts.
@@ -107,7 +107,7 @@ class Family:
         )
 
     def lost(self, determinant: Callable[[FloatArray, FloatArray], float]) -> Deciding | None:
-        """A parameter for which a determinant vanishes within given bounds, if there is one.
+        """Returns a parameter for which a determinant vanishes within the bounds, if there is one.
 
         Args:
             determinant: (state, values of all parameters) -> its sign; 0 if it vanishes.
@@ -135,7 +135,7 @@ class Family:
 
     @cached_property
     def _numbers(self) -> list[tuple[str, list[int]]]:
-        """The numbers to draw: parameters and derivatives of signals, with their places."""
+        """The parameters and derivatives of signals to draw, with their indices."""
         system = self._system
         entries, start, following = [], 0, sum(p.value.size for p in system.parameters)
         rates = []
@@ -172,7 +172,7 @@ class Family:
     def _consistent(
         self, state: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """A consistent state near one for other numbers; None if there is none in the domain."""
+        """Returns a consistent state near a state for other parameters; None if there is none."""
         try:
             consistent = self._manifold.project(state, parameters)
         except InconsistentStateError:

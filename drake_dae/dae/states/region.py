@@ -20,7 +20,7 @@ _FLAT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The states low <= x <= high.
+    """The states x with low <= x <= high.
 
     Attributes:
         low: The lower bounds, shape (n,); -inf where there is none.
@@ -31,7 +31,7 @@ class Region:
     high: FloatArray
 
     def holds(self, state: FloatArray) -> bool:
-        """Whether a state is in the box."""
+        """Returns whether a state is in the region."""
         bounds = np.where(np.isfinite([self.low, self.high]), [self.low, self.high], 0.0)
         slack = _SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
         return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
@@ -50,7 +50,7 @@ class ConsistentRegion:
         self.region = region
 
     def project(self, guess: FloatArray) -> FloatArray:
-        """A consistent state in the region, near a guess.
+        """Returns a consistent state in the region, near a guess.
 
         Raises:
             InconsistentStateError: No consistent state is found in the region.
@@ -73,7 +73,7 @@ class ConsistentRegion:
         return state
 
     def draw(self, guess: FloatArray) -> FloatArray:
-        """A consistent state with the bounded states of a guess, if there is one.
+        """Returns a consistent state with the bounded states of a guess, if there is one.
 
         So random values cover the region, although the projection changes other states.
 
@@ -137,7 +137,7 @@ class ConsistentRegion:
     def _downhill(
         self, region: Region, state: FloatArray, gradient: FloatArray, width: FloatArray
     ) -> FloatArray:
-        """Against the gradient, along N* and not out of the box, in units of the box."""
+        """Returns the descent direction along N* that stays in the box, in units of the box."""
         rows = self.manifold.gradients(state) * width
         slope = gradient * width
         fixed = np.zeros(state.size, dtype=bool)
@@ -155,7 +155,7 @@ class ConsistentRegion:
 
     @staticmethod
     def _room(region: Region, state: FloatArray, step: FloatArray) -> float:
-        """The factor by which a step reaches the edge of the box."""
+        """Returns the factor by which a step reaches the boundary of the box."""
         edge = np.where(step < 0.0, region.low, region.high)
         moving = step != 0.0
         with np.errstate(over="ignore"):

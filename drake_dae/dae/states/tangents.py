@@ -9,7 +9,7 @@ from drake_dae.trace.round_off import unit_rows
 
 
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
-    """A basis T, orthonormal in states relative to their scale, shape (n, n - k).
+    """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k).
 
     Args:
         gradients: Of the constraints, independent rows, shape (k, n).
@@ -20,7 +20,7 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
-    """States that are coordinates, (n - k,), and the derivatives of all by them, (n, n - k).
+    """Returns n - k states that are coordinates, and the derivatives of all states by them.
 
     Unlike an orthonormal basis this one leaves a triangular system triangular. The arguments are
     those of `tangent`.

@@ -13,7 +13,7 @@ from drake_dae.errors import AssumptionError
 
 
 class ViolationKind(Enum):
-    """The kind of a violation; the value is the remedy."""
+    """The kinds of violations; the enum value is the remedy."""
 
     COUNT = "Remove the redundant ones"
     CONSTRAINT_DEGREE = (
@@ -63,7 +63,7 @@ class ViolationKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """How a system violates one of Assumptions (1)-(5).
+    """A violation of one of Assumptions (1)-(5) by a system.
 
     Attributes:
         assumption: Its number in the paper.
@@ -105,7 +105,7 @@ class Violation:
         )
 
     def error(self) -> AssumptionError:
-        """The exception for this violation."""
+        """Returns the exception for this violation."""
         return AssumptionError(str(self), self.assumption, self.state, self)
 
     def _statement(self) -> str:
@@ -199,7 +199,7 @@ def rank_violation(
     vanishing: tuple[int, ViolationKind],
     dependent: tuple[int, ViolationKind],
 ) -> Violation | None:
-    """The violation by a singular matrix: one assumption if a whole row vanishes, else another.
+    """Returns the violation by a singular matrix: one kind if a whole row vanishes, else another.
 
     Args:
         margin: The margin of the matrix; None if there is no matrix.

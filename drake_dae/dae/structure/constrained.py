@@ -70,7 +70,7 @@ class ConstraintStructure:
     def constraint_matrix(
         self, state: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
+        """Returns A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
 
         Args:
             state: x, shape (n,).
@@ -84,7 +84,7 @@ class ConstraintStructure:
     def trace(
         self, name: str, value: ca.SX, needs_control: bool, doubt: ca.SX | None = None
     ) -> TracedFunction:
-        """An expression on N* as a function of state, control and parameters.
+        """Compiles an expression on N* to a function of state, control and parameters.
 
         Args:
             name: Its name in messages.
@@ -136,7 +136,7 @@ def find_constraint_structure(
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """The constraint structure of a system: the argument if it is one, otherwise found here.
+    """Returns the constraint structure of a system: the argument, or a new one if None.
 
     Args:
         owner: The caller's name in messages.
@@ -156,7 +156,7 @@ def constraint_structure_of(
 def checked_structure(
     owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
 ) -> Kind:
-    """The structure, if it is one of this system.
+    """Checks that a structure belongs to a system, and returns it.
 
     Raises:
         ModelError: It is not a structure of this kind, or that of another system.
@@ -174,7 +174,7 @@ def checked_structure(
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """The states near which consistent ones are sought, shape (count + 1, n).
+    """Returns initial guesses of consistent states, shape (count + 1, n).
 
     Raises:
         AssumptionError, ModelError: The system or an argument makes no sense.
@@ -188,7 +188,7 @@ def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) 
 def examine_constraints(
     system: DaeSystem, guesses: FloatArray, region: Region | None = None
 ) -> tuple[ConstraintStructure, Samples]:
-    """Finds r_1, ..., r_m and A(x) of a system that `check_system` takes.
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts.
 
     Args:
         system: The system (1)-(3).
@@ -229,7 +229,7 @@ def examine_constraints(
 
 
 def check_system(system: DaeSystem) -> None:
-    """Refuses a system with too many constraints, or with an invalid mass matrix.
+    """Checks the number of constraints and the mass matrix of a system.
 
     Raises:
         AssumptionError: There are more constraints than states.
@@ -242,7 +242,7 @@ def check_system(system: DaeSystem) -> None:
 
 
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:
-    """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
+    """Returns the violation of Assumption (1) or (2) by a singular A(x); None if it is regular."""
     causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
     signals, margin = structure.system.constraint_output_signals, structure.constraint_margin
     violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
@@ -273,7 +273,7 @@ def with_numbers(
     states: FloatArray,
     matrix: ca.SX,
 ) -> Violation | None:
-    """The violation by a matrix, including parameters other than the defaults.
+    """Returns the violation by a matrix, also for other parameters than the defaults.
 
     Args:
         violation: The violation with the defaults; None if there is none.
@@ -313,7 +313,7 @@ def with_numbers(
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
-    """The actual violation if redundant constraints led to a singular configuration.
+    """Returns the actual violation if redundant constraints led to a singular configuration.
 
     Off N* they are overdetermined, and only singular configurations satisfy them.
     """

@@ -21,7 +21,7 @@ that is a constraint times a factor."""
 
 @dataclass(frozen=True)
 class Combination:
-    """A row that is a combination of others: row = sum factors_j row_j.
+    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j.
 
     Attributes:
         name: The constraint or the output whose row it is.
@@ -45,7 +45,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Dependence:
-    """How the constraints depend on each other where A(x) is singular.
+    """The linear dependence of the constraints where A(x) is singular.
 
     Attributes:
         combinations: The rows that follow from those before them: of the gradients of the
@@ -63,7 +63,7 @@ class Dependence:
 def find_dependence(
     manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
 ) -> Dependence:
-    """How the constraints depend on each other at a state where A(x) is singular.
+    """Finds how the constraints depend on each other at a state where A(x) is singular.
 
     Args:
         manifold: N*.
@@ -97,7 +97,7 @@ def find_dependence(
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
-    """The constraints k_i whose gradients follow from those before them, at all of some states."""
+    """Returns the constraints whose gradients depend on those of earlier ones at all samples."""
     system = samples.system
     if not samples.dependent(system.k):
         return ()
@@ -107,7 +107,7 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
 
 
 def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
-    """Which of some outputs follow from the constraints, by their gradients."""
+    """Generates the outputs that are functions of the constraints, by their gradients."""
     system, manifold = samples.system, samples.manifold
     constraints = [signal.name for signal in manifold.residual_signals]
     for row, signal in enumerate(system.output_signals):
@@ -128,7 +128,7 @@ def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 def combinations_of(
     names: list[str], values: list[FloatArray], least: float = SINGULAR
 ) -> list[Combination]:
-    """The rows that follow from those before them at the first of some states.
+    """Returns the rows that depend on earlier rows at the first of some states.
 
     Args:
         names: The names of the rows.

@@ -21,16 +21,16 @@ DOUBTFUL = 1e-13
 
 
 class Elsewhere:
-    """Rows that are zero for the default parameters and not for others, by constraint or output."""
+    """Constraints and outputs whose row is zero at the default parameters but not at others."""
 
     def __init__(self) -> None:
         self._violations: dict[int, Violation] = {}
 
     def look(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
-        """Tests whether a row that is zero for the default parameters is zero for others as well.
+        """Tests a row that is zero at the default parameters at other parameters, and records it.
 
         Args:
-            index: The constraint or output of the row; the first row that is not zero is kept.
+            index: The constraint or output of the row; the first violation of each is recorded.
             violation: The violation if the row is not zero.
             samples: The states at which it is zero.
             row: The row at a state, with values of all parameters.
@@ -65,7 +65,7 @@ class Elsewhere:
             )
 
     def refuse(self, index: int) -> None:
-        """Refuses a constraint or output whose degree differs for other parameters.
+        """Checks that the degree of a constraint or output is the same for other parameters.
 
         Raises:
             AssumptionError: The degree differs; the message has the deciding numbers.
@@ -74,6 +74,6 @@ class Elsewhere:
             raise self._violations[index].error()
 
     def deciding(self, indices: Sequence[int]) -> Deciding | None:
-        """The deciding numbers for constraints or outputs on which nothing acts at the defaults."""
+        """Returns the parameters for which an input acts on one of some constraints or outputs."""
         violations = (self._violations[i] for i in indices if i in self._violations)
         return next((violation.deciding for violation in violations), None)

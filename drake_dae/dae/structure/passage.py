@@ -39,7 +39,7 @@ length NEAREST if it is nearer). With a larger change the system is almost at re
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """The motion of a system on N* through a singular configuration that it crosses.
+    """The motion of a system on N* through a singular configuration.
 
     Let n be the combinations of constraints whose gradients vanish in the configuration, n^T C = 0
     with the gradients C of the last derivatives c = L_f^(r_i - 1) k_i. There n^T c' = 0 does not
@@ -64,7 +64,7 @@ class Passage:
     def motion(
         self, state: FloatArray, control: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """x' and v at a state next to a singular configuration, shapes (n,) and (m,).
+        """Returns x' and v at a state close to a singular configuration, shapes (n,) and (m,).
 
         Returns:
             None if the system does not cross one there: its gradients are independent, or stay
@@ -185,7 +185,7 @@ class Passage:
 
     @cached_property
     def doubt(self) -> ca.SX | None:
-        """Negative where `motion` is needed; None if no singular configuration can be crossed."""
+        """An expression that is negative where `motion` is needed; None if it never is."""
         elimination, system = self.structure.elimination, self.structure.system
         if set(self.structure.constraint_degrees) != {2}:
             return None

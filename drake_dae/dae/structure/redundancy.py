@@ -27,7 +27,12 @@ this fraction of the best."""
 
 @checked(ModelError)
 def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> DaeSystem:
-    """The same motion with fewer constraints: those that follow from others are left out.
+    """Returns a system with the same motion in which redundant constraints are removed.
+
+    Removing constraint i also removes the constraint input v_i. The motion is unchanged, because
+    the remaining columns of g span the same space. The forces of the remaining constraints depend
+    on this choice: (1)-(3) determine the sum g(x) v, but not how it is distributed among redundant
+    constraints.
 
     A constraint goes with the constraint input of the same number. The motion is the same, since
     the inputs that remain act in all directions in which those that go did. The forces of the
@@ -61,7 +66,7 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
 
 
 def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
-    """The constraints that follow from those before them at all states around the nominal one."""
+    """Returns the constraints that depend on earlier ones at all states near the nominal state."""
     try:
         return redundant_constraints(consistent_samples(system))
     except InconsistentStateError:
@@ -69,12 +74,12 @@ def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
 
 
 def consistent_samples(system: DaeSystem) -> Samples:
-    """Consistent states around the nominal one, by the constraints k_i alone."""
+    """Returns random states around the nominal state at which all constraints k_i hold."""
     return Samples(_Redundant(system), draw(system, None, 12, 0))
 
 
 class _Redundant(Manifold):
-    """The states at which all constraints k_i hold, redundant ones included.
+    """The states at which all constraints k_i hold, including redundant ones.
 
     Near these states the gradients of redundant constraints are nearly dependent, so that Newton
     steps become very long or lead to a singular configuration. Levenberg-Marquardt steps with a
@@ -116,7 +121,7 @@ class _Redundant(Manifold):
 
 
 def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
-    """The constraints that remain without those of the given names.
+    """Returns the indices of the constraints whose names are not listed.
 
     Raises:
         ModelError: No constraint has that name.
@@ -129,7 +134,7 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 
 
 def independent_constraints(samples: Samples) -> list[int]:
-    """The constraints that can stay, chosen so that they are well independent at all samples."""
+    """Selects constraints that are well independent of each other at all sampled states."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
     remainders = [equilibrated(gradient) for (gradient,) in values]
     most = min(_rank(gradient) for (gradient,) in values)
@@ -146,7 +151,7 @@ def independent_constraints(samples: Samples) -> list[int]:
 
 
 def with_constraints(system: DaeSystem, remaining: list[int]) -> DaeSystem:
-    """A system with some of its constraints and their inputs alone."""
+    """Returns a system with only some of its constraints and their inputs."""
     signals = tuple(system.constraint_input_signals[i] for i in remaining)
     names = {signal.name for signal in signals}
     return replace(
@@ -162,7 +167,7 @@ def with_constraints(system: DaeSystem, remaining: list[int]) -> DaeSystem:
 
 
 def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None:
-    """Refuses to leave out constraints that are not redundant."""
+    """Checks that the motion does not change if some constraints are removed."""
     system = samples.system
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
     gradients = samples.values(

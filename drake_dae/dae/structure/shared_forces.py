@@ -31,7 +31,7 @@ def share_forces(
     *,
     compliances: Mapping[str, float] | None = None,
 ) -> DaeSystem:
-    """The same motion with fewer constraints, and the forces of all by least squares.
+    """Removes redundant constraints and distributes the forces among all by least squares.
 
     On N* the input of a constraint that is left out acts as a combination of those that stay, E^-1
     g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all v_all =
@@ -98,7 +98,7 @@ def share_forces(
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
-    """The states at which the redundant constraints that were left out hold; None without any.
+    """Returns the states at which the removed redundant constraints hold; None without any.
 
     It contains N*, and possibly states of another assembly mode.
     """

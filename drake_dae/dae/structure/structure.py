@@ -30,7 +30,7 @@ from drake_dae.trace.factorization import Factorization, nearest_solution
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Structure(ConstraintStructure):
-    """The structure that the paper assumes, by Assumptions (1)-(5), found for one system.
+    """The structure of one system by Assumptions (1)-(5): relative degrees, A(x), B(x), margins.
 
     Attributes:
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
@@ -61,7 +61,7 @@ class Structure(ConstraintStructure):
 
     @property
     def layout(self) -> DerivativeLayout:
-        """How references and output chains are stacked."""
+        """The layout of reference vectors and output chains."""
         return DerivativeLayout(self.output_degrees)
 
     @property
@@ -76,11 +76,11 @@ class Structure(ConstraintStructure):
 
     @property
     def chain(self) -> ca.SX:
-        """The output chains below each other, as `layout` stacks them, shape (sum mu_i, 1)."""
+        """The output chains in one column, in the order of `layout`, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
     def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """x' and v under the control of `control_for`, solved for along with it.
+        """Returns x' and v under the control of `control_for`, solved together with the control.
 
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
@@ -103,7 +103,7 @@ class Structure(ConstraintStructure):
         return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
+        """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
 
         If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
@@ -124,7 +124,7 @@ class Structure(ConstraintStructure):
         return control, pivot
 
     def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The control of `control_for` by B(x) itself, where A(x) is regular.
+        """Returns the control of `control_for`, computed with B(x); A(x) must be regular.
 
         Args:
             commanded: ubar of (28), shape (p, 1).
@@ -172,7 +172,7 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The structure of a system: the argument if it is one, otherwise found here.
+    """Returns the structure of a system: the argument, or the result of `find_structure` if None.
 
     Args:
         owner: The caller's name in messages.
@@ -191,7 +191,7 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, Violation | None]:
-    """Finds the structure as `find_structure` does, but also where B(x) is singular.
+    """Finds the structure as `find_structure`, but also returns it where B(x) is singular.
 
     Returns:
         The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
@@ -212,7 +212,7 @@ def examine_structure(
 
 
 def why_no_law(system: DaeSystem) -> str:
-    """Why a system has no law (28), by its numbers of inputs and outputs; empty if it may have."""
+    """Returns why a system has no law (28) by its numbers of inputs and outputs, else ""."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
         return "there is no control input, so no output can be controlled"
@@ -231,7 +231,7 @@ def why_no_law(system: DaeSystem) -> str:
 
 
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
-    """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
+    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular.
 
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
@@ -263,7 +263,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 
 def _check_metric(samples: Samples) -> None:
-    """Refuses an invalid `control_metric`.
+    """Checks the `control_metric`.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
@@ -281,7 +281,7 @@ def _check_metric(samples: Samples) -> None:
 
 
 def control_violation(structure: Structure) -> Violation | None:
-    """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
+    """Returns the violation of Assumption (4) or (5) by a singular B(x); None if it is regular."""
     causes = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
     margin, degrees = structure.control_margin, structure.output_degrees
     signals = structure.system.output_signals

@@ -20,7 +20,7 @@ def called_functions(
     labels: Mapping[str, Any],
     fields: Sequence[str],
 ) -> dict[str, Any]:
-    """The fields of a `DaeSystem` whose functions are given in Python; see `from_functions`.
+    """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`.
 
     Args:
         state: Names (or Signals) of the states, or their number n.

@@ -16,7 +16,7 @@ from drake_dae.trace.compiled import check_choice
 
 
 def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a system, converted and checked.
+    """Checks the fields of a system and returns them converted.
 
     Args:
         arguments: Name -> value of every field; see `DaeSystem`.

@@ -31,7 +31,7 @@ MOST = 8
 
 @dataclass(frozen=True)
 class UnilateralInput:
-    """A constraint input that can only push.
+    """A constraint input that must not be negative: a contact force that can only push.
 
     Attributes:
         force: The name of the constraint input, which acts on the constraint in the same place.
@@ -43,7 +43,7 @@ class UnilateralInput:
 
 
 class PainleveOutcome(Enum):
-    """The number of motions in a Painleve paradox; the value describes it."""
+    """The number of possible motions in a Painleve paradox; the enum value is a description."""
 
     INCONSISTENT = (
         "inconsistent: no compressive force maintains the contact, and without a force there "
@@ -57,7 +57,7 @@ class PainleveOutcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """The contacts of a system, where friction acts on one of them.
+    """The unilateral contacts of a system in which at least one contact has friction.
 
     Args:
         owner: The name of the system, for messages.
@@ -109,7 +109,7 @@ class Contacts:
         }
 
     def without_friction(self, matrix: ca.SX) -> ca.SX:
-        """An expression with all coefficients of friction zero."""
+        """Returns an expression with all coefficients of friction set to zero."""
         if not self:
             return matrix
         # Contacts may share a coefficient.
@@ -117,7 +117,7 @@ class Contacts:
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:
-        """The smallest principal minor of A(x), each divided by its value without friction.
+        """Returns the smallest principal minor of A(x), relative to its value without friction.
 
         Minors are those of sets of contacts with all other constraints, of which none can open. The
         least ratio is the same in any order of the contacts and in any units, 1 without friction,
@@ -165,7 +165,7 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
 
 
 def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
-    """The smallest s > 0 for which a principal minor of A_0 - s D is zero, infinite if none is.
+    """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity.
 
     Args:
         without: A_0, A(x) without friction, shape (m, m).
@@ -188,7 +188,7 @@ def painleve_outcome(
     size: FloatArray,
     rows: Sequence[int],
 ) -> PainleveOutcome | None:
-    """The outcome of a Painleve paradox, by the linear complementarity problem of all sets.
+    """Determines the outcome of a Painleve paradox by the linear complementarity problem.
 
     Args:
         matrix: A(x), shape (m, m).
@@ -227,7 +227,7 @@ def painleve_outcome(
 
 
 def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
-    """Every set of contacts, each together with all bilateral constraints."""
+    """Generates every set of contacts, each together with all bilateral constraints."""
     always = [i for i in range(size) if i not in rows]
     counts = range(0 if with_none else 1, len(rows) + 1)
     for chosen in chain.from_iterable(combinations(rows, count) for count in counts):

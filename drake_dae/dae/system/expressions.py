@@ -18,7 +18,7 @@ from drake_dae.trace.smoothness import find_flaw
 
 
 def as_expression(owner: str, key: str, value: Any) -> ca.SX:
-    """An SX matrix from an SX, a number, an array, or a (nested) list of these.
+    """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix.
 
     Args:
         owner: The name of the system, for messages.
@@ -47,7 +47,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 def as_functions(
     owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """The functions of (1)-(3) and others as expressions of the right shapes.
+    """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them.
 
     Args:
         owner: The name of the system, for messages.
@@ -99,7 +99,7 @@ def _misshapen(
 
 
 def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, other: ca.SX) -> None:
-    """Refuses expressions that can be evaluated but are not smooth."""
+    """Checks that expressions are smooth; CasADi also evaluates those that are not."""
     if find_flaw(ca.veccat(*values.values()), state, other) is None:
         return
     for key, value in values.items():
@@ -113,7 +113,7 @@ def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, oth
 
 
 def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
-    """Refuses names that occur twice.
+    """Checks that no name occurs twice.
 
     Raises:
         ModelError: A name occurs twice.
@@ -124,7 +124,7 @@ def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
 
 
 def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
-    """Signals from a list of these, or of names of signals without unit.
+    """Converts a list of signals, or of names of signals without unit, to signals.
 
     Raises:
         ModelError: An entry is neither.
@@ -139,7 +139,7 @@ def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
 def call(
     owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
 ) -> ca.SX:
-    """The expression that a user's function of symbols returns; empty without a function.
+    """Calls a user's function with symbols and returns its expression; empty without a function.
 
     Args:
         owner: The name of the system, for messages.
@@ -171,7 +171,7 @@ def call(
 
 
 def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    """The text of an error in a user's function, and what it means here."""
+    """Explains an error in a user's function."""
     text = str(error)
     try:
         signature(function).bind(*arguments)

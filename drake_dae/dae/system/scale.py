@@ -84,7 +84,7 @@ def natural_scale(
     parameters: tuple[ca.SX, FloatArray],
     nominal: FloatArray,
 ) -> FloatArray:
-    """Half the sizes of the states at which the terms of the equations (1)-(3) are equally large.
+    """Computes half the state sizes for which the terms of the equations (1)-(3) are equally large.
 
     The equations are expanded in Taylor series around the nominal state. A term c x_i^a x_j^b has
     the size |c| s_i^a s_j^b, where s are the unknown sizes; a derivative x_i' has the size w s_i
@@ -223,7 +223,7 @@ def _linear_part(
 
 
 def spread_about(state: FloatArray, scale: FloatArray) -> FloatArray:
-    """The default standard deviation of random states around one, shape (n,): 0.1 of their scale.
+    """Returns the default standard deviation of random states around a state: 0.1 of the scale.
 
     It is a hundredth of a value above 10 scales, and a tenth of one below 1e-3 scales that is not
     round-off.

@@ -27,13 +27,13 @@ COARSE = 16
 
 
 class AlongCurve:
-    """The tracking law's own feedforward along a curve, equations (28), (35) without error.
+    """The feedforward of the tracking law along a curve: (28), (35) without tracking error.
 
-    On Z(R), where all outputs are on their references, (28) is u = B^-1 (-a + r^(mu)), and (25) is
-    v = alpha + beta u. With r' = r_s w, r'' = r_ss w^2 + r_s a both are affine in a at a given
-    speed w = s', and affine in (a, b), b = w^2, for a rigid robot without friction:
+    On Z(R), where all outputs are on their references, (28) is u = B^-1 (r^(mu) - a(x)), and (25)
+    is v = alpha + beta u. With r' = r_s s', r'' = r_ss s'^2 + r_s s'' both are affine in s'' for
+    a constant speed w = s'. For a rigid robot without friction they are affine in s'' and s'^2:
 
-        u = m(s) b + n(s) a + c(s).
+        u = m(s) s'^2 + n(s) s'' + c(s).
 
     Args:
         structure: The structure of the system: degrees 0 and 2, no zero dynamics.
@@ -67,7 +67,7 @@ class AlongCurve:
         self._values = ManyPoints(values, self.system.compiled)
 
     def reference(self, piece: Piece, w: FloatArray, a: FloatArray) -> FloatArray:
-        """R at the points for speeds and accelerations along the curve, (N + 1, sum (mu_i + 1))."""
+        """Returns R at the points for speeds and accelerations, shape (N + 1, sum (mu_i + 1))."""
         rows, first = piece.values.copy(), self.layout.lowest[self.layout.dynamic]
         rows[:, first + 1] = piece.tangents * w[:, None]
         rows[:, first + 2] = piece.curvatures * w[:, None] ** 2 + piece.tangents * a[:, None]
@@ -76,7 +76,7 @@ class AlongCurve:
     def states_at_rest(
         self, piece: Piece, guess: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The states on Z(R) at rest at the points, and their derivatives by the speed w there.
+        """Returns the states on Z(R) at rest at the points, and their derivatives by the speed w.
 
         Returns:
             x, shape (N + 1, n), and dx/dw at w = 0, shape (N + 1, n).
@@ -110,7 +110,7 @@ class AlongCurve:
         return states, self._solved(gradients, goals)
 
     def states(self, rows: FloatArray, start: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The states on Z(R) of rows of R near given ones, by Newton's method, shape (k, n).
+        """Returns states on Z(R) for rows of R, by Newton's method from guesses, shape (k, n).
 
         Raises:
             ReferenceSignalError: It does not converge.
@@ -136,11 +136,11 @@ class AlongCurve:
             raise ReferenceSignalError(_SINGULAR.format(self.system.name)) from None
 
     def values(self, states: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The limited signals for states on Z(R) and rows of R, shape (k, number of them)."""
+        """Returns the limited signals for states on Z(R) and rows of R, shape (k, signals)."""
         return self._values(states, rows, parameters)[0]
 
     def limited_states(self, states: FloatArray) -> FloatArray:
-        """The limited states, shape (k, number of them)."""
+        """Returns the limited states, shape (k, limited states)."""
         return states[:, self.limited.states]
 
 

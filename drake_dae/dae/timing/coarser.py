@@ -17,7 +17,7 @@ CLOSE = 1e-6
 
 
 def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomials:
-    """A table with fewer and longer pieces.
+    """Returns a table with fewer and longer pieces.
 
     A longer piece has r, r' and r'' of the given table at both ends, so that the result has as many
     continuous derivatives. Outputs that have no derivatives are interpolated at up to six times.
@@ -70,7 +70,7 @@ def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomial
 def _furthest(
     joined: Callable[[int, int], FloatArray | None], i: int, end: int
 ) -> tuple[int, FloatArray | None]:
-    """The furthest break up to which pieces are joined, by doubling and halving."""
+    """Finds the furthest break up to which pieces are joined, by doubling and bisection."""
     good, row, step = i + 1, None, 2
     while i + step <= end and (polynomials := joined(i, i + step)) is not None:
         good, row, step = i + step, polynomials, 2 * step

@@ -35,7 +35,7 @@ Times = Callable[[FloatArray], FloatArray]
 
 
 def at_times(references: Sequence[Reference], layout: DerivativeLayout) -> Times:
-    """References as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
+    """Returns references as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
     parts = [_one_at_times(*part) for part in with_degrees(references, layout.degrees)]
     return lambda times: np.hstack([part(times) for part in parts])
 
@@ -80,7 +80,7 @@ class Piece:
 
 
 class Curve:
-    """The curve of a reference.
+    """The curve of a reference, by the distance along it.
 
     Args:
         references: The references, in the order of the outputs.
@@ -170,7 +170,7 @@ class Curve:
         ]
 
     def _turn(self, times: FloatArray, rates: FloatArray, k: int, after: int) -> float | None:
-        """The time between two samples at which the reference rests and turns."""
+        """Returns the time between two samples at which the reference rests and turns, if any."""
         from scipy.optimize import brentq, minimize_scalar  # It takes long to load.
 
         rate, next_rate = rates[k], rates[after]

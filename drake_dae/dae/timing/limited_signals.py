@@ -9,7 +9,7 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 
 
 class LimitedSignals:
-    """Controls, rates of states, constraint forces and friction cones that have limits.
+    """The controls, rates of states, constraint forces and friction cones that have limits.
 
     On N* they are y = y_0(x) + Y(x) u: x' = f* + h* u by (9), (10), and v = alpha + beta u by (25).
 
@@ -58,7 +58,7 @@ class LimitedSignals:
         self.state_low, self.state_high = low[self.states], high[self.states]
 
     def values(self, control: ca.SX) -> ca.SX:
-        """The signals for a control, shape (k, 1)."""
+        """Returns the limited signals for a control, shape (k, 1)."""
         motion = self._structure.derivatives
         rate, force = (  # (25), (35)
             ca.substitute(motion.expand(unknown), motion.control, control)
@@ -68,13 +68,13 @@ class LimitedSignals:
         return ca.densify(signals[self._rows, :])
 
     def by_control(self) -> tuple[ca.SX, ca.SX]:
-        """y_0(x), shape (k, 1), and Y(x), shape (k, p)."""
+        """Returns y_0(x), shape (k, 1), and Y(x), shape (k, p)."""
         motion = self._structure.derivatives
         free, by = motion.by_control(ca.vertcat(motion.rate, motion.constraint_input))
         return self._chosen(free, by)
 
     def rates_of_states(self) -> tuple[ca.SX, ca.SX]:
-        """x' of the limited states as a + B u, shapes (k, 1) and (k, p)."""
+        """Returns a and B of x' = a + B u of the limited states, shapes (k, 1) and (k, p)."""
         motion = self._structure.derivatives
         free, by = motion.by_control(motion.rate)
         return ca.densify(free[self.states, :]), ca.densify(by[self.states, :])

@@ -11,7 +11,7 @@ BLOCK = 128
 
 
 class ManyPoints:
-    """A CasADi function, called at many points without conversions between its matrices and NumPy.
+    """A CasADi function that is evaluated at many points without conversions of matrices.
 
     Args:
         function: The function, with dense inputs and outputs.
@@ -31,7 +31,7 @@ class ManyPoints:
             self._buffer.set_res(index, array.reshape(-1).data)
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
-        """The results at all points.
+        """Evaluates the function at all points.
 
         Args:
             arguments: One for each input: a row for each point, shape (k, size), or one row for

@@ -93,7 +93,7 @@ class TimeProfile:
 
     @property
     def shares(self) -> dict[str, float]:
-        """What limits the motion, with its share of the time, the largest first."""
+        """Name of what limits the motion -> its fraction of the time, the largest first."""
         sums: dict[str, float] = {}
         for part in self.pieces:
             for cause, time in zip(part.limiting.tolist(), np.diff(part.times), strict=True):
@@ -104,7 +104,7 @@ class TimeProfile:
 
 @checked(ReferenceSignalError)
 class PathTiming:
-    """The shortest motions along the curves of references within limits, from rest to rest.
+    """Computes the shortest motions along the curves of references within limits.
 
     A reference r(t) is taken as a curve r(s), see `dae.timing.curve`. For any s(t) the reference
     r(s(t)) is admissible, so that errors obey (30), (31) whatever s does. With b = s'^2 and a = s''
@@ -142,7 +142,7 @@ class PathTiming:
         largest_rate: float | None = None,
         points: int = 1000,
     ) -> TimeProfile:
-        """The shortest motion along the curve of a reference.
+        """Returns the shortest motion along the curve of a reference.
 
         A force is that of the reference at s. Where nothing moves, time passes as in the reference;
         a pause at the end in which no output changes is omitted. Limits of speed and acceleration
@@ -196,7 +196,7 @@ class PathTiming:
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class TimeOptimalReference(PiecewiseReference):
-    """The reference of a profile, for all outputs, by the time of the motion.
+    """The reference of a time-optimal profile, for all outputs, over the time of the motion.
 
     Before and after, the values are constant. r'' is continuous except at rests, and accurate to
     5e-4 of its largest value; forces have no derivatives.

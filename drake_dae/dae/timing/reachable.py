@@ -22,7 +22,7 @@ from drake_dae.dae.system.layout import Indices
 
 @dataclass(frozen=True, eq=False)
 class LinearLimits:
-    """alpha a + beta b <= 1, k of them at each of N + 1 points; 0 a + 0 b where there is none.
+    """The limits alpha a + beta b <= 1, k of them at each of N + 1 points.
 
     Attributes:
         alpha, beta: Shape (N + 1, k).
@@ -34,7 +34,7 @@ class LinearLimits:
 
 @dataclass(frozen=True, eq=False)
 class FastestMotion:
-    """The fastest motion.
+    """The fastest motion from rest to rest.
 
     Attributes:
         b: s'^2 at the points, shape (N + 1,).
@@ -51,7 +51,7 @@ class FastestMotion:
 
 @np.errstate(all="ignore")  # Without any limit b is infinite.
 def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray) -> FastestMotion:
-    """The fastest motion from rest to rest.
+    """Computes the fastest motion from rest to rest.
 
     Args:
         points: s_0, ..., s_N, increasing, shape (N + 1,).

@@ -25,7 +25,7 @@ CHECKED = 20
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What a line limits.
+    """The signal that a row limits.
 
     Attributes:
         name: The signal.
@@ -39,7 +39,7 @@ class LimitRow:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The limit as text."""
         return f"{self.side} {self.name}".strip()
 
 
@@ -88,7 +88,7 @@ class LimitRows:
         return (*rows, LimitRow("rate of the reference's time", "largest", ""))
 
     def lines(self, before: FloatArray | None) -> LinearLimits:
-        """The lines; where signals are not linear, those about a profile before.
+        """Returns the rows; where signals are not linear, those about a previous profile.
 
         Args:
             before: b of the profile before, shape (N + 1,), at which lines are exact; None for the
@@ -114,7 +114,7 @@ class LimitRows:
         return LinearLimits(np.hstack(of_a), np.hstack(of_b))
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
-        """The largest b at each point, and what limits it as a place in `names`.
+        """Returns the largest b at each point, and its cause as an index into `names`.
 
         Args:
             rate: The largest rate of the reference's time.
@@ -146,7 +146,7 @@ def rows_along(
     parameters: FloatArray,
     tools: Sequence[ToolLimits],
 ) -> LimitRows:
-    """The limited signals along a piece.
+    """Computes the limited signals along a piece.
 
     Args:
         along: What the system needs along curves.
@@ -185,7 +185,7 @@ def rows_along(
 
 
 def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> None:
-    """Refuses friction that needs more than the limits in slow motion.
+    """Checks that friction in slow motion is within the limits.
 
     Raises:
         ReferenceSignalError: Which signal, and where.
@@ -203,7 +203,7 @@ def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> No
 
 
 def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: FloatArray) -> None:
-    """Refuses a piece on which a rest is not within the limits.
+    """Checks that the system is within the limits at rest on a piece.
 
     Raises:
         ReferenceSignalError: Which signal, where, and by how much.

@@ -8,7 +8,7 @@ from drake_dae.arrays import FloatArray
 def smoothed(
     points: FloatArray, b: FloatArray, a: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """b, a and times at the points, with a straight in time between them.
+    """Returns b, a and times at the points, for an acceleration that is linear in time.
 
     The acceleration at a point is the mean of those beside it, weighted by their intervals d,
 

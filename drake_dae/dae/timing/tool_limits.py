@@ -18,7 +18,7 @@ DIRECTIONS = 25
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """|r'| and |r''| of a path: linear bounds on (a, b).
+    """The limits |r'| and |r''| of a path as linear bounds on (a, b).
 
     Attributes:
         largest: The largest b by the speed, shape (N + 1,).
@@ -33,7 +33,7 @@ class ToolLimits:
 def tool_limits(
     references: Sequence[Reference], piece: Piece, layout: DerivativeLayout
 ) -> list[ToolLimits]:
-    """The limits of all paths with any.
+    """Returns the limits of all paths that have limits.
 
     |r''| <= A is a circle in the plane of the tangential and the normal part,
 

@@ -28,7 +28,7 @@ STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIF
 
 
 def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
-    """The structure of a law's model that demands, instead of y_i^(r_i) = 0,
+    """Returns the structure of a law's model that demands, instead of y_i^(r_i) = 0,
 
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
 
@@ -103,7 +103,7 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
 def contact_damping(
     stiffness: float, mobility: float, sample_time: float = 0.0, delay: int = 1
 ) -> float:
-    """The damping c for which a contact of given stiffness settles fastest.
+    """Returns the damping c for which a contact of the stated stiffness settles fastest.
 
     On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
 
@@ -150,7 +150,7 @@ def contact_damping(
 
 
 def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
-    """`contact_damping` without a warning outside its range of validity."""
+    """Acts as `contact_damping`, without a warning outside the range of validity."""
     for name, value, least in (
         ("stiffness", stiffness, "positive"),
         ("mobility", mobility, "positive"),
@@ -174,7 +174,7 @@ def best_damping(stiffness: float, mobility: float, sample_time: float, delay: i
 def unstable_from(
     frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
 ) -> float | None:
-    """The lowest stiffness at which a contact is unstable, relative to the given one.
+    """Returns the lowest relative stiffness at which a contact is unstable, if there is one.
 
     Args:
         frequency: w = sqrt(A k) of the given stiffness.
@@ -195,7 +195,7 @@ def unstable_from(
 
 
 def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
-    """Warns if a recommended gain is outside its range of validity.
+    """Warns if a recommended gain is outside the range in which it is valid.
 
     Args:
         lost: The result of `unstable_from`.

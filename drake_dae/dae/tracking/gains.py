@@ -17,7 +17,7 @@ from drake_dae.errors import GainError
 @checked(GainError)
 @dataclass(frozen=True, eq=False)
 class FeedbackGains:
-    """The gains of the law (28), and with them the error dynamics (30).
+    """The feedback gains of the law (28), which determine the error dynamics (30).
 
     With the error coordinates e = (e_1, e_1', ..., e_1^(mu_1 - 1), ..., e_p^(mu_p - 1)), shape
     (N,), N = sum mu_i, the law sets
@@ -68,7 +68,7 @@ class FeedbackGains:
 
     @property
     def layout(self) -> DerivativeLayout:
-        """How the error coordinates are stacked."""
+        """The layout of the error coordinates."""
         return DerivativeLayout(self.degrees)
 
     @property
@@ -85,7 +85,7 @@ class FeedbackGains:
         return np.linalg.eigvals(self.error_matrix).astype(complex)
 
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
-        """The exact tracking error exp(E t) e(0) of (30), (31).
+        """Returns the exact tracking error exp(E t) e(0) of (30), (31).
 
         Args:
             times: Times in s after the start, shape (k,).
@@ -142,7 +142,7 @@ Poles = float | complex | Sequence[float | complex]
 
 @checked(GainError)
 def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
-    """Gains K_ij that give each output its own poles: the coefficients of (32).
+    """Designs gains K_ij that assign poles to each output: the coefficients of (32).
 
     Args:
         values: One pole in 1/s for all, or a sequence of mu_i poles for every output, or these per
@@ -161,7 +161,7 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
 def gain_coefficients(
     values: Sequence[float] | Mapping[str, float | Sequence[float]],
 ) -> GainDesign:
-    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first.
+    """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first.
 
     Args:
         values: mu_i numbers for every output, or these per output name, "*" for all others.
@@ -188,7 +188,7 @@ def gain_coefficients(
 
 @checked(GainError)
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
-    """Gains as full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ..., Lambda_6 of (72)-(73).
+    """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73).
 
     Args:
         groups: For each degree mu >= 1 that occurs among the outputs, highest first, the mu
@@ -232,7 +232,7 @@ T = TypeVar("T")
 def _per_output(
     values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
 ) -> list[tuple[str, int, T]]:
-    """The name, degree and given value of each output with a degree above 0."""
+    """Returns name, degree and value of each output with a degree above 0."""
     dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
     if not isinstance(values, Mapping):
         return [(name, degree, values) for name, degree in dynamic]

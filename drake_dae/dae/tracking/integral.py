@@ -43,7 +43,7 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> "IntegralAction":
-        """Integral action on outputs by their names.
+        """Returns the integral action on outputs by their names.
 
         Raises:
             GainError: A name is not that of an output, occurs twice, or is that of a force with
@@ -79,7 +79,7 @@ class IntegralAction:
         return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
 
     def coordinates(self, errors: ca.SX, integral: ca.SX | None = None) -> ca.SX:
-        """The error coordinates with the integrals among them.
+        """Returns the error coordinates, with the integrals among them.
 
         Args:
             errors: (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i, 1).
@@ -94,7 +94,7 @@ class IntegralAction:
         return ca.vertcat(ca.SX(0, 1), *rows)
 
     def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
-        """sigma' = z - r of these outputs, shape (k, 1).
+        """Returns sigma' = z - r of these outputs, shape (k, 1).
 
         Args:
             chain: The output chains, with measured forces where the law uses them.

@@ -25,7 +25,7 @@ from drake_dae.trace.given import result_of
 
 @checked(ModelError)
 class TrackingLaw:
-    """The law (28), which makes the controlled outputs follow a reference:
+    """The tracking law (28), which makes the controlled outputs follow a reference:
 
         u(x, R) = B(x)^-1 (-a(x) + ubar),
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
@@ -144,11 +144,11 @@ class TrackingLaw:
 
     @property
     def inputs(self) -> dict[str, ca.SX]:
-        """The symbols that `function` takes, by their names."""
+        """Name -> symbol of each input of `function`."""
         return dict(self._inputs)
 
     def commanded_derivatives(self, reference: ca.SX) -> ca.SX:
-        """ubar of (28) for a reference, in terms of state and parameters, shape (p, 1).
+        """Returns ubar of (28) for a reference, as an expression of state and parameters, (p, 1).
 
         A measured force is assumed to equal its reference, and integrals to be 0.
 
@@ -167,7 +167,7 @@ class TrackingLaw:
         return ca.substitute(self._ubar, symbols, ca.vertcat(*values.values()))
 
     def trace_motion(self) -> TracedFunction | None:
-        """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
+        """Traces x' and v of a plant that equals the law's model, under the law; see `motion_for`.
 
         Returns:
             A function of what `function` takes; None where there is none.
@@ -190,11 +190,11 @@ class TrackingLaw:
 
     @property
     def degrees(self) -> tuple[int, ...]:
-        """mu_1, ..., mu_p: how many derivatives of each reference the law needs."""
+        """mu_1, ..., mu_p: the number of derivatives of each reference that the law needs."""
         return self.layout.degrees
 
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
-        """The gains for the outputs of this law.
+        """Checks gains, or designs them, for the outputs of this law.
 
         Raises:
             GainError: The gains are for other outputs or degrees, or are no gains.
@@ -220,7 +220,7 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         gains: GainDesign | FeedbackGains | None = None,
     ) -> FloatArray:
-        """The parameters of `function`: those of the system, then the entries of K by columns.
+        """Returns the parameters of `function`: those of the system, then the entries of K.
 
         Args:
             parameters: Values of the system's parameters; the defaults if None.
@@ -263,7 +263,7 @@ class TrackingLaw:
         integral: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """The control u(x, R) of (28).
+        """Returns the control u(x, R) of (28).
 
         Args:
             state: x, shape (n,).
@@ -291,7 +291,7 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         integral: ArrayLike | None = None,
     ) -> FloatArray:
-        """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
+        """Returns (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
 
         The integral of an error stands before it, where the law has one. The arguments are those of
         `control`.
@@ -307,7 +307,7 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         integral: ArrayLike | None = None,
     ) -> FloatArray:
-        """The error that theory predicts after a start from a state, shape (k, p).
+        """Returns the tracking error that the theory predicts after a start, shape (k, p).
 
         Args:
             times: Times in s after the start, shape (k,).

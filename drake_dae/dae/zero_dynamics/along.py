@@ -45,7 +45,7 @@ class StabilityAlong:
 def judge_along(
     flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
 ) -> StabilityAlong:
-    """Whether disturbances of a motion with pinned outputs grow.
+    """Judges whether disturbances of a motion with pinned outputs grow.
 
     Args:
         flow: Along the reference.
@@ -106,7 +106,7 @@ def _by_multipliers(flow: DisturbanceFlow, closed: PeriodicMotion, begin: float)
 def _by_exponents(
     flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
 ) -> StabilityAlong:
-    """The growth of disturbances over the second half of the time."""
+    """Judges by the growth of disturbances over the second half of the time."""
     middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
     middle = min(middle, motion.times.size - 2)
     begin, end = float(motion.times[middle]), float(motion.times[-1])

@@ -39,7 +39,7 @@ renewed."""
 
 
 class MotionLost(Exception):
-    """A motion cannot be followed to the end of an interval."""
+    """The exception for a motion that cannot be followed to the end of an interval."""
 
     def __init__(self, cause: EndCause) -> None:
         super().__init__(cause.value)
@@ -48,7 +48,7 @@ class MotionLost(Exception):
 
 @dataclass(frozen=True, eq=False)
 class StateTransition:
-    """The flow of a state on Z(R) and of its disturbances over an interval of time.
+    """The motion of a state on Z(R) and of its small disturbances over an interval of time.
 
     Attributes:
         state: The state at the end, shape (n,).
@@ -66,7 +66,7 @@ class StateTransition:
 
 
 class DisturbanceFlow:
-    """Carries states on Z(R(t)), and their disturbances, through intervals of time.
+    """Integrates states on Z(R(t)) and their small disturbances.
 
     Args:
         pinned: Z(R).
@@ -86,11 +86,11 @@ class DisturbanceFlow:
         self._reference = reference
 
     def basis(self, state: FloatArray, time: float) -> FloatArray:
-        """T at a state, shape (n, d)."""
+        """Returns the basis T of the tangent space at a state, shape (n, d)."""
         return self.pinned.tangent(state, self.parameters(time), self.scale)
 
     def goal(self, time: float) -> FloatArray:
-        """R at a time, shape (sum (mu_i + 1),).
+        """Returns the reference vector R at a time, shape (sum (mu_i + 1),).
 
         Raises:
             ModelError: The reference has another size, or is not finite.
@@ -99,13 +99,13 @@ class DisturbanceFlow:
         return vector(f"reference({time:g})", goal, self.pinned.layout.reference_size)
 
     def period(self, begin: float, end: float) -> float | None:
-        """The period of reference and parameters, as `find_period` finds it in an interval."""
+        """Returns the period of reference and parameters in an interval; see `find_period`."""
         return find_period(
             lambda time: np.concatenate([self.goal(time), self.parameters(time)]), begin, end
         )
 
     def repeating(self, begin: float, period: float) -> "DisturbanceFlow":
-        """The same flow for a reference and parameters that repeat one period."""
+        """Returns the same flow for a reference and parameters that repeat one period."""
 
         def within(time: float) -> float:
             return begin + (time - begin) % period
@@ -118,7 +118,7 @@ class DisturbanceFlow:
         )
 
     def onto(self, state: FloatArray, time: float) -> FloatArray:
-        """The state on Z(R(t)) next to another one.
+        """Projects a state onto Z(R(t)).
 
         Raises:
             MotionLost: There is none, or it is not near.
@@ -132,7 +132,7 @@ class DisturbanceFlow:
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
     ) -> StateTransition:
-        """The state and its disturbances at the end of an interval.
+        """Integrates a state and its disturbances over an interval.
 
         Raises:
             MotionLost: The motion grows without bound, is too fast, or leaves the domain.
@@ -157,7 +157,7 @@ class DisturbanceFlow:
     def way(
         self, state: FloatArray, begin: float, end: float
     ) -> Iterator[tuple[float, FloatArray]]:
-        """The times and states after each step from a state.
+        """Generates the times and states after each integration step from a state.
 
         Raises:
             MotionLost: As `carry`.
@@ -179,7 +179,7 @@ class DisturbanceFlow:
         end: float,
         budget: Iterator[int],
     ) -> Iterator[tuple[float, FloatArray, FloatArray]]:
-        """The time, the state and the directions after each step of a section.
+        """Generates the time, the state and the directions after each step of a section.
 
         Raises:
             MotionLost: As `carry`; also if the budget of steps is used up.
@@ -238,5 +238,5 @@ class DisturbanceFlow:
 
 
 def _sections(begin: float, end: float) -> Iterator[tuple[float, float]]:
-    """The begin and end of each section of an interval."""
+    """Returns the begin and end of each section of an interval."""
     return pairwise(np.linspace(begin, end, SECTIONS + 1).tolist())

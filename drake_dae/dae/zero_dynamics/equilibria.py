@@ -31,7 +31,7 @@ APART = 1e-6
 
 
 def clock_rates(system: DaeSystem) -> FloatArray:
-    """The rates of states with a constant rate, such as clocks, shape (n,); 0 for others."""
+    """Returns the rates of states with a constant rate, such as clocks, shape (n,); else 0."""
     explicit, rates = system.explicit, np.zeros(system.num_states)
     for i in range(system.num_states):
         if explicit.f[i].is_constant() and not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz()):
@@ -40,7 +40,7 @@ def clock_rates(system: DaeSystem) -> FloatArray:
 
 
 class Equilibria:
-    """The states at rest on Z(R); all arguments are arrays of the right sizes.
+    """The equilibria on Z(R). The arguments of all methods are arrays of the right sizes.
 
     Args:
         pinned: Z(R).
@@ -57,7 +57,7 @@ class Equilibria:
         self._clocks = clock_rates(pinned.system)
 
     def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R with constant outputs, taken at a state.
+        """Returns R with the outputs of a state and zero derivatives.
 
         The state does not determine outputs of degree 0; they are chosen to minimize its rate.
         """
@@ -76,7 +76,7 @@ class Equilibria:
         return reference
 
     def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """An equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
+        """Finds an equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
 
         T spans the tangent space of Z(R), which contains x'. On a continuum of equilibria the
         shortest step is taken.
@@ -138,7 +138,7 @@ class Equilibria:
     def find_all(
         self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The distinct equilibria found from several guesses, shape (k, n).
+        """Finds distinct equilibria from several guesses, shape (k, n).
 
         Of equilibria that are not isolated (with a zero eigenvalue) only the first is returned.
         """
@@ -167,7 +167,7 @@ class Equilibria:
     def eigenvalues(
         self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
     ) -> tuple[ComplexArray, FloatArray, Isolation]:
-        """The eigenvalues at an equilibrium, their errors, and the accuracy of its position."""
+        """Returns the eigenvalues at an equilibrium, their errors, and its accuracy."""
         accuracy = isolation(self.pinned, rest, reference, parameters) or Isolation(0, 0.0)
         values, errors = linearized_eigenvalues(
             self.pinned, self.sizes, rest, reference, parameters
@@ -175,7 +175,7 @@ class Equilibria:
         return values, accuracy.errors(values, errors), accuracy
 
     def unrest(self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray) -> str:
-        """What changes at a point, or that it is singular; empty at a regular equilibrium.
+        """Returns why a point is no regular equilibrium, as text; empty if it is one.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """

@@ -54,7 +54,7 @@ class Isolation:
     radius: float
 
     def errors(self, values: ComplexArray, errors: FloatArray) -> FloatArray:
-        """Errors of eigenvalues, which are 0 in degenerate directions."""
+        """Returns the errors of eigenvalues, widened for degenerate directions."""
         widened = errors.copy()
         smallest = np.argsort(np.abs(values))[: self.degenerate]
         widened[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
@@ -67,7 +67,7 @@ def isolation(
     reference: FloatArray,
     parameters: FloatArray,
 ) -> Isolation | None:
-    """The isolation of the equilibrium at which a search ends; None if there is none.
+    """Returns the accuracy of the equilibrium at which a search ends; None if it is none.
 
     Args:
         pinned: Z(R).
@@ -91,7 +91,7 @@ def isolation(
 
 
 class _Rest:
-    """The rate and its slopes beside a state, in coordinates of Z(R) over their scale."""
+    """The rate close to a state, and its derivatives, in scaled coordinates of Z(R)."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class _Rest:
         return slopes[self._free] * self._scale[self._free] / self._scale[self._free][:, None]
 
     def _beside(self, index: int, distance: float) -> FloatArray:
-        """A state at a distance along a direction, relative to the scale; not put on Z(R)."""
+        """Returns a state at a scaled distance along a direction, not projected onto Z(R)."""
         along = self._moved @ (self._scale[self._free] * self._v[index])
         along /= np.max(np.abs(along) / self._scale)
         return np.asarray(self._state + distance * along)
@@ -142,7 +142,7 @@ class _Rest:
 
     @np.errstate(all="ignore")
     def radius(self, index: int) -> float | None:
-        """How far the equilibrium is in a direction in which it is not isolated.
+        """Returns the distance to which the equilibrium is known in a degenerate direction.
 
         Infinite if the rate vanishes along the whole direction, None if it vanishes nowhere. An
         analytic function that vanishes on a part of a line vanishes on all of it; one that is only

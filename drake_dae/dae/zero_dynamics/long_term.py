@@ -40,7 +40,7 @@ SLOWEST = 1e-4
 
 
 class Behavior(Enum):
-    """The long-term behavior of a motion; the value describes it."""
+    """The long-term behaviors of a motion; the enum value is a description."""
 
     GROWS = "grows without bound"
     SETTLES = "converges to another stable motion"
@@ -79,7 +79,7 @@ class LongTerm:
         return self.behavior.value + periodic
 
     def verdict_on_unstable(self, reason: str) -> tuple[Verdict, str]:
-        """The verdict on an unstable motion that other motions leave with this behavior.
+        """Returns verdict and reason for an unstable motion that other motions leave in this way.
 
         Args:
             reason: Why the motion is unstable; the returned reason may add the behavior.
@@ -91,7 +91,7 @@ class LongTerm:
 
 
 def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
-    """The behavior of a motion, from its disturbances over a late interval.
+    """Returns the behavior of a motion by the growth of its disturbances in a late interval.
 
     If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
     disturbances along the motion neither grow nor decay while volumes shrink; the same holds for a
@@ -116,7 +116,7 @@ def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
 def watch(
     flow: DisturbanceFlow, state: FloatArray, begin: float, end: float, period: float | None = None
 ) -> LongTerm:
-    """The long-term behavior of the motion from a state.
+    """Returns the long-term behavior of the motion from a state.
 
     Args:
         flow: The flow of a reference that is defined at all times.
@@ -147,7 +147,7 @@ def watch(
 def carry_in_halves(
     flow: DisturbanceFlow, state: FloatArray, begin: float, end: float
 ) -> tuple[StateTransition, tuple[StateTransition, StateTransition]]:
-    """The flow over an interval and over its halves.
+    """Integrates over both halves of an interval, and combines them.
 
     Raises:
         MotionLost: The motion cannot be followed.
@@ -168,7 +168,7 @@ def carry_in_halves(
 
 
 def watch_from(flow: DisturbanceFlow, state: FloatArray) -> LongTerm:
-    """The long-term behavior from a state that is not at rest, for a constant reference.
+    """Returns the long-term behavior from a state that is not at rest, for constant R.
 
     The duration follows from the rates of its disturbances.
     """
@@ -192,7 +192,7 @@ def leave(
     fastest: float,
     period: float | None = None,
 ) -> LongTerm:
-    """The long-term behavior of the motions that leave an unstable one, on both sides.
+    """Returns the long-term behavior of motions that start on both sides of an unstable motion.
 
     Args:
         flow: The flow of a reference that is defined at all times.
@@ -227,7 +227,7 @@ def leave(
 def judge_at_rest(
     equilibria: Equilibria, goal: FloatArray, rest: FloatArray, parameters: FloatArray
 ) -> Stability:
-    """The verdict by eigenvalues; if unstable, also by the motions that leave the equilibrium.
+    """Judges an equilibrium by eigenvalues; if unstable, also by the motions that leave it.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -254,7 +254,7 @@ def judge_without_rest(
     parameters: FloatArray,
     reason: str,
 ) -> Stability:
-    """The verdict by the motion from a state near which no equilibrium is found.
+    """Judges by the motion from a state if no equilibrium is found near it.
 
     Args:
         equilibria: The states at rest on Z(R).

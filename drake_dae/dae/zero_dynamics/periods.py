@@ -16,7 +16,7 @@ STILL = 1e-9
 
 
 def find_period(reference: Reference, begin: float, end: float) -> float | None:
-    """The smallest period of a reference that repeats itself in an interval at least once.
+    """Returns the smallest period of a reference that repeats itself in an interval.
 
     Args:
         reference: The function t -> R(t); it is evaluated only inside the interval.
@@ -56,7 +56,7 @@ def _refined(
     end: float,
     period: float,
 ) -> float | None:
-    """A period near a guess, by the Gauss-Newton method; None if there is none."""
+    """Refines a period by the Gauss-Newton method; None if there is none."""
     step = (end - begin) / SAMPLES
     # Not at round parts of the period, where references have their breaks.
     shares = (np.arange(1, 41) * 0.6180339887) % 1.0

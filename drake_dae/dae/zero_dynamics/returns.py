@@ -80,7 +80,7 @@ def close(
     free: bool = False,
     patient: bool = False,
 ) -> PeriodicMotion | None:
-    """The periodic motion near a state for a period; None if none is found.
+    """Finds the periodic motion close to a state by Newton's method; None if there is none.
 
     Newton's method for the distance from the start after a period, along the tangent space.
 
@@ -140,7 +140,7 @@ def close(
 
 
 def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> PeriodicMotion | None:
-    """The periodic motion on or near a motion of an autonomous system.
+    """Finds the periodic motion on or close to a motion of an autonomous system.
 
     Candidates are crossings of a section, the plane normal to its rate, near the start.
 
@@ -157,13 +157,13 @@ def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Pe
 def find_multiple(
     flow: DisturbanceFlow, state: FloatArray, begin: float, period: float
 ) -> PeriodicMotion | None:
-    """The attracting motion near a state whose period is a multiple of the reference's."""
+    """Finds an attracting motion near a state with a multiple of the reference's period."""
     motions = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
     return next((motion for motion in motions if motion is not None and motion.attracts), None)
 
 
 def _near(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Iterator[float]:
-    """The times at which a motion crosses the section at a state in the same direction, near it."""
+    """Generates the times of near returns through the section at a state, in the same direction."""
     rate = flow.pinned.rate(state, flow.goal(0.0), flow.parameters(0.0)) / flow.scale
     if not np.any(rate):
         return

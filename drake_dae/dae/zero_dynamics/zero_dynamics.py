@@ -33,7 +33,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 
 @checked(ModelError)
 class ZeroDynamics:
-    """The dynamics (35) that are left when the outputs are pinned to a reference.
+    """The dynamics (35) that remain if the outputs are pinned to a reference.
 
     In all methods `reference` is R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape
     (sum (mu_i + 1),), as for `TrackingLaw`; `guess` is a state, shape (n,), the nominal one if
@@ -66,7 +66,7 @@ class ZeroDynamics:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """A state on Z(R), to round-off, by Newton's method from a guess, with steps of least norm.
+        """Returns a state on Z(R), to round-off, by Newton's method from a guess.
 
         Returns:
             x, shape (n,).
@@ -88,7 +88,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         exogenous: Sequence[references.Reference] = (),
     ) -> PinnedMotion:
-        """The motion on Z(R(t)) from a state next to the guess, as far as it exists.
+        """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
         Without zero dynamics each state follows from the one before by Newton's method. Else
         x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
@@ -118,7 +118,7 @@ class ZeroDynamics:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """A state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
+        """Returns a state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
 
         Where there is a continuum of equilibria, it is one near the guess.
 
@@ -146,7 +146,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> ComplexArray:
-        """The eigenvalues of the zero dynamics, linearized at an equilibrium with constant outputs.
+        """Returns the eigenvalues of the zero dynamics, linearized at an equilibrium.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
         eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
@@ -184,7 +184,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> Stability:
-        """Whether Assumption 2.2 holds near an equilibrium, by linearization.
+        """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
 
         Args:
             state: Where to look for the equilibrium.
@@ -214,7 +214,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> FloatArray:
-        """The states at rest with the same outputs that a search from several guesses finds.
+        """Returns the equilibria with the same outputs that a search from several guesses finds.
 
         Args:
             guesses: States from which the search starts, shape (k, n); `structure.states` if None.
@@ -246,7 +246,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         exogenous: Sequence[references.Reference] = (),
     ) -> StabilityAlong:
-        """Whether Assumption 2.2 holds along a motion, by what it does to small disturbances.
+        """Judges by the growth of small disturbances whether Assumption 2.2 holds along a motion.
 
         On Z(R(t)) a disturbance moves by delta' = (dx'/dx) delta. If the reference repeats itself
         within the times, the motion of the same period is sought, and the eigenvalues of the
@@ -290,7 +290,7 @@ class ZeroDynamics:
     def _moving(
         self, parameters: FloatArray, exogenous: Sequence[references.Reference]
     ) -> Callable[[float], FloatArray]:
-        """The function t -> values of all parameters."""
+        """Returns the function t -> values of all parameters."""
         if not exogenous:
             return lambda time: parameters
         structure, system = self.structure, self.system
@@ -324,12 +324,12 @@ class ZeroDynamics:
     def _goal(
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
     ) -> FloatArray:
-        """R with constant outputs, those of a state if None."""
+        """Returns R with constant outputs; with those of the state if None."""
         if outputs is None:
             return self._equilibria.constant_outputs(state, parameters)
         return self._constant(outputs)
 
     def _constant(self, outputs: ArrayLike) -> FloatArray:
-        """R with constant outputs."""
+        """Returns R with constant outputs."""
         values = self._vector("outputs", outputs, self.system.num_outputs)
         return self._pinned.layout.constant(values)

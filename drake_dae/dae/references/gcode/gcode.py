@@ -100,7 +100,7 @@ class GCodeReference(SplineReference):
 
     @cached_property
     def program(self) -> GCodeProgram:
-        """The moves of the file."""
+        """The moves that the file contains."""
         if Path(self.file).suffix.lower() == ".csv":
             return read_points(self.file)
         try:
@@ -206,7 +206,7 @@ class _Path:
         return points
 
     def times(self, change: float, bend: float, acceleration: float) -> FloatArray:
-        """When the motion passes the nodes, in s.
+        """Returns the times in s at which the motion passes the nodes.
 
         Args:
             change: The largest change of the velocity at a corner, at the start and at the end.

@@ -14,7 +14,7 @@ SPEEDS = {"speed": MILLIMETRE, "feed": MILLIMETRE / MINUTE}
 
 
 def read_points(file: str) -> GCodeProgram:
-    """The straight moves between the points of a table.
+    """Reads the straight moves between the points of a table.
 
     Its columns are x and y in mm, and optionally speed in mm/s or feed in mm/min of the move which
     ends at the point, infinite without such a column. A point that repeats is no move.

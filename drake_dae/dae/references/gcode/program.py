@@ -46,7 +46,7 @@ class GCodeMove:
 
     @property
     def length(self) -> float:
-        """The length; of an arc with its mean radius."""
+        """The length of the move in m; that of an arc is computed with its mean radius."""
         if self.center is None:
             return float(np.linalg.norm(self.end - self.start))
         return abs(self.sweep) * self.radius
@@ -58,11 +58,11 @@ class GCodeMove:
 
     @property
     def radius(self) -> float:
-        """The mean radius of an arc; infinite for a straight move."""
+        """The mean radius of an arc in m; infinite for a straight move."""
         return inf if self.center is None else float(np.mean(self._radii))
 
     def direction(self, share: float) -> FloatArray:
-        """The direction of the motion at a share of its length, as a unit vector, shape (2,)."""
+        """Returns the unit tangent at a fraction of the length of the move, shape (2,)."""
         along = self.end - self.start
         if self.center is not None:
             x, y = (self.at(np.array([share])) - self.center)[0] * np.sign(self.sweep)
@@ -70,7 +70,7 @@ class GCodeMove:
         return np.asarray(along / np.linalg.norm(along))
 
     def at(self, shares: FloatArray) -> FloatArray:
-        """The points at shares of its length, shape (n, 2)."""
+        """Returns the points at fractions of the length of the move, shape (n, 2)."""
         if self.center is None:
             return self.start + shares[:, None] * (self.end - self.start)
         first = self.start - self.center
@@ -108,7 +108,7 @@ class _Machine:
 
 
 def read_program(text: str, name: str) -> GCodeProgram:
-    """The moves of a program.
+    """Reads the moves of a program.
 
     It follows G0, G1, G2 and G3 with X and Y, with I and J or R, F per minute, G20 and G21, G90 and
     G91, and ends at M2, M30 or the end of the text. Comments stand in parentheses or after a

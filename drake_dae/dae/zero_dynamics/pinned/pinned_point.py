@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray
 
 
 class Regularity(Enum):
-    """Whether the motion is determined at a point; the value describes the problem."""
+    """Whether the motion is determined at a point; the enum value describes the problem."""
 
     REGULAR = ""
     MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
