@@ -75,7 +75,7 @@ def test_what_a_block_holds_at_the_start_may_follow_from_what_nothing_else_reads
     compiled = compile_diagram(diagram, context=context)
     state, held = compiled.start(context)
     assert np.isnan(held).all()
-    np.testing.assert_array_equal(compiled.begun(0.0, state, held, compiled.values(context)), [7.0])
+    np.testing.assert_array_equal(compiled.initialized(0.0, state, held, compiled.values(context)), [7.0])
 
 
 def test_parameters_that_move_by_a_value_that_is_fixed_are_those_of_drake():
