@@ -6,7 +6,7 @@ from functools import partial
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, System
+from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
@@ -78,7 +78,7 @@ def compile_part(
         {name: leaf_port(port) for name, port in inputs.items()},
         {name: leaf_port(port) for name, port in outputs.items()},
     )
-    return _compiled(wires, None, context)
+    return _compiled(wires, list(outputs), context)
 
 
 def compile_open(
@@ -102,7 +102,9 @@ def compile_open(
     sources = {port: source for port, source in wires.sources.items() if port not in cut}
     systems = tuple(each for each in wires.systems if not getattr(each, "ends_runs", False))
     ports = {name: leaf_port(port) for name, port in outputs.items()}
-    return _compiled(replace(wires, systems=systems, sources=sources, outputs=ports), None, context)
+    return _compiled(
+        replace(wires, systems=systems, sources=sources, outputs=ports), list(outputs), context
+    )
 
 
 def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
@@ -129,7 +131,11 @@ def _compiled(
     is_short: bool = False,
 ) -> CompiledDiagram:
     if outputs is None:
-        outputs = [name for name, port in wires.outputs.items() if _is_vector(port)]
+        outputs = [
+            name
+            for name, (system, index) in wires.outputs.items()
+            if system.get_output_port(index).get_data_type() == PortDataType.kVectorValued
+        ]
     for name in outputs:
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
@@ -237,14 +243,6 @@ def _check_stepped(blocks: Mapping[System, Block], states: Sequence[ColumnPlace]
             f"'{other}', which has a continuous state, phases or contact of its own. Sample the "
             "law, with a force sensor without a time constant, or run the loop by simulate"
         )
-
-
-def _is_vector(port: Port) -> bool:
-    system, index = port
-    try:
-        return bool(system.get_output_port(index).size() >= 0)
-    except RuntimeError:
-        return False
 
 
 def _stacked(

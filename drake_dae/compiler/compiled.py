@@ -168,17 +168,17 @@ class CompiledDiagram:
         for system, part in self.states:
             system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
         for system, part in self.held:
-            own, first = system.GetMyMutableContextFromRoot(context), part.start
-            for i in range(own.num_discrete_state_groups()):
-                last = first + own.get_discrete_state(i).size()
-                own.SetDiscreteState(i, held[first:last])
-                first = last
+            own = system.GetMyMutableContextFromRoot(context)
+            groups = range(own.num_discrete_state_groups())
+            stops = np.cumsum([own.get_discrete_state(i).size() for i in groups])
+            for i, values in enumerate(np.split(held[part], stops[:-1])):
+                own.SetDiscreteState(i, values)
         for system, part in self.parameters:
-            own, first = system.GetMyMutableContextFromRoot(context), part.start
-            for i in range(own.num_numeric_parameter_groups()):
-                last = first + own.get_numeric_parameter(i).size()
-                own.get_mutable_numeric_parameter(i).SetFromVector(parameters[first:last])
-                first = last
+            own = system.GetMyMutableContextFromRoot(context)
+            groups = range(own.num_numeric_parameter_groups())
+            stops = np.cumsum([own.get_numeric_parameter(i).size() for i in groups])
+            for i, values in enumerate(np.split(parameters[part], stops[:-1])):
+                own.get_mutable_numeric_parameter(i).SetFromVector(values)
         for system, name, part in self.fixed:
             own = system.GetMyMutableContextFromRoot(context)
             system.GetInputPort(name).FixValue(own, parameters[part])

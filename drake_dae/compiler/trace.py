@@ -318,11 +318,6 @@ class Expressions:
         if under is not None:
             self._under[plant] = controller, under
 
-    @property
-    def is_shortened(self) -> bool:
-        """Whether the derivative of a plant is computed by `Block.under` of its controller."""
-        return bool(self._under)
-
     def _source(self, system: System, name: str) -> Port | None:
         """The output port that an input port is connected to; None if it is unconnected."""
         index = int(system.GetInputPort(name).get_index())
