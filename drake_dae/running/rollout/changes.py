@@ -51,7 +51,7 @@ class _Changes:
         # Plants that need the moments of changes ask whether they are sought.
         self.context.SetAccuracy(WINDOW)
         given = problem.state, problem.held, problem.parameters
-        compiled.put(self.context, problem.times[0], *given)
+        compiled.set_context(self.context, problem.times[0], *given)
         start, nowhere = float(problem.times[0]), np.full_like(problem.state, np.nan)
         counts, none = (
             (0, 0, start, start, np.inf, nowhere),
@@ -136,7 +136,7 @@ class _Changes:
     def ended(self, run: Run) -> Context:
         """A context of the diagram at the end of a run."""
         given = run.time, run.state, run.held, self.problem.parameters
-        self.fused.program.compiled.put(self.context, *given)
+        self.fused.program.compiled.set_context(self.context, *given)
         return self.context
 
     def react(
@@ -152,7 +152,7 @@ class _Changes:
         self, time: float, state: FloatArray, held: FloatArray, systems: Sequence[System]
     ) -> tuple[FloatArray, FloatArray, bool]:
         compiled, goes_on = self.fused.program.compiled, True
-        compiled.put(self.context, time, state, held, self.problem.parameters)
+        compiled.set_context(self.context, time, state, held, self.problem.parameters)
         after = self.context.Clone()
         for system in systems:
             guard = compiled.blocks[system].guard

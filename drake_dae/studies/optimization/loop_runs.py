@@ -97,7 +97,7 @@ class LoopRuns:
         found, size = context.Clone(), program.size
         _, held = program.compiled.start(found)
         held[program.kept_places] = start[size:]
-        program.compiled.put(found, context.get_time(), start[:size], held, parameters)
+        program.compiled.set_context(found, context.get_time(), start[:size], held, parameters)
         return found
 
     @property

@@ -136,7 +136,7 @@ class _Words:
             )
         functions = compiled.staged
         start, (_, held) = self.context.get_time(), compiled.start(self.context)
-        begin = compiled.begin(held)
+        begin = compiled.initialization(held)
         chosen = {"given": functions["given"], "row": functions["row"]}
         chosen |= {name: each for name, each in functions.items() if name.startswith("update")}
         if begin is not None:

@@ -61,7 +61,7 @@ def write_integrated(
     compiled, prefix, file = part.compiled, prefix_of(name), file_of(name)
     functions = compiled.staged
     start, held = compiled.start(context)
-    begin = compiled.begin(held)
+    begin = compiled.initialization(held)
     chosen = {key: functions[key] for key in ("given", "rate", "row", "newton")}
     chosen |= {key: each for key, each in functions.items() if key.startswith("update")}
     if begin is not None:
