@@ -43,7 +43,7 @@ def add_block(builder: DiagramBuilder, block: Block) -> Block:
     )
     # Drake's AddSystem refuses a block of an unfinished diagram, but one of a built diagram only
     # its Build, which would fail here without the name of the argument.
-    if block.GetSystemPathname() != f"::{block.get_name()}":
+    if block.GetSystemPathname() not in (f"::{block.get_name()}", "::_"):
         raise taken
     try:
         return builder.AddSystem(block)
