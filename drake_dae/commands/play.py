@@ -126,14 +126,17 @@ def _live(options: argparse.Namespace) -> int:
             "--compiled true may help"
         )
     title = scenario.description or name
-    live(
-        *made,
-        title=title,
-        notes=built.left_out,
-        port=options.port,
-        opens=not options.no_browser,
-        save=_saver(scenario, folder),
-    )
+    try:
+        live(
+            *made,
+            title=title,
+            notes=built.left_out,
+            port=options.port,
+            opens=not options.no_browser,
+            save=_saver(scenario, folder),
+        )
+    except OSError as error:
+        raise ModelError(error.strerror or str(error)) from error
     return 0
 
 
