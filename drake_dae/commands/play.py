@@ -123,16 +123,19 @@ def _live(options: argparse.Namespace) -> int:
             f"this machine runs it at {rate:.2g} of real time, and so the bench will; "
             "--compiled true may help"
         )
-    live(
-        built.loop,
-        built.context,
-        scenario.integrator,
-        title=scenario.description or name,
-        notes=built.left_out,
-        port=options.port,
-        opens=not options.no_browser,
-        save=_saver(scenario, folder),
-    )
+    try:
+        live(
+            built.loop,
+            built.context,
+            scenario.integrator,
+            title=scenario.description or name,
+            notes=built.left_out,
+            port=options.port,
+            opens=not options.no_browser,
+            save=_saver(scenario, folder),
+        )
+    except OSError as error:
+        raise ModelError(error.strerror or str(error)) from error
     return 0
 
 

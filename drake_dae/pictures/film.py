@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common import MemoryFile
 from pydrake.geometry import (
     Box,
     ClippingRange,
@@ -16,7 +16,6 @@ from pydrake.geometry import (
     FramePoseVector,
     GeometryFrame,
     GeometryInstance,
-    InMemoryMesh,
     LightParameter,
     MakeRenderEngineVtk,
     Mesh,
@@ -27,8 +26,6 @@ from pydrake.geometry import (
     Rgba,
     Role,
     SceneGraph,
-    Shape,
-    TriangleSurfaceMesh,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder
@@ -38,9 +35,13 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
+from drake_dae.pictures.moments import RunEvent, moments_of, ordered
+from drake_dae.pictures.scene.film_marks import FilmMarks
 from drake_dae.pictures.scene.floor import floor_below
 from drake_dae.pictures.scene.framing import ViewAngles
+from drake_dae.pictures.scene.friction import slips
 from drake_dae.pictures.scene.labels import label_box, to_be_seen
+from drake_dae.pictures.scene.rendered import rendered
 from drake_dae.pictures.scene.run_motion import (
     RunMotion,
     ShownLoop,
@@ -51,8 +52,9 @@ from drake_dae.pictures.scene.run_motion import (
 from drake_dae.pictures.scene.surroundings import surroundings
 from drake_dae.pictures.scene.view import ARROW, PIECE
 from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.simulation.records.phases import phases_at
+from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.summary import Limits
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes
@@ -99,7 +101,8 @@ Pixels = NDArray[np.uint8]
 def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
 
-    The actual path is blue, the desired one green; a star is an impact.
+    The actual path is blue, the desired one green; a star is an impact. Contacts with friction have
+    their cones, moments arrows with two heads; below are marks of phases and events, over time.
 
     Args:
         loop: A loop of a `RobotPlant` whose links have geometry.
@@ -123,7 +126,10 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
         )
     rate, sharpness = (FAST, 2) if kind == ".mp4" else (RATE, 1)
     course = follow(loop, record, context, rate)
-    scene, last = _Scene(course, loop.scene_graph, sharpness), len(course.times) - 1
+    events = [*moments_of(record, Limits.of(course.model)), *slips(course)]
+    phases = [span.begin for span in phase_spans(record)]
+    scene = _Scene(course, loop.scene_graph, sharpness, ordered(record, events), phases)
+    last = len(course.times) - 1
     scene.notes = phases_at(record, course.start_time + course.times)
     if kind == ".png":
         figure, axes = _screen(STRIP)
@@ -192,7 +198,12 @@ class _Scene:
     """The links and surfaces in front of a camera."""
 
     def __init__(
-        self, course: RunMotion, scene_graph: SceneGraph | None, sharpness: int = 1
+        self,
+        course: RunMotion,
+        scene_graph: SceneGraph | None,
+        sharpness: int = 1,
+        events: Sequence[RunEvent] = (),
+        phases: Sequence[float] = (),
     ) -> None:
         model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
@@ -202,6 +213,8 @@ class _Scene:
         view = ViewAngles.of(_ANGLE, _WIDTH / _HEIGHT, _TOP)
         placed = run_view(course, scene_graph, view, ARROW * self._size)
         self._camera = _Camera(*placed, 10.0 * self._size, sharpness)
+        arrow = ARROW * self._size
+        self._marks = FilmMarks(course, self._camera.project, arrow, events, phases)
         self.notes = [""] * len(course.times)
         self._course, self._points, self._wanted = course, course.points, course.wanted_points
         builder = DiagramBuilder()
@@ -234,7 +247,7 @@ class _Scene:
             constraint, picture = one.constraint, one.picture
             frame = GeometryFrame(constraint.name)
             self._frames[constraint] = scene.RegisterFrame(source, frame)
-            shape = GeometryInstance(picture.pose, _shape(picture.form), constraint.name)
+            shape = GeometryInstance(picture.pose, rendered(picture.form), constraint.name)
             shape.set_perception_properties(_properties(_SURFACE))
             scene.RegisterGeometry(source, frame.id(), shape)
         if self._frames:
@@ -256,6 +269,7 @@ class _Scene:
         everywhere = (-0.5, _WIDTH - 0.5, _HEIGHT - 0.5, -0.5)
         axis.imshow(self._render(number), interpolation="nearest", extent=everywhere)
         axis.set_axis_off()
+        happened = self._marks.draw(axis, number, _WIDTH, _HEIGHT)
         wrench, boxes = course.wrenches[number], list[FloatArray]()
         sizes = np.linalg.norm(wrench.forces, axis=1)
         tails = wrench.points - ARROW * self._size * wrench.forces / max(self._largest, 1e-6)
@@ -288,6 +302,8 @@ class _Scene:
             axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25"),
             axis.text(12, 46, self.notes[number], fontsize=11, color="0.25"),
             axis.text(_WIDTH - 12, 24, scale, fontsize=9, color="0.35", ha="right"),
+            axis.text(_WIDTH - 12, 38, self._marks.scale, fontsize=9, color="0.35", ha="right"),
+            axis.text(_WIDTH - 12, 54, happened, fontsize=9, color="0.2", ha="right"),
         ]
         for words in said:
             words.set_path_effects([halo])
@@ -313,26 +329,6 @@ def _has_gltf(scene_graph: SceneGraph) -> bool:
     inspector = scene_graph.model_inspector()
     shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
     return any(isinstance(shape, Mesh) and shape.extension() == ".gltf" for shape in shapes)
-
-
-def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
-    """A form as what is rendered: a mesh as the text of an .obj file."""
-    if isinstance(form, Shape):
-        return form
-    points = np.array(form.vertices())
-    faces = np.array([[triangle.vertex(k) for k in range(3)] for triangle in form.triangles()])
-    # The renderer needs normals at the vertices: the mean of those of adjacent triangles.
-    corners, normals = points[faces], np.zeros_like(points)
-    for k in range(3):
-        edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        np.add.at(normals, faces[:, k], np.cross(*edges))
-    rows = [
-        *("v {:.9g} {:.9g} {:.9g}".format(*point) for point in points),
-        *("vn {:.9g} {:.9g} {:.9g}".format(*normal) for normal in normals),
-        *("f " + " ".join(f"{k}//{k}" for k in face) for face in faces + 1),
-    ]
-    text = "\n".join(rows)
-    return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "surface")))
 
 
 def _properties(color: Rgba) -> PerceptionProperties:

@@ -108,7 +108,23 @@ def test_a_sweep_writes_the_page_and_its_commands_run(tmp_path, monkeypatch, cap
     capsys.readouterr()
 
 
+def test_a_study_of_a_scenario_says_how_its_runs_are_made_again(tmp_path):
+    given = load_scenario(find_scenario("two_link_wall"), ["duration=0.1"])
+    one = study(2)
+    changes = ({"start.errors.tool.z": 0.0}, {"start.errors.tool.z": 0.02})
+    Study(changes, one.results, given, True).save(tmp_path)
+    said = data((tmp_path / "study.html").read_text("utf-8"))
+    assert said["duration"] == 0.1
+    words = shlex.split(said["again"][1])
+    assert words[:4] == ["drake-dae", "simulate", str(tmp_path / "scenario.yaml"), "--rollout"]
+    assert words[4:] == ["--set", "start.errors.tool.z=0.02", "--out", str(tmp_path / "run1")]
+    again = load_scenario(words[2], [words[5]])
+    assert (again.duration, again.start.errors["tool.z"]) == (0.1, 0.02)
+    assert again.references.keys() == given.references.keys()
+
+
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_sweep_in_python_says_how_its_runs_are_made_again(tmp_path):
     """The scenario stands beside the page, with what was set before."""
     given = load_scenario(find_scenario("two_link_wall"), ["duration=0.1", "start.errors={}"])

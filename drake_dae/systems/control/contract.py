@@ -76,6 +76,7 @@ class Controller(System):
     law: TrackingLaw
     shown: tuple[str, ...] = ()
     refused: Mapping[str, str] = {}
+    phase_ends: tuple[str, ...] = ()
     follows: bool = False
     takes_over: bool = False
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
@@ -181,11 +182,6 @@ class Controller(System):
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
         """The start of each phase of a run, with the reason."""
-        return ()
-
-    @property
-    def phase_ends(self) -> tuple[str, ...]:
-        """The signal for which each phase waits, "" for none; empty without phases."""
         return ()
 
 

@@ -114,6 +114,7 @@ class TaskController(Diagram, Controller):
         super().__init__()
         check_sampled(task, sample_period)
         self.task, self.law, self.free_law = task, law, free_law
+        self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
         self.sample_period = sample_period
         self.place, self.force = opened_contact(law, free_law)
         self.outputs = self._trace_outputs()
@@ -205,10 +206,6 @@ class TaskController(Diagram, Controller):
             context: The context of this system.
         """
         return tuple(segment.change for segment in self.segments(context))
-
-    @property
-    def phase_ends(self) -> tuple[str, ...]:
-        return tuple(phase.signal for phase in self.task.plan.phases)
 
     def segments(self, context: Context) -> tuple[ReferenceSegment, ...]:
         """The references of a run, one segment for each phase.

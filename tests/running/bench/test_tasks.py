@@ -86,6 +86,10 @@ BUTTONS = """
   found.given = bench.panel.present[bench.data.phases[2]];
   press("lose");
   found.lost = await until(0, 60);
+  const [wall] = bench.data.controls.find(({ label }) => label === "wall.position[0]").inputs;
+  const gone = bench.panel.present[wall];
+  await run(0.2);
+  found.wall = [gone, gone - bench.panel.present[wall]];
   return found;
 """
 
@@ -100,6 +104,8 @@ def test_buttons_end_phases_and_lose_the_contact(guarded, tmp_path):
     assert found["said"] == "this phase makes or breaks the contact, and ends by itself"
     assert (found["waits"], found["slides"], found["lost"]) == (2, 3, 0)
     assert found["given"] == 0
+    # The wall comes back at 5 cm/s.
+    assert found["wall"] == [pytest.approx(1.358, abs=2e-3), pytest.approx(0.01, abs=1e-6)]
 
 
 def test_links_are_pushed_in_compliant_contact():

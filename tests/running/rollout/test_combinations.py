@@ -1,72 +1,14 @@
 """All combinations of parts of a scenario: a rollout is Drake's run, or one sentence refuses."""
 
 import re
-from itertools import product
 
 import numpy as np
 import pytest
+from combinations import CASES, combined
 
 from drake_dae import build_scenario, load_scenario, rollout, simulate, start_values
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import ModelError, ScenarioError, WiringError
-
-BASE = """
-robot: {file: package://drake_dae_models/two_link_arm.urdf}
-constraints:
-- {name: wall, frame: tool, friction: %s, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
-outputs: [{frame: tool, axes: z}]
-start: {positions: {joint1: 1.2, joint2: -1.6}}
-duration: 0.04
-compiled: false
-integrator:
-  integration_scheme: runge_kutta3
-  use_error_control: false
-  max_step_size: 1.0e-3
-  accuracy: 1.0e-9
-"""
-FRICTION = {"smooth": "0.0", "frictional": "0.3"}
-ACTUATION = {
-    "rigid": "",
-    "springs": "actuation: [!FlexibleJoints {stiffness: 1000.0, inertia: 0.5}]\n",
-}
-SENSING = {
-    "exact": "",
-    "encoders": "encoders: {resolution: 1.0e-5, velocity_bandwidth: 300}\n",
-    "noise": "encoders: {position_noise: 1.0e-6, velocity_noise: 1.0e-4, seed: 3}\n",
-    "force": "force_feedback: !MeasuredForce {sample_period: 0.002, noise_deviation: 0.01}\n",
-}
-PLANTS = {
-    "ideal": "",
-    "opening": "plant: !Unilateral {restitution: {wall: 0.5}}\n",
-    "Drake's contact": "plant: !MultibodyPlant {time_step: 0.001}\n",
-    "compliant": "plant: !CompliantContact {time_step: 0.001}\n",
-    "continuous": "plant: !CompliantContact {time_step: 0, stiffness: 1.0e+4}\n",
-}
-REFERENCES = """gains: {all: [-10]}
-references:
-  tool.z: !Sinusoids {offset: 0.3, amplitudes: [0.1], frequencies: [2.0]}
-  wall.force: !Sinusoids {offset: 4.0, amplitudes: [10.0], frequencies: [60.0]}
-"""
-SAMPLED = "sampling: {period: 0.002, delay: 0.001}\n"
-TASK = """gains: {all: [-10]}
-task:
-  phases:
-  - !Press {force: 5, over: 0.01, within: 1.0}
-  - !Move {references: {tool.z: 0.31}, duration: 0.01, over: 0.01}
-  - !Release {over: 0.01}
-"""
-CONTROLLERS = {
-    "law": REFERENCES,
-    "sampled": REFERENCES + SAMPLED,
-    "integral": REFERENCES.replace("[-10]", "[-10, -10, -10]") + SAMPLED + "integral: [tool.z]\n",
-    "observer": REFERENCES + SAMPLED + "observer: {rate: 20.0}\n",
-    "limits": REFERENCES + "saturation: true\n",
-    "task": TASK,
-    "sampled task": TASK + SAMPLED,
-    "observed task": TASK + SAMPLED + "observer: {rate: 20.0}\nsaturation: true\n",
-}
-PARTS = (FRICTION, ACTUATION, SENSING, PLANTS, CONTROLLERS)
-CASES = list(product(*PARTS))
 
 
 @pytest.mark.slow
@@ -80,12 +22,7 @@ CASES = list(product(*PARTS))
 )
 def test_a_rollout_is_drakes_run_or_says_why_not(names, tmp_path):
     """To 1e-9 of the largest value, away from what happens at a moment that both find."""
-    friction, *parts = (part[name] for part, name in zip(PARTS, names, strict=True))
-    path = tmp_path / "scenario.yaml"
-    text = BASE % friction + "".join(parts)
-    if names[1] == "springs":  # Short phases ask for 1e7 N m of them, and diverge.
-        text = text.replace("over: 0.01", "over: 0.3").replace("duration: 0.01", "duration: 0.3")
-    path.write_text(text)
+    path = combined(names, tmp_path)
     try:
         loop, context = build_scenario(load_scenario(path))
     except (ScenarioError, WiringError):

@@ -167,7 +167,8 @@ def parameters_of_block(system: System, count: int) -> list[Signal]:
 
 def block_name(system: System) -> str:
     """The name of a block, the same in every process: of one without a name its class."""
-    return system.get_name().partition("@")[0].rpartition("/")[2]
+    name: str = system.get_name()
+    return name.partition("@")[0].rpartition("/")[2] if "@" in name else name
 
 
 def distinct(signals: Sequence[Signal]) -> list[Signal]:
