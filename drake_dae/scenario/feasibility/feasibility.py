@@ -210,7 +210,7 @@ def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
     v = ca.SX.sym("v", dae.num_constraints)
     function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
     pairs = zip(motion.states, motion.constraint_inputs, strict=True)
-    return np.array([function(x, given, dae.parameter_values)[0] for x, given in pairs])
+    return np.array([function(x, v_at, dae.parameter_values)[0] for x, v_at in pairs])
 
 
 def _along(model: RobotModel, expression: ca.SX, states: FloatArray) -> FloatArray:

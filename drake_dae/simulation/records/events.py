@@ -29,7 +29,7 @@ def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
         "events.contacts": np.array(names, dtype=str),
         "events.happened": np.array([[n in e.contacts for n in names] for e in events]),
         "events.closed": np.array([[n in e.closed for n in names] for e in events]),
-        "events.impulses": np.array([[given.get(n, 0.0) for n in names] for given in impulses]),
+        "events.impulses": np.array([[impulse.get(n, 0.0) for n in names] for impulse in impulses]),
         "events.energy_lost": np.array([e.energy_lost for e in events]),
         "events.rest_time": np.array(rests),
     }
