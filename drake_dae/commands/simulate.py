@@ -392,7 +392,7 @@ def _write_record(record: Record, run: _CommandRun) -> None:
             record.save(temporary / RECORD)
     except OSError as error:
         with suppress(OSError):
-            writer.finish(run.context)  # The rows written so far are kept.
+            writer.finish(run.context)  # If it fails, rows that were written before remain.
         with suppress(OSError, ModelError, IndexError):
             end = Record.load(writer.path).time[-1]
             error.strerror = f"{error.strerror or error}; {PART} has the record up to {end:.6g} s"

@@ -72,7 +72,7 @@ def limit_remarks(record: Record, limits: Limits) -> list[str]:
         lower, upper = limits.state
         values = record["state"][:, : lower.size]
         room = np.minimum(values - lower, upper - values).min(axis=0)
-        # A joint with one limit alone, or none, has no range to compare with.
+        # A joint with one limit or none has no range to compare with.
         shares = np.full(lower.size, np.inf)
         np.divide(room, upper - lower, out=shares, where=np.isfinite(upper - lower))
         index, signals = int(np.argmin(shares)), record.signals["state"].signals

@@ -1,4 +1,4 @@
-"""Outputs that may complete those of a scenario."""
+"""The outputs that may complete the outputs of a scenario."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -183,7 +183,7 @@ def _with_outputs(
 
 
 def _movable(postures: Postures) -> list[int]:
-    """The rows that vary with q; those of a planar arm may be constant."""
+    """The rows that vary with q; some rows of a planar arm are constant."""
     some = [postures.at(q).gradients for q in postures.guesses(4)]
     return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
 

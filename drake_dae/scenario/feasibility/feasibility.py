@@ -55,11 +55,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     All numbers are those of the law's model without errors: the minimum requirements.
 
     Args:
-        scenario: What `load_scenario` returns.
+        scenario: A scenario, as `load_scenario` returns it.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key. A violated assumption is
-            not an error: the analysis reports it.
+        ScenarioError: The scenario is not valid; the message names the key. A violated assumption
+            is no error: the analysis reports it.
     """
     scene_graph = SceneGraph()
     completed, model = completed_model(scenario, scene_graph)

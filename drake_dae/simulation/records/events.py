@@ -39,7 +39,7 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
     """Converts arrays of `event_arrays` back to events.
 
     Raises:
-        KeyError, ValueError: The arrays are those of something else.
+        KeyError, ValueError: The arrays are no events.
     """
     if "events.time" not in arrays:
         return ()
