@@ -43,7 +43,9 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     """
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
-        couplings = _read_couplings(robot)
+        second, _ = read_robot(robot)  # Only a finalized plant has its couplings.
+        finalize(second)
+        couplings = couplings_of(second)
     with _drake_errors():
         if robot.base is not None:
             weld_base(robot.base, plant)
@@ -74,13 +76,6 @@ def _drake_errors() -> Iterator[None]:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
         raise ModelError(str(error)) from None
-
-
-def _read_couplings(robot: Robot) -> Sequence[Coupling]:
-    """Reads the couplings of the file from a second plant, since the plant must be finalized."""
-    plant, _ = read_robot(robot)
-    finalize(plant)
-    return couplings_of(plant)
 
 
 @at("robot.base.weld")
