@@ -243,18 +243,20 @@ def drive_joints(
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
     names = {_named(name, joints).index(): name for name in limits}
-    kept = set()
+    with_actuator = set()
     for actuator in actuators_of(plant):
-        name = names.get(actuator.joint().index())
-        kept.add(name)
-        if name is None:
+        driven_joint = names.get(actuator.joint().index())
+        if driven_joint is None:
             plant.RemoveJointActuator(actuator)
-        elif (limit := limits[name]) is not None:
+            continue
+        with_actuator.add(driven_joint)
+        if (limit := limits[driven_joint]) is not None:
             actuator.set_effort_limit(limit)
-    for name in (name for name in limits if name not in kept):
-        joint, limit = joints[name], limits[name]
-        effort = efforts.get(name, np.inf) if limit is None else limit
-        plant.AddJointActuator(joint.name(), joint, effort)
+    for name, limit in limits.items():
+        if name not in with_actuator:
+            joint = joints[name]
+            effort = efforts.get(name, np.inf) if limit is None else limit
+            plant.AddJointActuator(joint.name(), joint, effort)
 
 
 def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
