@@ -72,8 +72,8 @@ def _report(
     """Writes the scenario and prints the result."""
     path: Path | None = options.out
     if path is not None:
-        with stage(path.parent, path.name) as place:
-            save_scenario(scenario, place / path.name, MARK)
+        with stage(path.parent, path.name) as temporary:
+            save_scenario(scenario, temporary / path.name, MARK)
     if options.json:
         print(json.dumps(result.to_dict(), indent=2))
         return

@@ -34,9 +34,9 @@ def _play(options: argparse.Namespace) -> int:
     pages = {name: _animation(run) for name, run in runs_by_name(options.runs).items()}
     times = [load_run(run).time for run in options.runs]
     duration = max(float(time[-1] - time[0]) for time in times)
-    with stage(page.parent, page.name) as place:
+    with stage(page.parent, page.name) as temporary:
         text = side_by_side(pages, duration, page.parent)
-        (place / page.name).write_text(text, encoding="utf-8")
+        (temporary / page.name).write_text(text, encoding="utf-8")
     _open(page)
     return 0
 

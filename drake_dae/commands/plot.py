@@ -31,8 +31,8 @@ def _render(options: argparse.Namespace) -> Path:
     record = load_run(folder)
     loop, context = build_scenario(load_scenario(folder / SCENARIO, []))
     path: Path = options.out or folder / FILM
-    with stage(path.parent, path.name) as place:
-        save_film(loop, record, context, place / path.name)
+    with stage(path.parent, path.name) as temporary:
+        save_film(loop, record, context, temporary / path.name)
     return path
 
 
@@ -41,8 +41,8 @@ def _diagram(options: argparse.Namespace) -> Path:
     file = find_scenario(options.scenario)
     path: Path = options.out or Path(f"{file.stem}.svg")
     loop, _ = build_scenario(load_scenario(file, options.settings))
-    with stage(path.parent, path.name) as place:
-        save_diagram(loop.diagram, place / path.name)
+    with stage(path.parent, path.name) as temporary:
+        save_diagram(loop.diagram, temporary / path.name)
     return path
 
 
@@ -54,6 +54,6 @@ def _plot(options: argparse.Namespace) -> Path:
     records = {name: load_run(run) for name, run in runs_by_name(options.runs).items()}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)
-    with stage(path.parent, path.name) as place:
-        figure.savefig(place / path.name, dpi=110)
+    with stage(path.parent, path.name) as temporary:
+        figure.savefig(temporary / path.name, dpi=110)
     return path

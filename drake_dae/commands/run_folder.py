@@ -186,15 +186,15 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
         OSError: A file cannot be written; the error has the path of the first of the names if it
             has no other path.
     """
-    place = None
+    temporary = None
     try:
-        with _workplace(folder) as place:
-            yield Path(place)
+        with _workplace(folder) as temporary:
+            yield Path(temporary)
             for name in names:
-                Path(place, name).replace(folder / name)
+                Path(temporary, name).replace(folder / name)
     except OSError as error:
         # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
-        if place is None or str(error.filename or place).startswith(place):
+        if temporary is None or str(error.filename or temporary).startswith(temporary):
             error.filename, error.filename2 = str(folder / names[0]), None
         raise
 
@@ -205,17 +205,17 @@ def _workplace(folder: Path) -> Iterator[str]:
 
     Signals are deferred while the folder is made and while it is removed.
     """
-    place = None
+    temporary = None
     ending, last = Interruption(), Interruption()
     try:
         with ending_signals(ending):
-            place = mkdtemp(prefix=_STAGE, dir=folder)
+            temporary = mkdtemp(prefix=_STAGE, dir=folder)
         if ending.signal is not None:
             end_at_once(ending.signal)
-        yield place
+        yield temporary
     finally:
-        if place is not None:
+        if temporary is not None:
             with ending_signals(last):
-                shutil.rmtree(place)
+                shutil.rmtree(temporary)
         if last.signal is not None:
             end_at_once(last.signal)

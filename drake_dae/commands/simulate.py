@@ -301,9 +301,9 @@ def _write(run: _CommandRun) -> bool:
             more = {**record.signals, "predicted_error": Recorded(predicted, signals)}
             with _collected(problems):
                 _write_record(replace(record, signals=more, about=run.writer.about), run)
-        with _collected(problems), stage(folder, "summary.txt") as place:
+        with _collected(problems), stage(folder, "summary.txt") as temporary:
             results = "\n".join([_filled(job), "", text, *run.notes, ""])
-            (place / "summary.txt").write_text(results, encoding="utf-8")
+            (temporary / "summary.txt").write_text(results, encoding="utf-8")
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)
@@ -316,17 +316,17 @@ def _write(run: _CommandRun) -> bool:
         if write.plots and run.pictures:
             paths = contact_paths(course) if course is not None else []
             plots = [name for name in PLOTS if paths or name != PATHS]
-            with _collected(problems), stage(folder, *plots) as place, _frozen():
-                save_plots(record, predicted, limits.control, place, paths, accuracy, moments)
+            with _collected(problems), stage(folder, *plots) as temporary, _frozen():
+                save_plots(record, predicted, limits.control, temporary, paths, accuracy, moments)
             for reference in loop.generator.references if loop.generator is not None else ():
                 if isinstance(reference, TimeOptimalReference):
-                    with _collected(problems), stage(folder, PROFILE) as place:
-                        save_profile(reference.profile, place)
+                    with _collected(problems), stage(folder, PROFILE) as temporary:
+                        save_profile(reference.profile, temporary)
         if write.animation and course is not None:
-            with _collected(problems), stage(folder, ANIMATION) as place:
+            with _collected(problems), stage(folder, ANIMATION) as temporary:
                 spans = phase_spans(record)
                 page = animate(course, loop.scene_graph, run.title, spans, moments)
-                (place / ANIMATION).write_text(page, encoding="utf-8")
+                (temporary / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]
         run.results["files"] = files
@@ -388,11 +388,11 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
 def _write_record(record: Record, run: _CommandRun) -> None:
     writer = run.writer
     try:
-        with stage(run.folder, RECORD) as place:
-            record.save(place / RECORD)
+        with stage(run.folder, RECORD) as temporary:
+            record.save(temporary / RECORD)
     except OSError as error:
         with suppress(OSError):
-            writer.finish(run.context)  # The rows written so far are kept.
+            writer.finish(run.context)  # If it fails, rows that were written before remain.
         with suppress(OSError, ModelError, IndexError):
             end = Record.load(writer.path).time[-1]
             error.strerror = f"{error.strerror or error}; {PART} has the record up to {end:.6g} s"

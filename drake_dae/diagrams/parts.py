@@ -66,11 +66,13 @@ def add_signals(
     """
     ports = [controller.get_input_port(i) for i in range(controller.num_input_ports())]
     names = [port.get_name() for port in ports]
-    known = [name.removeprefix(SIGNAL) for name in names if name.startswith(SIGNAL)]
+    waited_for = [name.removeprefix(SIGNAL) for name in names if name.startswith(SIGNAL)]
     for name in signals:
-        if name not in known:
-            raise WiringError(f"{unknown_name('signal', name, known)}, for which a phase waits")
-    for name in known:
+        if name not in waited_for:
+            raise WiringError(
+                f"{unknown_name('signal', name, waited_for)}, for which a phase waits"
+            )
+    for name in waited_for:
         port = controller.GetInputPort(SIGNAL + name)
         if name not in signals:
             builder.ExportInput(port, SIGNAL + name)

@@ -51,14 +51,14 @@ from drake_dae.systems.plants.contract import Plant
 def build_scenario(
     scenario: Scenario, meshcat: Meshcat | None = None
 ) -> tuple[ClosedLoop, Context]:
-    """The closed loop of a scenario, and its context at the start.
+    """Builds the closed loop of a scenario, and its context at the start.
 
     Args:
-        scenario: What `load_scenario` returns.
+        scenario: A scenario, as `load_scenario` returns it.
         meshcat: The Meshcat for a live view; None for no view.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: The scenario is not valid; the message names the key.
     """
     completed, loop = build_completed(scenario, meshcat)
     return loop, start_scenario(completed.scenario, loop)
@@ -67,9 +67,9 @@ def build_scenario(
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
 ) -> tuple[Completed, ClosedLoop]:
-    """The completed scenario and its loop, which `start_scenario` can start repeatedly.
+    """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
-    The arguments and errors are those of `build_scenario` and `build_loop`.
+    Arguments and errors are as for `build_scenario` and `build_loop`.
     """
     if scenario.task is not None:
         check_task(scenario)
@@ -104,7 +104,7 @@ def build_loop(
     motion: TimedScenario | None = None,
     commands: CommandLimits | None = None,
 ) -> ClosedLoop:
-    """The closed loop of a scenario's robot.
+    """Builds the closed loop of a scenario's robot.
 
     Args:
         scenario: A completed scenario with gains, from `advised`.
@@ -114,8 +114,8 @@ def build_loop(
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
         motion: The time-optimal motion, from `timed`; None for the scenario's references.
-        commands: How fast references follow what is commanded; signals for which a task waits are
-            then inputs of the diagram. None if nothing is commanded.
+        commands: The limits with which references follow a person's commands; signals for which a
+            task waits are then inputs of the diagram. None for no commands.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -210,13 +210,13 @@ def make_plant(
     opens: str = "",
     pushed: bool = False,
 ) -> Plant:
-    """The plant of a scenario.
+    """Makes the plant of a scenario.
 
     Args:
         scenario: The scenario.
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
-        feedback: Whether the plant may take a law itself.
+        feedback: Whether the plant may evaluate the law itself.
         opens: The contact that a task opens and closes; empty without a task.
         pushed: Whether the links of Drake's own plant can be pushed while it runs.
 
@@ -256,7 +256,7 @@ def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
 
 
 def _check_parts(settings: LoopSettings, plant: Plant) -> None:
-    """Refuses parts that do not fit the plant, with their keys in the scenario."""
+    """Checks that the parts of a loop fit the plant; errors get the keys of the parts."""
     if settings.sampling is not None:
         with at("sampling"):
             hold_before(plant, settings.sampling)
@@ -292,7 +292,7 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
 def exogenous_references(
     scenario: Scenario, system: DaeSystem, needed: Sequence[int]
 ) -> list[Reference]:
-    """The references of the exogenous parameters in the order of the system.
+    """The references of the exogenous parameters, in the order of the system.
 
     Args:
         scenario: The scenario.

@@ -265,10 +265,10 @@ def _check_exogenous(
     """Checks that exogenous names are parameters."""
     attached = [stage.attach(links).parameters for stage in stages]
     groups = [links.parameters, *(member.parameters for member in members), *attached]
-    known = [parameter.name for group in (*groups, choice) for parameter in group]
+    parameters = [parameter.name for group in (*groups, choice) for parameter in group]
     for name in names:
-        if name not in known:
-            raise ModelError(unknown_name("parameter", name, known))
+        if name not in parameters:
+            raise ModelError(unknown_name("parameter", name, parameters))
 
 
 @at("start.positions")

@@ -1,4 +1,4 @@
-"""The system of the law of a scenario: of its robot or of the links alone, observed or not."""
+"""The system on which the law of a scenario is based."""
 
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
@@ -46,7 +46,7 @@ def law_robot(
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of the system of a scenario's law, with a disturbance if it is observed.
+    """The structure of the law's system, with a disturbance if the scenario has an observer.
 
     Raises:
         ScenarioError: The observer does not fit; the message names its key.

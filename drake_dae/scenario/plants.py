@@ -135,7 +135,11 @@ class Unilateral(ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
-            pushing = [one.name for one in robot.model.constraints if any(one.is_unilateral)]
+            pushing = [
+                constraint.name
+                for constraint in robot.model.constraints
+                if any(constraint.is_unilateral)
+            ]
             if not pushing:
                 raise ModelError("the robot has no unilateral constraint, so no contact can open")
             return UnilateralRobotPlant(

@@ -121,9 +121,9 @@ def roll_scenario(
         scenario: The scenario.
         loop: Its closed loop.
         context: The start, by `start_scenario`.
-        lasting: The expected total duration of runs of this loop, in s, for the decision on machine
-            code; None for a single run, which uses the cache.
-        look: As of `run_loop`.
+        lasting: The expected total duration of runs of this loop, in s, for the decision whether to
+            compile it; None for a single run, which uses the cache.
+        look: As for `run_loop`.
 
     Raises:
         ModelError: The loop cannot be rolled out.
@@ -153,7 +153,7 @@ def roll_together(
         scenarios: The scenarios.
         loop: The closed loop of all.
         contexts: Their starts, by `start_scenario`.
-        lasting: As of `roll_scenario`.
+        lasting: As for `roll_scenario`.
 
     Returns:
         One run per scenario; None where `roll_scenario` has to be used, as for `run_together`.

@@ -81,8 +81,8 @@ class Scenario:
         description: One line for `drake-dae list`.
         robot: The robot's file, with additions: which frames are welded or free, which joints are
             locked or driven.
-        constraints: The constraints; without a tag it is a PointOnSurface. Those of the robot's
-            file, such as mimic joints, are appended.
+        constraints: The constraints; one without a tag is a PointOnSurface. Constraints in the
+            robot's file, such as mimic joints, are appended.
         outputs: Position outputs; the force outputs follow them. If there are fewer than actuators
             minus force outputs, they are completed: see `complete_scenario`.
         tool_axis: The direction of the tool's axis in completed outputs: normal to the surface,

@@ -44,7 +44,7 @@ class OutputQuality:
         tolerance: The tolerated |z - r|, in its unit.
         since: The time from which |z - r| stayed within the tolerance, in s; None if it was outside
             at the end.
-        predicted_since: The same of the predicted error; None if the run is too short for it.
+        predicted_since: The same time for the predicted error; None if the run is too short.
         follows_prediction: Whether the error is within the tolerance of the predicted one in the
             second half of the run.
         largest: The largest |z - r| in the second half of the run.

@@ -62,25 +62,25 @@ def limit_remarks(record: Record, limits: Limits) -> list[str]:
     remarks = []
     if limits.control is not None and np.isfinite(limits.control).any():
         shares = np.max(np.abs(record["control"]), axis=0) / limits.control
-        place, signal = int(np.argmax(shares)), record.signals["control"].signals
-        unit = f" {signal[place].unit}".rstrip()
+        index, signals = int(np.argmax(shares)), record.signals["control"].signals
+        unit = f" {signals[index].unit}".rstrip()
         remarks.append(
-            f"of the drives {signal[place].name} comes closest to its limit, with "
-            f"{shares[place]:.0%} of {limits.control[place]:.4g}{unit}"
+            f"of the drives {signals[index].name} comes closest to its limit, with "
+            f"{shares[index]:.0%} of {limits.control[index]:.4g}{unit}"
         )
     if limits.state is not None:
         lower, upper = limits.state
         values = record["state"][:, : lower.size]
         room = np.minimum(values - lower, upper - values).min(axis=0)
-        # A joint with one limit alone, or none, has no range to compare with.
+        # A joint with one limit or none has no range to compare with.
         shares = np.full(lower.size, np.inf)
         np.divide(room, upper - lower, out=shares, where=np.isfinite(upper - lower))
-        place, signal = int(np.argmin(shares)), record.signals["state"].signals
-        if np.isfinite(shares[place]):
-            unit = f" {signal[place].unit}".rstrip()
+        index, signals = int(np.argmin(shares)), record.signals["state"].signals
+        if np.isfinite(shares[index]):
+            unit = f" {signals[index].unit}".rstrip()
             remarks.append(
-                f"of the joints {signal[place].name} comes closest to a limit, with "
-                f"{room[place]:.3g}{unit} left"
+                f"of the joints {signals[index].name} comes closest to a limit, with "
+                f"{room[index]:.3g}{unit} left"
             )
     return remarks
 

@@ -156,14 +156,14 @@ def _phases(record: Record) -> list[str]:
     if not spans or not signals:
         return []
     units = list(dict.fromkeys(signal.unit for signal in signals))
-    places = [[i for i, one in enumerate(signals) if one.unit == unit] for unit in units]
+    columns_of = [[i for i, signal in enumerate(signals) if signal.unit == unit] for unit in units]
     sizes, rows, last = unit_sizes(record), [], 0
     for span in spans:
         # At the time of a change a row has the values before it.
         first, last = last, int(np.searchsorted(record.time, span.end, side="right"))
         rms = late_rms(record.time[first:last], record["tracking_error"][first:last])
-        sums = [float(np.linalg.norm(rms[each])) for each in places]
-        numbers = [_number(sum_, sizes[unit], 2) for sum_, unit in zip(sums, units, strict=True)]
+        sums = [float(np.linalg.norm(rms[columns])) for columns in columns_of]
+        numbers = [_number(total, sizes[unit], 2) for total, unit in zip(sums, units, strict=True)]
         rows.append([span.name, f"{span.begin:.4g}", f"{span.end:.4g}", *numbers])
     heads = [f"late rms [{unit or '1'}]" for unit in units]
     return [

@@ -36,15 +36,15 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
     """The gains of a task without contact, soft along the distance: see `TaskController`."""
     constraint = opening_contact(scenario, model)
     names = [signal.name for signal in model.dae.constraint_input_signals]
-    place = names.index(constraint.force_signals[0].name)
+    index = names.index(constraint.force_signals[0].name)
     distance, rate = (
-        model.dae.constraint_output_signals[place].name,
+        model.dae.constraint_output_signals[index].name,
         contact.position_rate / _SOFTER,
     )
     gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
     gains[distance] = [rate**2, 2.0 * rate]
     return parts.Coefficients(
-        outputs={name: [rounded(gain) for gain in each] for name, each in gains.items()}
+        outputs={name: [rounded(gain) for gain in values] for name, values in gains.items()}
     )
 
 
@@ -179,7 +179,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         force_feedback=force,
         largest_roughness=None,
     )
-    known = ", ".join(observer.identify_friction) or "none"
+    identified = ", ".join(observer.identify_friction) or "none"
     estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
@@ -187,7 +187,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"at {rounded(contact.position_rate):g} 1/s, and of forces one at "
         f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
-        f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
+        f"{observer.rate:g} 1/s that identifies the friction of: {identified}{estimated}"
         f"{loop_note(scenario)}{outlook}"
         f"{_touch_note(task, stiffness, mobility, period * (1 + late))}"
     )

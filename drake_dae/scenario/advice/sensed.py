@@ -48,8 +48,8 @@ def sensed_contact(
     moves = np.einsum("ij,ji->i", jacobian, np.linalg.solve(inertia, jacobian.T))
     levers = np.linalg.norm(jacobian, axis=1)
     free, contact = slice(len(points)), slice(len(points), None)
-    given = scenario.observer is None or scenario.observer.state_rate is not None
-    plain = encoders.velocity_bandwidth is None and velocities_are_rates(model.links)
+    may_estimate = scenario.observer is None or scenario.observer.state_rate is not None
+    has_rates = encoders.velocity_bandwidth is None and velocities_are_rates(model.links)
     period, delay = timing
     return SensedContact(
         period=period,
@@ -66,7 +66,7 @@ def sensed_contact(
             force=_largest(getattr(scenario.force_feedback, "noise_deviation", 0.0)),
             velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
         ),
-        estimates=given and plain,
+        estimates=may_estimate and has_rates,
     )
 
 

@@ -1,4 +1,4 @@
-"""Outputs that may complete those of a scenario."""
+"""The outputs that may complete the outputs of a scenario."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class Candidates:
     Args:
         scenario: The scenario.
         links: Its robot.
-        given: The outputs of the scenario.
+        outputs: The outputs of the scenario.
         bound: The constraints.
 
     Attributes:
@@ -55,13 +55,13 @@ class Candidates:
         self,
         scenario: Scenario,
         links: Links,
-        given: Sequence[PositionOutput],
+        outputs: Sequence[PositionOutput],
         bound: ConstraintSet,
     ) -> None:
         self._forms: list[Output] = []
-        self.signals: list[Signal] = [s for output in given for s in output.signals(links)]
+        self.signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
         self._given = len(self.signals)
-        rows = [output.expression(links) for output in given]
+        rows = [output.expression(links) for output in outputs]
         touching = [(c.name, c.touch(links)) for c in bound.constraints]
         places = [
             _ToolContact(name, t, tool_axis(links, t)) for name, t in touching if t is not None

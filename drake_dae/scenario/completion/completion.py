@@ -68,8 +68,8 @@ def complete(
         ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
     bound = ConstraintSet([*constraints, *of_plant])
-    given = [make(form, constraints) for form in scenario.outputs]
-    size = sum(len(output.signals(links)) for output in given)
+    outputs = [make(form, constraints) for form in scenario.outputs]
+    size = sum(len(output.signals(links)) for output in outputs)
     steered = force_outputs(scenario.forces, bound)
     names = [signal.name for output in steered for signal in output.signals(bound)]
     S = force_rows(steered, bound, links)
@@ -87,7 +87,7 @@ def complete(
         or (missing == 0 and is_placed)
     ):
         return Completed(scenario)
-    candidates = Candidates(scenario, links, given, bound)
+    candidates = Candidates(scenario, links, outputs, bound)
     with at("plant_parameters or exogenous"):
         postures = Postures(
             links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
@@ -183,7 +183,7 @@ def _with_outputs(
 
 
 def _movable(postures: Postures) -> list[int]:
-    """The rows that vary with q; those of a planar arm may be constant."""
+    """The rows that vary with q; some rows of a planar arm are constant."""
     some = [postures.at(q).gradients for q in postures.guesses(4)]
     return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
 
@@ -213,8 +213,8 @@ def _posture(
 def _guesses(referred: ReferredRows, postures: Postures, guess: FloatArray) -> FloatArray:
     """Random guesses of the joints without start.positions, shape (TRIES, nq)."""
     names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
-    given = [name in referred.scenario.start.positions for name in names]
-    return np.where(given, guess, postures.guesses(TRIES))
+    is_given = [name in referred.scenario.start.positions for name in names]
+    return np.where(is_given, guess, postures.guesses(TRIES))
 
 
 def _search(

@@ -75,10 +75,10 @@ class ReferredRows:
 
     def _meant(self, name: str, key: str) -> Sequence[int | None]:
         signals = [signal.name for signal in self.candidates.signals]
-        known = [*signals[: self.given], *self._forces]
+        outputs = [*signals[: self.given], *self._forces]
         degrees = [2] * self.given + [0] * len(self._forces)
         try:
-            places = meant(name, known, degrees)
+            places = meant(name, outputs, degrees)
         except ReferenceSignalError as error:
             if not self.missing:
                 raise ScenarioError((key, str(error))) from None
@@ -91,7 +91,7 @@ class ReferredRows:
         try:
             chosen = of_point or [others[k] for k in meant(name, others, [2] * len(others))]
         except ReferenceSignalError:
-            text = unknown_name("output", name, [*known, *others])
+            text = unknown_name("output", name, [*outputs, *others])
             raise ScenarioError((key, text)) from None
         return [signals.index(signal) for signal in chosen]
 

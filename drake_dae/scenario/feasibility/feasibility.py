@@ -55,11 +55,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     All numbers are those of the law's model without errors: the minimum requirements.
 
     Args:
-        scenario: What `load_scenario` returns.
+        scenario: A scenario, as `load_scenario` returns it.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key. A violated assumption is
-            not an error: the analysis reports it.
+        ScenarioError: The scenario is not valid; the message names the key. A violated assumption
+            is no error: the analysis reports it.
     """
     scene_graph = SceneGraph()
     completed, model = completed_model(scenario, scene_graph)
@@ -210,7 +210,7 @@ def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
     v = ca.SX.sym("v", dae.num_constraints)
     function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
     pairs = zip(motion.states, motion.constraint_inputs, strict=True)
-    return np.array([function(x, given, dae.parameter_values)[0] for x, given in pairs])
+    return np.array([function(x, v_at, dae.parameter_values)[0] for x, v_at in pairs])
 
 
 def _along(model: RobotModel, expression: ca.SX, states: FloatArray) -> FloatArray:

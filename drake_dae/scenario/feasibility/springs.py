@@ -164,7 +164,7 @@ def _mobilities(links: RobotModel, structure: Structure) -> tuple[FloatArray, li
         often=False,
     )
     nv = B.shape[0]
-    mass, held = function(structure.states[0], system.parameter_values)
+    mass, h_star = function(structure.states[0], system.parameter_values)
     free = B.T @ np.linalg.inv(np.array(mass).reshape(nv, nv)) @ B
-    constrained = B.T @ np.array(held).reshape(nv, B.shape[1])
+    constrained = B.T @ np.array(h_star).reshape(nv, B.shape[1])
     return np.asarray(np.linalg.inv(free)), [np.asarray(free), constrained]

@@ -76,7 +76,7 @@ class Form:
                 ),
                 required=default is MISSING,
             )
-            for name, hint, default in self._fields(source)
+            for name, hint, default in _fields_of(source, self.defaults)
         }
         names, tag = list(entries), {TAG: self.tag} if self.tag else {}
         if tag:
@@ -117,10 +117,6 @@ class Form:
 
         return core_schema.with_info_wrap_validator_function(read_once, made)
 
-    def _fields(self, source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
-        for name, hint, default in _fields_of(source):
-            yield name, hint, self.defaults.get(name, default)
-
     def _type_in_data(self, hint: Any) -> Any:
         """The type in data of a field with an annotation."""
         if is_dataclass(hint):
@@ -157,17 +153,19 @@ def _is_plain(value: Any) -> bool:
     return value is None or value == {} or isinstance(value, (bool, int, float, str))
 
 
-def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
+def _fields_of(source: type[Any], defaults: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """The name, the annotation and the default of each field, `MISSING` where it has none."""
     if not is_dataclass(source):
         made: Any = source()
-        yield from ((item.name, item.type, getattr(made, item.name)) for item in made.__fields__)
+        for item in made.__fields__:
+            yield item.name, item.type, defaults.get(item.name, getattr(made, item.name))
         return
     hints = get_type_hints(source, include_extras=True)
     for item in fields(source):
         if item.init:
             factory = item.default_factory
-            yield item.name, hints[item.name], item.default if factory is MISSING else factory()
+            default = item.default if factory is MISSING else factory()
+            yield item.name, hints[item.name], defaults.get(item.name, default)
 
 
 def _members(hint: Any) -> set[Any]:

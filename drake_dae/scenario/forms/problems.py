@@ -55,7 +55,7 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _D
             break  # The rest of the location is about one of several types.
         if "oneOf" in schema:
             tag, tags = str(part), _tags(schema)
-            schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
+            schema = next(member for member in schema["oneOf"] if _tag(member) == tag)
         else:
             keys.append(str(part))
             inner = schema.get("items", schema.get("additionalProperties"))
@@ -66,19 +66,19 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _D
 
 def with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
     """The inner schema of an optional value with parts; any other schema unchanged."""
-    inside = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
+    inside = [member for member in schema.get("anyOf", ()) if member.get("type") != "null"]
     return inside[0] if len(inside) == 1 and not _PARTS.isdisjoint(inside[0]) else schema
 
 
 def _wrong_key(place: _DataPlace, name: str, value: Any, is_missing: bool) -> str:
     """The text for a key that is missing or unknown."""
     names = [name for name in place.schema["properties"] if name != TAG]
-    title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
+    title, keys = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
     if is_missing:
-        return f"{title}needs the key '{name}'; {known}"
+        return f"{title}needs the key '{name}'; {keys}"
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
-    text = f"{title}has no key '{name}'; {hint}{known}"
+    text = f"{title}has no key '{name}'; {hint}{keys}"
     if place.tag and TAG not in place.data:
         text += f". No tag is given; there are {place.tags}"
     return text
@@ -128,7 +128,7 @@ def without_tags(schema: Any) -> Any:
     Without a tag any of the forms may match, so "oneOf" becomes "anyOf".
     """
     if isinstance(schema, list):
-        return [without_tags(one) for one in schema]
+        return [without_tags(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
     plain = {

@@ -70,8 +70,8 @@ def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
     schema = with_parts(schema)
     if isinstance(schema.get("additionalProperties"), dict):
         yield path
-    for one in schema.get("oneOf", ()):
-        yield from _free_names(one, path)
+    for member in schema.get("oneOf", ()):
+        yield from _free_names(member, path)
     inside = {"*": schema["items"]} if isinstance(schema.get("items"), dict) else {}
     for name, inner in {**schema.get("properties", {}), **inside}.items():
         yield from _free_names(inner, f"{path}.{name}" if path else name)

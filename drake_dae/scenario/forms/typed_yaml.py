@@ -47,19 +47,19 @@ class _Loader(yaml.SafeLoader):
             self._check_size(node, {})
         return node
 
-    def _check_size(self, node: yaml.Node, known: dict[int, int]) -> int:
+    def _check_size(self, node: yaml.Node, sizes: dict[int, int]) -> int:
         """Counts the values of a node, at most `MOST_VALUES`."""
-        if id(node) not in known:
-            known[id(node)] = MOST_VALUES  # For an alias inside itself.
+        if id(node) not in sizes:
+            sizes[id(node)] = MOST_VALUES  # For an alias inside itself.
             parts = node.value if isinstance(node, yaml.CollectionNode) else []
             if isinstance(node, yaml.MappingNode):
                 parts = [part for pair in parts for part in pair]
-            size = 1 + sum(self._check_size(part, known) for part in parts)
+            size = 1 + sum(self._check_size(part, sizes) for part in parts)
             if size > MOST_VALUES:
                 text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
                 raise self._error(text, node)
-            known[id(node)] = size
-        return known[id(node)]
+            sizes[id(node)] = size
+        return sizes[id(node)]
 
     def construct_scalar(self, node: yaml.ScalarNode) -> Any:
         value = super().construct_scalar(node)
@@ -190,8 +190,8 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
         slot: str | int = part
         if isinstance(data, list):
             if not (part.isascii() and part.isdecimal() and int(part) < len(data)):
-                known = ", ".join(map(str, range(len(data)))) or "none"
-                raise ScenarioError((path, f"no entry '{part}'; entries: {known}"))
+                indices = ", ".join(map(str, range(len(data)))) or "none"
+                raise ScenarioError((path, f"no entry '{part}'; entries: {indices}"))
             slot = int(part)
         elif not isinstance(data, dict):
             raise ScenarioError((path, f"{brief(data)} has no entry '{part}'"))

@@ -151,8 +151,12 @@ def _with(data: Any, path: tuple[str | int, ...], value: Any) -> Any:
 def _takes(schema: Mapping[str, Any]) -> str:
     """The values that a schema allows, in words."""
     if "oneOf" in schema:
-        tags = (one["properties"][TAG]["const"] for one in schema["oneOf"] if "properties" in one)
-        texts = (_takes(one) for one in schema["oneOf"] if "properties" not in one)
+        tags = (
+            member["properties"][TAG]["const"]
+            for member in schema["oneOf"]
+            if "properties" in member
+        )
+        texts = (_takes(member) for member in schema["oneOf"] if "properties" not in member)
         return ", ".join([*texts, *tags])
     if "anyOf" in schema:
         return ", or ".join(dict.fromkeys(map(_takes, schema["anyOf"])))

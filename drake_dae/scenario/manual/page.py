@@ -33,7 +33,9 @@ def _section(entry: ManualEntry) -> str:
     where = f"At `{entry.where}`. " if entry.where else ""
     paragraphs = entry.text.split("\n\n")
     # Formulas are for readers of the code.
-    end = next((i for i, one in enumerate(paragraphs) if one.endswith((":", ","))), None)
+    end = next(
+        (i for i, paragraph in enumerate(paragraphs) if paragraph.endswith((":", ","))), None
+    )
     text = _one_line(" ".join(paragraphs if end is None else paragraphs[: max(end, 1)]))
     text = text.rstrip(":,.") + "."
     if not entry.keys:

@@ -27,8 +27,8 @@ def custom_tags() -> list[str]:
 
 def _tags(schema: Mapping[str, Any]) -> Iterator[str]:
     for value in schema.values():
-        for one in value if isinstance(value, list) else [value]:
-            if isinstance(one, dict):
-                if TAG in one:
-                    yield one[TAG]["const"]
-                yield from _tags(one)
+        for part in value if isinstance(value, list) else [value]:
+            if isinstance(part, dict):
+                if TAG in part:
+                    yield part[TAG]["const"]
+                yield from _tags(part)

@@ -1,4 +1,4 @@
-"""A scenario for a robot, from its file alone."""
+"""Makes a scenario for a robot from nothing but its file."""
 
 import warnings
 from dataclasses import replace

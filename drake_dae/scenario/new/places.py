@@ -53,7 +53,7 @@ class TipPlace:
         ways: The axes of the world along the surface in which it can move, one or two.
         directions: The number of directions: of the normal, two along the surface, and two angles.
         speed: The largest speed of the tip along the surface, m/s, within the joints' limits.
-        force: The largest force, N, likewise; infinite without limits.
+        force: The largest force, N, within the effort limits; infinite without limits.
         size: The size of the robot, m.
     """
 

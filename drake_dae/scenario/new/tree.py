@@ -106,7 +106,7 @@ class Tree:
 def _somewhere(
     joint: Joint, random: np.random.Generator, plant: MultibodyPlant, context: Context
 ) -> FloatArray:
-    """The positions of a plant with those of one joint at random."""
+    """The positions of a plant, with a random position of one joint within its limits."""
     q = plant.GetPositions(context)
     low = max(joint.position_lower_limits()[0], -1.0)
     high = max(min(joint.position_upper_limits()[0], 1.0), low)

@@ -46,10 +46,10 @@ class ScenarioTask:
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
-        known = self.make().signals
+        signals = self.make().signals
         for name in self.signals:
-            if name not in known:
-                text = unknown_name("phase that waits for the signal", name, known)
+            if name not in signals:
+                text = unknown_name("phase that waits for the signal", name, signals)
                 raise ModelError(f"signals: {text}")
 
     def make(self, force_noise: float = 0.0) -> Task:

@@ -25,7 +25,7 @@ class WrittenForm(ABC, Generic[T]):
         """Makes the library's object.
 
         Args:
-            constraints: The scenario's constraints made so far.
+            constraints: The constraints of the scenario to which the form may refer.
 
         Raises:
             ModelError: Something does not fit.

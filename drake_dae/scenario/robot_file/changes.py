@@ -43,7 +43,9 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     """
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
-        couplings = _read_couplings(robot)
+        second, _ = read_robot(robot)  # Only a finalized plant has its couplings.
+        finalize(second)
+        couplings = couplings_of(second)
     with _drake_errors():
         if robot.base is not None:
             weld_base(robot.base, plant)
@@ -74,13 +76,6 @@ def _drake_errors() -> Iterator[None]:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
         raise ModelError(str(error)) from None
-
-
-def _read_couplings(robot: Robot) -> Sequence[Coupling]:
-    """Reads the couplings of the file from a second plant, since the plant must be finalized."""
-    plant, _ = read_robot(robot)
-    finalize(plant)
-    return couplings_of(plant)
 
 
 @at("robot.base.weld")
@@ -248,18 +243,20 @@ def drive_joints(
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
     names = {_named(name, joints).index(): name for name in limits}
-    kept = set()
+    with_actuator = set()
     for actuator in actuators_of(plant):
-        name = names.get(actuator.joint().index())
-        kept.add(name)
-        if name is None:
+        driven_joint = names.get(actuator.joint().index())
+        if driven_joint is None:
             plant.RemoveJointActuator(actuator)
-        elif (limit := limits[name]) is not None:
+            continue
+        with_actuator.add(driven_joint)
+        if (limit := limits[driven_joint]) is not None:
             actuator.set_effort_limit(limit)
-    for name in (name for name in limits if name not in kept):
-        joint, limit = joints[name], limits[name]
-        effort = efforts.get(name, np.inf) if limit is None else limit
-        plant.AddJointActuator(joint.name(), joint, effort)
+    for name, limit in limits.items():
+        if name not in with_actuator:
+            joint = joints[name]
+            effort = efforts.get(name, np.inf) if limit is None else limit
+            plant.AddJointActuator(joint.name(), joint, effort)
 
 
 def _named(name: str, joints: Mapping[str, Joint]) -> Joint:

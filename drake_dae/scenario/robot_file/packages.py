@@ -18,23 +18,23 @@ _MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
 """The suffixes of files that may contain names of packages."""
 
 
-def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
+def add_packages(packages: Mapping[str, str], package_map: PackageMap) -> None:
     """Adds the shipped package and those of `robot.packages`.
 
     Raises:
         ScenarioError: A folder does not exist, or the name is one of Drake's.
     """
-    known.AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    package_map.AddPackageXml(str(FOLDER / "models" / "package.xml"))
     for name, folder in packages.items():
         with at(f"robot.packages.{name}"):
             try:
-                known.Add(name, folder)
+                package_map.Add(name, folder)
             except RuntimeError as error:
                 raise ModelError(f"no package in '{folder}': {error}") from None
 
 
 def find_packages(
-    file: str, known: PackageMap, places: Sequence[Path] = ()
+    file: str, package_map: PackageMap, places: Sequence[Path] = ()
 ) -> tuple[list[Path], dict[str, str]]:
     """Adds the packages that a file names, and those that its included files name.
 
@@ -44,7 +44,7 @@ def find_packages(
 
     Args:
         file: A path, or a URL of a package.
-        known: The known packages; the packages that are found are added.
+        package_map: The known packages; the packages that are found are added.
         places: Folders with packages as subfolders of their names.
 
     Returns:
@@ -54,11 +54,11 @@ def find_packages(
     folders: list[Path] = []
     missing: dict[str, str] = {}
     ros: PackageMap | None = None
-    waiting, seen = [(file, Path())], set()
+    waiting, searched = [(file, Path())], set()
     while waiting:
         url, origin = waiting.pop()
         for name in _URL.findall(url):
-            if not known.Contains(name) and name not in missing:
+            if not package_map.Contains(name) and name not in missing:
                 ros = ros or _ros_packages()
                 folder = _beside(name, origin) if origin.name else None
                 if folder is None and ros.Contains(name):
@@ -69,12 +69,12 @@ def find_packages(
                 if folder is None:
                     missing[name] = str(origin) if origin.name else ""
                     continue
-                known.Add(name, str(folder))
+                package_map.Add(name, str(folder))
                 folders.append(folder)
-        path = _path(url, known)
-        if path is None or path in seen or path.suffix not in _MODEL or not path.is_file():
+        path = _path(url, package_map)
+        if path is None or path in searched or path.suffix not in _MODEL or not path.is_file():
             continue
-        seen.add(path)
+        searched.add(path)
         text = without_comments(path.read_text("utf-8", errors="replace"))
         waiting.extend((match[0], path) for match in _URL.finditer(text))
     return folders, missing
@@ -95,12 +95,12 @@ def explained(missing: Mapping[str, str]) -> str:
     )
 
 
-def _path(url: str, known: PackageMap) -> Path | None:
+def _path(url: str, package_map: PackageMap) -> Path | None:
     """The file of a path or a URL; None if the package is unknown."""
     if "://" not in url:
         return Path(url)
     try:
-        return Path(known.ResolveUrl(url))
+        return Path(package_map.ResolveUrl(url))
     except RuntimeError:
         return None
 

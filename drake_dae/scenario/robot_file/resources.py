@@ -70,12 +70,12 @@ def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
 
 def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
     """Checks the files that a file names, directly or through other files."""
-    waiting, seen = [file], set()
+    waiting, checked = [file], set()
     while waiting:
         current = waiting.pop()
-        if current in seen or not current.is_file():
+        if current in checked or not current.is_file():
             continue
-        seen.add(current)
+        checked.add(current)
         for name in _references(current):
             if name.lower().startswith("data:"):
                 continue

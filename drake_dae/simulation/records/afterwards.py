@@ -63,17 +63,17 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     _refuse_fixed_ports(loop, context)
     plant = loop.plant
     times, values = logged.time, {name: logged[name] for name in logged.signals}
-    known = {**values, "parameters": _parameters_along(loop, plant, context, times)}
+    inputs = {**values, "parameters": _parameters_along(loop, plant, context, times)}
     if "exogenous" in values:  # Logged, since it does not follow from the time.
-        known["parameters"][:, plant.exogenous_places] = values["exogenous"]
+        inputs["parameters"][:, plant.exogenous_places] = values["exogenous"]
     elif loop.plant_exogenous is not None:
         values["exogenous"] = _along(loop.plant_exogenous, times, context)
     if loop.generator is not None and "reference" not in values:
         values["reference"] = _along(loop.generator, times, context)
-    if "control" not in known:
-        inputs = {**known, "reference": values["reference"]}
-        values["control"] = known["control"] = _control_along(loop, context, times, inputs)
-    values |= {port: plant.along(port, known) for port in plant.functions}
+    if "control" not in inputs:
+        law_inputs = {**inputs, "reference": values["reference"]}
+        values["control"] = inputs["control"] = _control_along(loop, context, times, law_inputs)
+    values |= {port: plant.along(port, inputs) for port in plant.functions}
     return Record(times, {n: Recorded(values[n], tuple(loop.signals[n])) for n in loop.signals})
 
 

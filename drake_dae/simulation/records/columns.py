@@ -113,13 +113,15 @@ def _columns(
         raise ModelError(f"{path} separates its columns by ';'; separate them by ','")
     parsed = [(i, *name_and_unit(text)) for i, text in enumerate(head)]
     if columns is not None:
-        known = {name: (i, unit) for i, name, unit in parsed}
-        missing = [name for name in columns if name_and_unit(name)[0] not in known]
+        available = {name: (i, unit) for i, name, unit in parsed}
+        missing = [name for name in columns if name_and_unit(name)[0] not in available]
         if missing:
-            raise ModelError(f"{path} has no column {listed(missing)}; it has {listed(known, 30)}")
+            raise ModelError(
+                f"{path} has no column {listed(missing)}; it has {listed(available, 30)}"
+            )
         parsed = []
         for column, target in columns.items():
-            place, unit = known[name_and_unit(column)[0]]
+            place, unit = available[name_and_unit(column)[0]]
             name, target_unit = name_and_unit(target)
             parsed.append((place, name, target_unit or unit))
     names = [name for _, name, _ in parsed]

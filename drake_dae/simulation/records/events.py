@@ -29,7 +29,7 @@ def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
         "events.contacts": np.array(names, dtype=str),
         "events.happened": np.array([[n in e.contacts for n in names] for e in events]),
         "events.closed": np.array([[n in e.closed for n in names] for e in events]),
-        "events.impulses": np.array([[given.get(n, 0.0) for n in names] for given in impulses]),
+        "events.impulses": np.array([[impulse.get(n, 0.0) for n in names] for impulse in impulses]),
         "events.energy_lost": np.array([e.energy_lost for e in events]),
         "events.rest_time": np.array(rests),
     }
@@ -39,7 +39,7 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
     """Converts arrays of `event_arrays` back to events.
 
     Raises:
-        KeyError, ValueError: The arrays are those of something else.
+        KeyError, ValueError: The arrays are no events.
     """
     if "events.time" not in arrays:
         return ()

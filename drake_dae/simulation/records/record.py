@@ -37,12 +37,12 @@ def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded
 class Record:
     """All signals of a run at the ends of the integrator's steps.
 
-    On disk it is one `record.npz` that NumPy alone reads: `numpy.load("record.npz")` has "time"
-    in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
-    Events stand in it as "events.time", "events.kind", "events.impulses" and others; and "about" is
-    JSON with the versions that made it and, of a run by the command, the scenario with all seeds.
+    The file `record.npz` can be read with NumPy: `numpy.load("record.npz")` has "time" in s, and
+    for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units". Events are
+    in "events.time", "events.kind", "events.impulses" and others. "about" is JSON with the versions
+    of the software and, if the command made the run, the scenario with all seeds.
 
-    Velocities jump at impacts: the sample at that time is the one before the impact.
+    Velocities jump at impacts: the sample at the time of an impact has the values before it.
 
     Attributes:
         time: The times in s, shape (k,), strictly increasing.
@@ -196,8 +196,8 @@ class Record:
     def from_csv(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
         """Reads a file of `to_csv`, or the log of a robot.
 
-        A row has what is so just before its time: a control that is held between samples is that of
-        the time before, up to this row.
+        A row has the values just before its time: a control with a zero-order hold is the one that
+        acted up to this row.
 
         Args:
             path: The file, with a line of names and then a line for each time.

@@ -37,9 +37,9 @@ def save_rerun(record: Record, path: str | Path) -> None:
     stream.save(str(path))
     times = rr.TimeColumn("time", duration=np.asarray(record.time))
     for name, recorded in record.signals.items():
-        for place, signal in enumerate(recorded.signals):
+        for column, signal in enumerate(recorded.signals):
             entry = f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
-            values = np.ascontiguousarray(recorded.values[:, place])
+            values = np.ascontiguousarray(recorded.values[:, column])
             where = rr.new_entity_path([name, entry])
             columns = rr.Scalars.columns(scalars=values)
             stream.send_columns(where, [times], columns, strict=True)

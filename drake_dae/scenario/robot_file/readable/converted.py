@@ -76,7 +76,7 @@ def _obj(mesh: Path) -> bytes:
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(lengths > 0.0, lengths, 1.0)
     rows = [
-        *("v {:.9g} {:.9g} {:.9g}\n".format(*place) for place in vertices.tolist()),
+        *("v {:.9g} {:.9g} {:.9g}\n".format(*vertex) for vertex in vertices.tolist()),
         *("vn {:.5g} {:.5g} {:.5g}\n".format(*normal) for normal in normals.tolist()),
         *(
             f"f {i}//{number} {j}//{number} {k}//{number}\n"

@@ -146,7 +146,8 @@ def _read_sdf(inertial: ElementTree.Element) -> _Read:
     inertia = inertial.find("inertia")
     if inertia is None:
         return None
-    entries = [inertia.findtext(key, "10"[i > 2]) for i, key in enumerate(_ENTRIES)]
+    # The defaults of SDFormat are those of the unit matrix.
+    entries = [inertia.findtext(key, "1" if key[1] == key[2] else "0") for key in _ENTRIES]
     return _numbers(inertial.findtext("mass", "1"), entries)
 
 

@@ -155,8 +155,9 @@ def _readable(
         text = _with_visuals(text, file, packages)
     if text == plain:
         return file, fixed
-    if not _is_mjcf(file):
-        text = _with_absolute_names(text, file)
+    if not _is_mjcf(file):  # Absolute names, since the copy is in another folder.
+        name = _FILE[file.suffix]
+        text = name.sub(lambda match: match[1] + _absolute(match[2], file) + match[3], text)
     copies.left_out.extend(left_out)
     copy = folder / str(len(copies.originals)) / file.name
     copy.parent.mkdir()
@@ -193,12 +194,6 @@ def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
         return match[0] if copy is None else f"{match[1]}{copy}{match[3]}"
 
     return _MESH[file.suffix].sub(drawn, text)
-
-
-def _with_absolute_names(text: str, file: Path) -> str:
-    """Makes names absolute, since the copy is in another folder."""
-    name = _FILE[file.suffix]
-    return name.sub(lambda match: match[1] + _absolute(match[2], file) + match[3], text)
 
 
 def _absolute(name: str, file: Path) -> str:

@@ -110,14 +110,14 @@ def _without_idle_transmissions(text: str) -> str:
 def _with_names_of_their_own(text: str) -> str:
     """Appends numbers to equal names of actuators."""
     taken = Counter(name for _, name in _ACTUATOR.findall(text))
-    seen: Counter[str] = Counter()
+    count: Counter[str] = Counter()
 
     def named(actuator: re.Match[str]) -> str:
         head, name = actuator.groups()
-        seen[name] += 1
-        if seen[name] == 1:
+        count[name] += 1
+        if count[name] == 1:
             return actuator[0]
-        number = seen[name]
+        number = count[name]
         while f"{name}_{number}" in taken:
             number += 1
         taken[f"{name}_{number}"] += 1
