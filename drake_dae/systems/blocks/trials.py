@@ -179,18 +179,11 @@ class StepWatch:
             _add(parameters, before, _parameters(context))
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
-        vars(progress).update(
-            vars(
-                RunProgress(
-                    time,
-                    start=time,
-                    mark=time,
-                    parameters=parameters,
-                    laws=progress.laws,
-                    entry=entry,
-                )
-            )
+        laws = progress.laws
+        begun = RunProgress(
+            time, start=time, mark=time, parameters=parameters, laws=laws, entry=entry
         )
+        vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return _DONE
