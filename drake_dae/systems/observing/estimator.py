@@ -126,12 +126,15 @@ class StateEstimator(ObservingSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {entry.ticket(), self.all_parameters_ticket()}
         read = {force, self.input_port_ticket(self._ports["reference"].get_index())}
-        size, value = functions.exogenous.outputs[0].size, port_value(self._exogenous_values)
-        self.DeclareVectorOutputPort("exogenous", size, value, sources | read)
-        parts = zip(("estimated_state", "disturbance", "friction"), self._parts, strict=False)
-        for name, part in parts:
-            size, value = part.stop - part.start, port_value(self._part, part)
-            self.DeclareVectorOutputPort(name, size, value, sources)
+        exogenous = port_value(self._exogenous_values)
+        state, disturbance, friction, _ = (port_value(self._part, part) for part in self._parts)
+        for name, size, value, tickets in (
+            ("estimated_state", law.system.num_states, state, sources),
+            ("exogenous", functions.exogenous.outputs[0].size, exogenous, sources | read),
+            ("disturbance", count, disturbance, sources),
+            ("friction", len(self.friction_signals), friction, sources),
+        ):
+            self.DeclareVectorOutputPort(name, size, value, tickets)
         if not self._measures:
             size = law.system.num_constraints
             self.DeclareVectorOutputPort(_FORCE, size, port_value(self._force), {force})
