@@ -153,7 +153,7 @@ ROBOTS = {
         "joint 'j': Coulomb friction of a joint is not supported",
     ),
     "no effort": ({"effort": "0"}, "joint 'j': .* zero effort limit"),
-    "two actuators on a joint": ({"more": SECOND}, "actuators m, m2 move the joints in 1 indepen"),
+    "two actuators on a joint": ({"more": SECOND}, "m, m2 move the joints in only 1 indepen"),
     "a second robot": ({"after": '<robot name="b"/>'}, "has 2 <robot>s, and only one is read"),
     "gears of ratio zero": (
         {"gear": '<drake:gear_ratio xmlns:drake="http://drake.mit.edu" value="0"/>'},

@@ -130,11 +130,12 @@ class _Surface:
     def __init__(self, model: RobotModel, name: str, touch: Touch) -> None:
         links, self._name, self._touch = model.links, name, touch
         points = ca.horzsplit(links.landmarks())
-        named = dict(zip(links.landmark_names, points, strict=True))
-        moving = {name: point for name, point in named.items() if ca.depends_on(point, links.q)}
-        self._links, of_links = list(moving), list(moving.values())
+        moves = [ca.depends_on(point, links.q) for point in points]
+        pairs = list(zip(links.landmark_names, points, moves, strict=True))
+        self._links = [name for name, _, moving in pairs if moving]  # Two robots may share names.
+        of_links = [point for _, point, moving in pairs if moving]
         # The world's origin is not part of a robot with a floating base.
-        fixed = [p for name, p in named.items() if name not in moving and name != "world"]
+        fixed = [point for name, point, moving in pairs if not moving and name != "world"]
         contact = links.position(touch.frame, touch.point)
         self._nq = links.q.numel()
         inputs = {"q": links.q, "parameters": model.dae.parameter_symbol}

@@ -31,10 +31,6 @@ class Links(Frames, Protocol):
     """
 
     @property
-    def q(self) -> ca.SX:
-        """Generalized positions, symbols, shape (nq, 1)."""
-
-    @property
     def v(self) -> ca.SX:
         """Generalized velocities, symbols, shape (nv, 1)."""
 
@@ -57,10 +53,6 @@ class Links(Frames, Protocol):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Numbers that a study may change."""
-
-    @property
-    def position_signals(self) -> tuple[Signal, ...]:
-        """Names and units of q."""
 
     @property
     def velocity_signals(self) -> tuple[Signal, ...]:

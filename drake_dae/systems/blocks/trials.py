@@ -109,7 +109,7 @@ class StepWatch:
         # events change everything else in it.
         self._index = system.DeclareCacheEntry(
             "progress",
-            ValueProducer(_no_simulation, _note_parameters),
+            ValueProducer(lambda: AbstractValue.Make(RunProgress()), _note_parameters),
             {system.all_parameters_ticket()},
         ).cache_index()
         # An entry keeps its system alive: a context may hold one, but not the system itself.
@@ -179,18 +179,11 @@ class StepWatch:
             _add(parameters, before, _parameters(context))
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
-        vars(progress).update(
-            vars(
-                RunProgress(
-                    time,
-                    start=time,
-                    mark=time,
-                    parameters=parameters,
-                    laws=progress.laws,
-                    entry=entry,
-                )
-            )
+        laws = progress.laws
+        begun = RunProgress(
+            time, start=time, mark=time, parameters=parameters, laws=laws, entry=entry
         )
+        vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return _DONE
@@ -231,10 +224,6 @@ def _along(history: Sequence[tuple[float, FloatArray]], times: FloatArray) -> Fl
     """The values of a history at some times, one row for each."""
     last = np.searchsorted([time for time, _ in history], times) - 1
     return np.array([values for _, values in history])[np.maximum(last, 0)]
-
-
-def _no_simulation() -> AbstractValue:
-    return AbstractValue.Make(RunProgress())
 
 
 def _note_parameters(context: Context, value: AbstractValue) -> None:

@@ -15,7 +15,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation, Update
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.observing_system import ObservingSystem
@@ -126,12 +126,15 @@ class StateEstimator(ObservingSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {entry.ticket(), self.all_parameters_ticket()}
         read = {force, self.input_port_ticket(self._ports["reference"].get_index())}
-        size, value = functions.exogenous.outputs[0].size, port_value(self._exogenous_values)
-        self.DeclareVectorOutputPort("exogenous", size, value, sources | read)
-        parts = zip(("estimated_state", "disturbance", "friction"), self._parts, strict=False)
-        for name, part in parts:
-            size, value = part.stop - part.start, port_value(self._part, part)
-            self.DeclareVectorOutputPort(name, size, value, sources)
+        exogenous = port_value(self._exogenous_values)
+        state, disturbance, friction, _ = (port_value(self._part, part) for part in self._parts)
+        for name, size, value, tickets in (
+            ("estimated_state", law.system.num_states, state, sources),
+            ("exogenous", functions.exogenous.outputs[0].size, exogenous, sources | read),
+            ("disturbance", count, disturbance, sources),
+            ("friction", len(self.friction_signals), friction, sources),
+        ):
+            self.DeclareVectorOutputPort(name, size, value, tickets)
         if not self._measures:
             size = law.system.num_constraints
             self.DeclareVectorOutputPort(_FORCE, size, port_value(self._force), {force})
@@ -213,25 +216,13 @@ class StateEstimator(ObservingSystem):
         shown = ca.Function("shown", [column], list(parts.values()))
         u, v = ca.SX.sym("u", self.dae.num_controls), ca.SX.sym("v", self.dae.num_constraints)
         after = ca.Function("after", [column, u, v], [ca.vertcat(column, u, v)])
-        return Block(
-            self,
-            (
-                now,
-                Computation(shown, (_NOW,), tuple(parts)),
-                Computation.of(functions.exogenous, state, ("exogenous",)),
-                self._traced_hold(force),
-            ),
-            (
-                Update(
-                    Computation(after, (_NOW, "control", force), (HELD,)),
-                    self.sample_period,
-                    is_unrestricted=True,
-                ),
-            ),
-            unwired=self._unwired("estimated_state"),
-            signals=self._signals,
-            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
+        computations = (
+            now,
+            Computation(shown, (_NOW,), tuple(parts)),
+            Computation.of(functions.exogenous, state, ("exogenous",)),
         )
+        sample = Computation(after, (_NOW, "control", force), (HELD,))
+        return self._block(computations, sample, force)
 
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:

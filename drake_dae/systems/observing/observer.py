@@ -9,7 +9,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.observing_system import ObservingSystem
@@ -131,21 +131,8 @@ class DisturbanceObserver(ObservingSystem):
         sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
         parts = [memory.disturbance, memory.friction]
         shown = ca.Function("shown", [memory.column], parts)
-        return Block(
-            self,
-            (
-                Computation.of(functions.exogenous, needed, ("exogenous",)),
-                self._traced_hold(),
-                Computation(shown, (HELD,), ("disturbance", "friction")),
-            ),
-            (
-                Update(
-                    Computation.of(functions.sample, sampled, (HELD,)),
-                    self.sample_period,
-                    is_unrestricted=True,
-                ),
-            ),
-            unwired=self._unwired("estimated_state"),
-            signals=self._signals,
-            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
+        computations = (
+            Computation.of(functions.exogenous, needed, ("exogenous",)),
+            Computation(shown, (HELD,), ("disturbance", "friction")),
         )
+        return self._block(computations, Computation.of(functions.sample, sampled, (HELD,)))

@@ -13,7 +13,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import NO_TIME_DERIVATIVE, ParameterizedSystem
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
-from drake_dae.systems.blocks.traced import PARAMETERS, Computation, zero
+from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation, Update, zero
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
 
@@ -155,14 +155,25 @@ class ObservingSystem(ParameterizedSystem):
     def _hold_output(self, context: Context) -> FloatArray:
         return self._observed.hold.evaluate(self._force(context), self._hold_input(context))[0]
 
-    def _traced_hold(self, force: str = "measured_force") -> Computation:
-        return Computation.of(self._observed.hold, (force, "hold"), ("hold",))
-
-    def _unwired(self, state: str) -> dict[str, Computation]:
-        """The values of input ports without a wire.
+    def _block(
+        self,
+        computations: Sequence[Computation],
+        sample: Computation,
+        force: str = "measured_force",
+    ) -> Block:
+        """The observer with some computations, and the update of its state at samples.
 
         Args:
-            state: The name of the state among the sources.
+            computations: All computations except that of the port `hold`.
+            sample: The computation of its state after a sample.
+            force: The source of the constraint force.
         """
-        moving = Computation.of(self.observation.moving, (state, PARAMETERS), ("reference",))
-        return {"hold": zero("hold"), "reference": moving}
+        rates = self.observation.moving, ("estimated_state", PARAMETERS), ("reference",)
+        return Block(
+            self,
+            (*computations, Computation.of(self._observed.hold, (force, "hold"), ("hold",))),
+            (Update(sample, self.sample_period, is_unrestricted=True),),
+            unwired={"hold": zero("hold"), "reference": Computation.of(*rates)},
+            signals=self._signals,
+            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
+        )

@@ -63,7 +63,8 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     with the forces F of `contact_force`, those of a continuous MultibodyPlant. Torques beyond the
     effort limits of the actuators are cut to them, as Drake does. Drake stops a joint at its
-    limits; this plant has no such stops, and a run that reaches one ends with an error.
+    limits; this plant has no such stops, and a run that reaches one ends with an error. After
+    `set_consistent_state` the robot touches without force, and penetrates when the run starts.
 
     Input ports:
         control: u, shape (p,).
@@ -188,16 +189,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
         self.check_context(context)
         context.SetDiscreteState(0, self.dae.state_vector(state))
         context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
-
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state on N* next to a guess, shape (n,), and returns it.
-
-        The robot then touches without force, and penetrates when the run starts.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
-        return super().set_consistent_state(context, guess)
 
     def set_contact(self, context: Context, material: PointMaterial) -> None:
         """Sets stiffness, dissipation, friction and radius, and places the balls on the robot.

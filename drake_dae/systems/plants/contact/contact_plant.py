@@ -54,7 +54,7 @@ from drake_dae.systems.plants.contact.traced_contact import traced_contact
 from drake_dae.systems.plants.contract import Plant
 
 
-def _is_of_use(record: logging.LogRecord) -> bool:
+def _is_relevant(record: logging.LogRecord) -> bool:
     """Filters Drake's message on half spaces in deformable contact, which is not used here."""
     return "half spaces are not currently supported for deformable" not in record.getMessage()
 
@@ -72,7 +72,8 @@ class ContactPlant(Diagram, Plant):
     of the robot collides.
 
     The plant steps at t_n = n time_step: its ports then have x(t_n), before the step to t_(n+1),
-    which uses the control at t_n. The force is that of the step to t_n.
+    which uses the control at t_n. The force is that of the step to t_n. After
+    `set_consistent_state` the robot touches without force, and penetrates when the run starts.
 
     Stages of actuation step with it and drive its joints: see `SteppedStages`. Rotors that belong
     to a stage do not move with the links.
@@ -132,7 +133,7 @@ class ContactPlant(Diagram, Plant):
         self._values = changed_parameters(model, parameters or {})
         if model.stages:
             check_step(model, material.time_step, self._values)
-        logging.getLogger("drake").addFilter(_is_of_use)
+        logging.getLogger("drake").addFilter(_is_relevant)
         inner = DiagramBuilder()
         config = MultibodyPlantConfig(
             time_step=material.time_step,
@@ -337,13 +338,3 @@ class ContactPlant(Diagram, Plant):
         count = self.multibody.num_multibody_states()
         links, stages = np.split(self.state(context), [count])
         return np.concatenate([links, self.GetOutputPort("contact_force").Eval(context), stages])
-
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state on N* next to a guess, shape (n,), and returns it.
-
-        The robot then touches without force, and penetrates when the run starts.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
-        return super().set_consistent_state(context, guess)

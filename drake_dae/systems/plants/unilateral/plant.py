@@ -111,10 +111,14 @@ class UnilateralRobotPlant(ModalPorts):
         super().__init__(model, contacts, structure)
         self._resets = Resets(self._contacts, self.modes, settling)
         self._log_index = self.DeclareCacheEntry(
-            "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
+            "events",
+            ValueProducer(lambda: AbstractValue.Make(RunLog()), _keep),
+            {self.nothing_ticket()},
         ).cache_index()
         self._margins_index = self.DeclareCacheEntry(
-            "margins", ValueProducer(_no_margins, weakly(self._calc_margins)), self._by_control
+            "margins",
+            ValueProducer(lambda: AbstractValue.Make(np.zeros(0)), weakly(self._calc_margins)),
+            self._by_control,
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
@@ -293,14 +297,6 @@ class UnilateralRobotPlant(ModalPorts):
                 "constraint_wrenches": tuple(self.wrench_signals),
             },
         )
-
-
-def _no_events() -> AbstractValue:
-    return AbstractValue.Make(RunLog())
-
-
-def _no_margins() -> AbstractValue:
-    return AbstractValue.Make(np.zeros(0))
 
 
 def _keep(context: Context, value: AbstractValue) -> None:

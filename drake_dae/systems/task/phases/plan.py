@@ -55,7 +55,7 @@ def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
             raise ModelError(f"{where}: '{name}' is no name of a phase; give it another one")
         if chosen.count(name) > 1:
             raise ModelError(f"{where}: more than one phase has the name '{name}'")
-        if name not in chosen:
+        if name == type(phase).__name__:
             taken = {*chosen, *(other.name for other in renamed)}
             while name in taken:
                 number += 1
