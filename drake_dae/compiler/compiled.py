@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
@@ -144,15 +145,11 @@ class CompiledDiagram:
         """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,)."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
-            own = system.GetMyContextFromRoot(context)
-            state[part] = own.get_continuous_state_vector().CopyToVector()
+            local = system.GetMyContextFromRoot(context)
+            state[part] = local.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
-            own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
-            if stepped is not None:
-                held[part] = stepped.held(own)
-            else:
-                groups = range(own.num_discrete_state_groups())
-                held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
+            local, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
+            held[part] = stepped.held(local) if stepped else np.concatenate(discrete_states(local))
         return state, held
 
     def set_context(
@@ -168,20 +165,18 @@ class CompiledDiagram:
         for system, part in self.states:
             system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
         for system, part in self.held:
-            own = system.GetMyMutableContextFromRoot(context)
-            groups = range(own.num_discrete_state_groups())
-            stops = np.cumsum([own.get_discrete_state(i).size() for i in groups])
+            local = system.GetMyMutableContextFromRoot(context)
+            stops = np.cumsum([group.size for group in discrete_states(local)])
             for i, values in enumerate(np.split(held[part], stops[:-1])):
-                own.SetDiscreteState(i, values)
+                local.SetDiscreteState(i, values)
         for system, part in self.parameters:
-            own = system.GetMyMutableContextFromRoot(context)
-            groups = range(own.num_numeric_parameter_groups())
-            stops = np.cumsum([own.get_numeric_parameter(i).size() for i in groups])
+            local = system.GetMyMutableContextFromRoot(context)
+            stops = np.cumsum([group.size for group in numeric_parameters(local)])
             for i, values in enumerate(np.split(parameters[part], stops[:-1])):
-                own.get_mutable_numeric_parameter(i).SetFromVector(values)
+                local.get_mutable_numeric_parameter(i).SetFromVector(values)
         for system, name, part in self.fixed:
-            own = system.GetMyMutableContextFromRoot(context)
-            system.GetInputPort(name).FixValue(own, parameters[part])
+            local = system.GetMyMutableContextFromRoot(context)
+            system.GetInputPort(name).FixValue(local, parameters[part])
 
     def initialized(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
@@ -231,16 +226,15 @@ class CompiledDiagram:
         """
         values = np.zeros(self.sizes["parameters"])
         for system, part in self.parameters:
-            own = system.GetMyContextFromRoot(context)
-            groups = range(own.num_numeric_parameter_groups())
-            values[part] = np.concatenate([own.get_numeric_parameter(i).value() for i in groups])
+            local = system.GetMyContextFromRoot(context)
+            values[part] = np.concatenate(numeric_parameters(local))
         for system, name, part in self.fixed:
-            own, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
-            if not port.HasValue(own):
+            local, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
+            if not port.HasValue(local):
                 raise ModelError(
                     f"the input port '{name}' of '{system.get_name()}' has no value in this context"
                 )
-            values[part] = port.Eval(own)
+            values[part] = port.Eval(local)
         for name, part in self.inputs:
             system, index = self.wires.inputs[name]
             values[part] = system.get_output_port(index).Eval(system.GetMyContextFromRoot(context))
