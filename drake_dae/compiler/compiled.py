@@ -207,8 +207,8 @@ class CompiledDiagram:
         """(time, state, held, parameters) -> the discrete state at the start of a run.
 
         Args:
-            held: The discrete state in the context. The function replaces the slices of blocks
-                that have NaN there. Returns None if all entries are finite.
+            held: The discrete state in a context. The function replaces the blocks that are NaN
+                in it. None is returned if all entries are finite.
         """
         if all(np.isfinite(held)):
             return None
@@ -242,7 +242,7 @@ class CompiledDiagram:
 
     @cached_property
     def twins(self) -> Mapping[System, System]:
-        """Plant -> the controller whose law has the plant's system as its model."""
+        """Plant -> its twin: the controller whose law has the plant's system as its model."""
         controllers = {
             id(block.model): system
             for system, block in self.blocks.items()
@@ -271,7 +271,10 @@ class CompiledDiagram:
 
     @cached_property
     def moved_parameters(self) -> Mapping[System, ca.Function]:
-        """Plant with time-varying parameters -> a function that returns all its parameters."""
+        """Plant with time-varying parameters -> a function that returns all its parameters.
+
+        The arguments are (time, state, held, parameters).
+        """
         return {
             system: self._function("parameters", [self._expressions.parameters(block)])
             for system, block in self.blocks.items()

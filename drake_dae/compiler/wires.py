@@ -67,12 +67,12 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
 
 
 def leaf_port(port: OutputPort) -> Port:
-    """The output port of a leaf whose value an output port of any system has."""
+    """The port of a leaf that an output port exports; a leaf's port is returned as is."""
     return _output(port.get_system(), int(port.get_index()))
 
 
 def _output(system: System, index: int) -> Port:
-    """The output port of a leaf that a diagram exports as this output port."""
+    """The port of a leaf that an output port exports, through all nested diagrams."""
     while isinstance(system, Diagram) and not isinstance(system, Traced):
         system, inner = system.get_output_port_locator(OutputPortIndex(index))
         index = int(inner)
@@ -80,7 +80,7 @@ def _output(system: System, index: int) -> Port:
 
 
 def _inputs(system: System, index: int) -> list[Port]:
-    """The input ports of leaves that a diagram exports as this input port."""
+    """The ports of leaves that an input port feeds, through all nested diagrams."""
     if not isinstance(system, Diagram) or isinstance(system, Traced):
         return [(system, index)]
     locators = system.GetInputPortLocators(InputPortIndex(index))
