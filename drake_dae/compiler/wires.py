@@ -80,7 +80,7 @@ def _output(system: System, index: int) -> Port:
 
 
 def _inputs(system: System, index: int) -> list[Port]:
-    """The ports of leaves that an input port feeds, through all nested diagrams."""
+    """The input ports of leaves that a diagram exports as this input port."""
     if not isinstance(system, Diagram) or isinstance(system, Traced):
         return [(system, index)]
     locators = system.GetInputPortLocators(InputPortIndex(index))
