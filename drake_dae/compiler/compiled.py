@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
@@ -144,15 +145,11 @@ class CompiledDiagram:
         """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,)."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
-            own = system.GetMyContextFromRoot(context)
-            state[part] = own.get_continuous_state_vector().CopyToVector()
+            local = system.GetMyContextFromRoot(context)
+            state[part] = local.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
-            own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
-            if stepped is not None:
-                held[part] = stepped.held(own)
-            else:
-                groups = range(own.num_discrete_state_groups())
-                held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
+            local, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
+            held[part] = stepped.held(local) if stepped else np.concatenate(discrete_states(local))
         return state, held
 
     def set_context(
@@ -168,20 +165,18 @@ class CompiledDiagram:
         for system, part in self.states:
             system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
         for system, part in self.held:
-            own = system.GetMyMutableContextFromRoot(context)
-            groups = range(own.num_discrete_state_groups())
-            stops = np.cumsum([own.get_discrete_state(i).size() for i in groups])
+            local = system.GetMyMutableContextFromRoot(context)
+            stops = np.cumsum([group.size for group in discrete_states(local)])
             for i, values in enumerate(np.split(held[part], stops[:-1])):
-                own.SetDiscreteState(i, values)
+                local.SetDiscreteState(i, values)
         for system, part in self.parameters:
-            own = system.GetMyMutableContextFromRoot(context)
-            groups = range(own.num_numeric_parameter_groups())
-            stops = np.cumsum([own.get_numeric_parameter(i).size() for i in groups])
+            local = system.GetMyMutableContextFromRoot(context)
+            stops = np.cumsum([group.size for group in numeric_parameters(local)])
             for i, values in enumerate(np.split(parameters[part], stops[:-1])):
-                own.get_mutable_numeric_parameter(i).SetFromVector(values)
+                local.get_mutable_numeric_parameter(i).SetFromVector(values)
         for system, name, part in self.fixed:
-            own = system.GetMyMutableContextFromRoot(context)
-            system.GetInputPort(name).FixValue(own, parameters[part])
+            local = system.GetMyMutableContextFromRoot(context)
+            system.GetInputPort(name).FixValue(local, parameters[part])
 
     def initialized(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
@@ -212,8 +207,8 @@ class CompiledDiagram:
         """(time, state, held, parameters) -> the discrete state at the start of a run.
 
         Args:
-            held: The discrete state in the context. The function replaces the slices of blocks
-                that have NaN there. Returns None if all entries are finite.
+            held: The discrete state in a context. The function replaces the blocks that are NaN
+                in it. None is returned if all entries are finite.
         """
         if all(np.isfinite(held)):
             return None
@@ -231,16 +226,15 @@ class CompiledDiagram:
         """
         values = np.zeros(self.sizes["parameters"])
         for system, part in self.parameters:
-            own = system.GetMyContextFromRoot(context)
-            groups = range(own.num_numeric_parameter_groups())
-            values[part] = np.concatenate([own.get_numeric_parameter(i).value() for i in groups])
+            local = system.GetMyContextFromRoot(context)
+            values[part] = np.concatenate(numeric_parameters(local))
         for system, name, part in self.fixed:
-            own, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
-            if not port.HasValue(own):
+            local, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
+            if not port.HasValue(local):
                 raise ModelError(
                     f"the input port '{name}' of '{system.get_name()}' has no value in this context"
                 )
-            values[part] = port.Eval(own)
+            values[part] = port.Eval(local)
         for name, part in self.inputs:
             system, index = self.wires.inputs[name]
             values[part] = system.get_output_port(index).Eval(system.GetMyContextFromRoot(context))
@@ -248,7 +242,7 @@ class CompiledDiagram:
 
     @cached_property
     def twins(self) -> Mapping[System, System]:
-        """Plant -> the controller whose law has the plant's system as its model."""
+        """Plant -> its twin: the controller whose law has the plant's system as its model."""
         controllers = {
             id(block.model): system
             for system, block in self.blocks.items()
@@ -277,7 +271,10 @@ class CompiledDiagram:
 
     @cached_property
     def moved_parameters(self) -> Mapping[System, ca.Function]:
-        """Plant with time-varying parameters -> a function that returns all its parameters."""
+        """Plant with time-varying parameters -> a function that returns all its parameters.
+
+        The arguments are (time, state, held, parameters).
+        """
         return {
             system: self._function("parameters", [self._expressions.parameters(block)])
             for system, block in self.blocks.items()

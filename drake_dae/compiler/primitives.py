@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus, PortDataType, System
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.errors import ModelError
 from drake_dae.symbolic import to_casadi
 from drake_dae.systems.blocks.traced import (
@@ -96,8 +97,8 @@ class _Converted:
     def __init__(self, system: System, converted: System, name: str) -> None:
         self._system, self._converted, self._name = system, converted, name
         self._context = context = converted.CreateDefaultContext()
-        own = system.CreateDefaultContext()
-        if own.num_abstract_states() or own.num_abstract_parameters():
+        default = system.CreateDefaultContext()
+        if default.num_abstract_states() or default.num_abstract_parameters():
             raise ModelError(
                 f"{name} cannot be traced: it has an abstract state or parameter, so that it "
                 "only runs in Drake's Simulator"
@@ -107,14 +108,9 @@ class _Converted:
         time = self._variables(TIME, 1)
         context.SetTime(time[0])
         sizes = {
-            STATE: [own.num_continuous_states()],
-            HELD: [
-                own.get_discrete_state(i).size() for i in range(own.num_discrete_state_groups())
-            ],
-            PARAMETERS: [
-                own.get_numeric_parameter(i).size()
-                for i in range(own.num_numeric_parameter_groups())
-            ],
+            STATE: [default.num_continuous_states()],
+            HELD: [group.size for group in discrete_states(default)],
+            PARAMETERS: [group.size for group in numeric_parameters(default)],
         }
         state, held, parameters = (
             np.split(self._variables(source, sum(each)), np.cumsum(each)[:-1])

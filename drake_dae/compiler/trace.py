@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 from pydrake.systems.framework import Context, PortDataType, System
 
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.primitives import primitive
 from drake_dae.compiler.wires import Port, Wires
 from drake_dae.errors import ModelError
@@ -98,7 +99,6 @@ class Expressions:
         self._open: list[tuple[System, Computation]] = []
         # The calls on which each expression under construction depends; the innermost is last.
         self._dependencies: list[dict[int, TracedCall]] = []
-        self._computations: dict[System, dict[str, Computation]] = {}
         self._under: dict[System, tuple[Block, Computation]] = {}
         cut = {name: system.get_output_port(i) for name, (system, i) in wires.inputs.items()}
         self.inputs = {name: ca.SX.sym(name, port.size()) for name, port in cut.items()}
@@ -109,14 +109,7 @@ class Expressions:
     def block(self, system: System) -> Block:
         """The block of a system: its computations and updates."""
         if system not in self.used:
-            block = system.traced() if isinstance(system, Traced) else primitive(system)
-            self.used[system] = block
-            self._computations[system] = {
-                name: computation
-                for computation in block.computations
-                for name in computation.outputs
-                if name
-            }
+            self.used[system] = system.traced() if isinstance(system, Traced) else primitive(system)
         return self.used[system]
 
     def port(self, port: Port) -> ca.SX:
@@ -133,7 +126,7 @@ class Expressions:
         if (system, name) in self._cut:
             return self._cut[system, name]
         block = self.block(system)
-        computation = self._computations[system].get(name)
+        computation = next((each for each in block.computations if name in each.outputs), None)
         if computation is None:
             raise ModelError(
                 f"the output port '{name}' of '{system.get_name()}' cannot be traced. What depends "
@@ -277,7 +270,7 @@ class Expressions:
         port, source = system.GetInputPort(name), self._source(system, name)
         if source is not None:
             return self.port(source)
-        if port.HasValue(self._own(system)):
+        if port.HasValue(self._local(system)):
             return self.symbol(system, name, port.size())
         law = self._law_behind(system)
         if law is not None and law.HasOutputPort(name):
@@ -300,7 +293,7 @@ class Expressions:
             parameters = self.symbol(twin, PARAMETERS, self._size(twin, PARAMETERS))[:size]
         if block.moving and system.HasInputPort("exogenous"):
             port = system.GetInputPort("exogenous")
-            if self._source(system, "exogenous") is not None or port.HasValue(self._own(system)):
+            if self._source(system, "exogenous") is not None or port.HasValue(self._local(system)):
                 parameters = ca.SX(parameters)
                 parameters[list(block.moving)] = self.input(block, "exogenous")
         return parameters
@@ -312,7 +305,7 @@ class Expressions:
         source = self._source(plant, "control")
         port = controller.system.GetOutputPort("control")
         is_direct = source == (controller.system, int(port.get_index()))
-        if source is None and not plant.GetInputPort("control").HasValue(self._own(plant)):
+        if source is None and not plant.GetInputPort("control").HasValue(self._local(plant)):
             is_direct = self._law_behind(plant) is controller.system
         under = controller.under() if is_direct else None
         if under is not None:
@@ -323,7 +316,7 @@ class Expressions:
         index = int(system.GetInputPort(name).get_index())
         return self._wires.sources.get((system, index))
 
-    def _own(self, system: System) -> Context:
+    def _local(self, system: System) -> Context:
         return system.GetMyContextFromRoot(self._context)
 
     def symbol(self, system: System, name: str, size: int) -> ca.SX:
@@ -336,19 +329,17 @@ class Expressions:
     def _law_behind(self, system: System) -> System | None:
         """The block connected to an abstract-valued input port, which provides the law."""
         for index in range(system.num_input_ports()):
-            if system.get_input_port(index).get_data_type() == PortDataType.kAbstractValued:
-                source = self._wires.sources.get((system, index))
-                if source is not None:
-                    return source[0]
+            is_abstract = (
+                system.get_input_port(index).get_data_type() == PortDataType.kAbstractValued
+            )
+            if is_abstract and (source := self._wires.sources.get((system, index))) is not None:
+                return source[0]
         return None
 
     def _size(self, system: System, name: str) -> int:
         """The number of entries of a column of a block."""
-        context = self._own(system)
+        context = self._local(system)
         if name == STATE:
             return int(context.num_continuous_states())
-        if name == PARAMETERS:
-            count = context.num_numeric_parameter_groups()
-            return sum(context.get_numeric_parameter(i).size() for i in range(count))
-        count = context.num_discrete_state_groups()
-        return sum(context.get_discrete_state(i).size() for i in range(count))
+        groups = numeric_parameters if name == PARAMETERS else discrete_states
+        return sum(group.size for group in groups(context))

@@ -67,12 +67,12 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
 
 
 def leaf_port(port: OutputPort) -> Port:
-    """The output port of a leaf whose value an output port of any system has."""
+    """The port of a leaf that an output port exports; a leaf's port is returned as is."""
     return _output(port.get_system(), int(port.get_index()))
 
 
 def _output(system: System, index: int) -> Port:
-    """The output port of a leaf that a diagram exports as this output port."""
+    """The port of a leaf that an output port exports, through all nested diagrams."""
     while isinstance(system, Diagram) and not isinstance(system, Traced):
         system, inner = system.get_output_port_locator(OutputPortIndex(index))
         index = int(inner)
