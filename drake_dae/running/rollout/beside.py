@@ -9,18 +9,15 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings
 from drake_dae.running.rollout.stepping.called import BufferedFunction
-from drake_dae.running.rollout.stepping.fused import DiagramFunctions
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
 
-LOOKED = 64
-"""The number of samples after which a run checks for Ctrl-C and divergence."""
-
 
 def run_beside(
-    fused: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
+    functions: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
 ) -> Run:
     """Runs a diagram in which Drake steps one block, and no block has a continuous state.
 
@@ -29,21 +26,21 @@ def run_beside(
     rows of the record are computed at the end, from the values that were held.
 
     Args:
-        fused: The diagram.
+        functions: The diagram.
         code: Its machine code; None if there is none.
         problem: What to run.
         settings: Its `look` says whether to stop.
     """
-    plant = _DrakeSteps(fused, problem)
+    plant = _DrakeSteps(functions, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
     kept = np.empty((times.size, held.size))
     rows = count = 0
     ending, error, moment = RunEnding.DONE, None, float(times[0])
-    take = _sampler(fused, code, problem, held)
+    take = _sampler(functions, code, problem, held)
 
     def written() -> FloatArray:
         states = np.zeros((rows, 0))
-        return fused.rows(times[:rows], states, kept[:rows], problem.parameters)[0]
+        return functions.rows(times[:rows], states, kept[:rows], problem.parameters)[0]
 
     while rows < times.size:
         at = problem.events[count] if count < problem.events.size else np.inf
@@ -79,8 +76,8 @@ def run_beside(
 class _DrakeSteps:
     """The block that Drake steps, in a context of its own."""
 
-    def __init__(self, fused: DiagramFunctions, problem: RunProblem) -> None:
-        compiled = fused.program.compiled
+    def __init__(self, functions: DiagramFunctions, problem: RunProblem) -> None:
+        compiled = functions.program.compiled
         rate, block = compiled.stepped
         assert block.stepped is not None
         stepped, system = block.stepped, block.stepped.system
@@ -106,7 +103,7 @@ class _DrakeSteps:
 
 
 def _sampler(
-    fused: DiagramFunctions, code: Library | None, problem: RunProblem, held: FloatArray
+    functions: DiagramFunctions, code: Library | None, problem: RunProblem, held: FloatArray
 ) -> Callable[[float, int, int, bool, FloatArray], bool]:
     """A function that makes the updates in `held` and returns whether all values are valid.
 
@@ -114,7 +111,7 @@ def _sampler(
     unrestricted ones or the discrete ones, and an array for what Drake's block reads, which comes
     with the unrestricted ones.
     """
-    compiled, parameters = fused.program.compiled, problem.parameters
+    compiled, parameters = functions.program.compiled, problem.parameters
     kinds = sum(
         1 << i
         for i, rate in enumerate(compiled.rates)
@@ -140,7 +137,7 @@ def _sampler(
         valid, noise = np.zeros(1), problem.noise[index]
         if first:
             into[:], valid = read(time, np.zeros(0), held, parameters, noise)
-        held[:] = fused.update(time, np.zeros(0), held, parameters, noise, due, first)
+        held[:] = functions.update(time, np.zeros(0), held, parameters, noise, due, first)
         return bool(np.isfinite(valid[0]) and np.isfinite(held).all())
 
     return sample_slowly

@@ -26,7 +26,7 @@ from drake_dae.running.rollout.problems import Problems, problems_of
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
-from drake_dae.running.rollout.stepping.fused import DiagramFunctions
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.trace.compiled import Compiled
 
@@ -216,8 +216,8 @@ def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutPro
 
 def _interpreted(program: RolloutProgram, settings: Settings) -> Callable[..., Run]:
     """What runs a problem from its start, whatever it came to elsewhere."""
-    run = interpreted.runner(program.kept("fused", lambda: DiagramFunctions(program)), settings)
-    return lambda problem, *given: run(problem)
+    functions = program.kept("functions", lambda: DiagramFunctions(program))
+    return lambda problem, *state: interpreted.run(functions, settings, problem)
 
 
 def _runs(
@@ -231,14 +231,14 @@ def _runs(
     if code is not None and side_by_side is not None:
         return run_many(side_by_side, code, program, problems, settings)
     if code is None or program.compiled.changes or program.compiled.has_stepped:
-        fused = program.kept("fused", lambda: DiagramFunctions(program))
-        run = interpreted.runner(fused, settings)
+        functions = program.kept("functions", lambda: DiagramFunctions(program))
+        run = partial(interpreted.run, functions, settings)
     if code is not None:
         run = partial(machine.run, code, program, settings=settings)
     if program.compiled.changes:
-        run = partial(run_with_changes, fused, run, settings.tableau)
+        run = partial(run_with_changes, functions, run, settings.tableau)
     if program.compiled.has_stepped:
-        run = partial(run_beside, fused, code, settings=settings)
+        run = partial(run_beside, functions, code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:
         return [run(problems[index]) for index in range(len(problems))]
     # Machine code lets go of Python's lock: threads are enough for all cores.

@@ -23,6 +23,10 @@ SMALLEST = 1e-13
 """Less than this, relative to the state, no step can promise."""
 
 
+LOOKED = 64
+"""The number of fixed steps or samples after which a run checks for Ctrl-C and divergence."""
+
+
 def num_cores() -> int:
     """How many cores this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # macOS has none.

@@ -12,7 +12,7 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import RunProblem, Tableau
 from drake_dae.running.rollout.stepping.called import BufferedFunction
-from drake_dae.running.rollout.stepping.course import REACHED
+from drake_dae.running.rollout.stepping.functions import REACHED
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
 
 MOST = 8
@@ -103,17 +103,14 @@ class ComputedFunctions:
 
     def run(self, longest: float) -> None:
         """Runs from the start to the end."""
-        times, number = self._problem.times, 0
-        for block in fixed_steps(self._problem, longest):
-            for first, after, is_row in block.tolist():
-                if not number:
-                    self._add("row", "row", first)
-                    number = 1
-                self._update(first)
-                self._add("state", "step", first, after - first)
-                if is_row and number < times.size - 1:
-                    self._add("row", "row", after, row=number)
-                    number += 1
+        times, number = self._problem.times, 1
+        self._add("row", "row", times[0])
+        for first, after, is_row in fixed_steps(self._problem, longest):
+            self._update(first)
+            self._add("state", "step", first, after - first)
+            if is_row and number < times.size - 1:
+                self._add("row", "row", after, row=number)
+                number += 1
         self._update(times[-1])
         self._add("row", "row", times[-1], row=number)
 
