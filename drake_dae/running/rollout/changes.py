@@ -1,4 +1,4 @@
-"""Runs in which blocks change at moments that are found: contacts that open, phases of a task."""
+"""Runs in which blocks change at times to be located: contacts that open, phases of a task."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

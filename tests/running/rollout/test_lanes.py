@@ -268,7 +268,7 @@ def test_operations_are_those_of_casadi(options):
 
 def test_what_lanes_do_not_know_is_refused():
     function = ca.Function("odd", [X], [ca.erf(X)])
-    with pytest.raises(ModelError, match=re.escape("odd has an operation that lanes do not know")):
+    with pytest.raises(ModelError, match=re.escape("odd has an operation that lanes do not support")):
         emitted(function, "odd")
 
 

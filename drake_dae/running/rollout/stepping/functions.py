@@ -80,8 +80,8 @@ class DiagramFunctions:
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> FloatArray | None:
         """Returns the state on N* after two Newton steps; None if these do not reach it."""
-        found, left = self._newton(time, state, held, parameters)
-        return found.copy() if left[0] <= REACHED else None
+        projected, left = self._newton(time, state, held, parameters)
+        return projected.copy() if left[0] <= REACHED else None
 
     def guards(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
@@ -142,6 +142,11 @@ class DiagramFunctions:
         """Returns states after two Newton steps, and which are on N*; arguments as of `rows`."""
         states, left = self._projections(times[:, None], states, held, parameters)
         return states, left[:, 0] <= REACHED
+
+
+def functions_of(program: RolloutProgram) -> DiagramFunctions:
+    """Returns the functions of a diagram, which are made once."""
+    return program.kept("functions", lambda: DiagramFunctions(program))
 
 
 def _evaluated(
