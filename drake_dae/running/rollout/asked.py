@@ -63,12 +63,12 @@ class RolloutRequest:
         check_choice("rollout", choice)
         moments = checked_times(times)
 
-        def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+        def look_at_rows(rows: Callable[[], FloatArray], context: Context | None) -> bool:
             if look is None:
                 return False
             return look(lambda after: record_of(program, moments, rows(), after, context))
 
-        settings = Settings.of(config, program.compiled.scale, looked)
+        settings = Settings.of(config, program.compiled.scale, look_at_rows)
         return cls(program, moments, choice, settings, lasting)
 
     def machine_code(self, program: RolloutProgram, count: int) -> machine.Library | None:
@@ -78,20 +78,18 @@ class RolloutRequest:
         """
         if self.choice is False:
             return None
-        if program.library is None and self._is_sought(program, count, 1.0):
-            program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
+        make = self._pays(program, count, 1.0)
+        if program.library is None and (make or self.lasting is None):
+            program.library = machine.load(program, self.choice, make)
         return program.library
 
     def lanes(self, program: RolloutProgram, count: int) -> machine.Library | None:
         """Returns as `machine_code`, for runs side by side."""
         can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
-        if not can_run or not self._is_sought(program, count, FASTER):
-            return None
         make = self._pays(program, count, FASTER)
+        if not can_run or not (make or self.lasting is None):
+            return None
         return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
-
-    def _is_sought(self, program: RolloutProgram, count: int, saved: float) -> bool:
-        return self.lasting is None or self._pays(program, count, saved)
 
     def _pays(self, program: RolloutProgram, count: int, saved: float) -> bool:
         """Whether machine code pays that saves a fraction of each interpreted evaluation."""

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.compiler.rates import dense_function
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import RunProblem, Tableau
@@ -57,7 +58,7 @@ class Differentiable:
         value = self._function.call(symbols)[0]
         weights = ca.SX.sym("weights", value.numel())
         gradients = [ca.jtimes(value, x, weights, True) for x in symbols[1:4]]
-        return BufferedFunction(_dense("backward", [*symbols, weights], gradients))
+        return BufferedFunction(dense_function("backward", [*symbols, weights], gradients))
 
 
 class RungeKuttaStep(Differentiable):
@@ -78,14 +79,15 @@ class RungeKuttaStep(Differentiable):
         time, state, held, parameters = (ca.MX.sym("x", size) for size in sizes)
         step = ca.MX.sym("step")
         changes = [ca.MX.sym("d", size, count) for size in sizes[1:]]
-        values, slopes = list[ca.MX](), list[ca.MX]()
+        values, slopes, zero = list[ca.MX](), list[ca.MX](), ca.MX(0.0)
         for row, part in zip(self._tableau.a, self._tableau.c, strict=True):
-            x, d = state + step * _sum(row, values), changes[0] + step * _sum(row, slopes)
+            x = state + step * _sum(row, values, zero)
+            d = changes[0] + step * _sum(row, slopes, zero)
             value, slope = rate(time + part * step, x, held, parameters, d, *changes[1:])
             values.append(value)
             slopes.append(slope)
         b = self._tableau.b
-        results = [state + step * _sum(b, values), changes[0] + step * _sum(b, slopes)]
+        results = [state + step * _sum(b, values, zero), changes[0] + step * _sum(b, slopes, zero)]
         symbols = [time, state, held, parameters, step, *changes]
         return BufferedFunction(ca.Function("forward", symbols, results))
 
@@ -202,11 +204,6 @@ def _symbols(function: ca.Function) -> list[ca.SX]:
     return [ca.SX.sym("x", function.numel_in(i)) for i in range(function.n_in())]
 
 
-def _dense(name: str, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX]) -> ca.Function:
-    dense = [ca.densify(each) for each in outputs]
-    return ca.Function(name, list(inputs), ca.cse(dense), {"cse": False})
-
-
 def _forward(function: ca.Function, count: int) -> ca.Function:
     """(arguments, changes of state, held and parameters) -> the result, and its change."""
     symbols = _symbols(function)
@@ -216,29 +213,23 @@ def _forward(function: ca.Function, count: int) -> ca.Function:
         (ca.jtimes(value, x, d) for x, d in zip(symbols[1:4], changes, strict=True)),
         ca.SX.zeros(value.numel(), count),
     )
-    return _dense("forward", [*symbols, *changes], [value, change])
+    return dense_function("forward", [*symbols, *changes], [value, change])
 
 
-def _sum(weights: FloatArray, values: Sequence[ca.MX]) -> ca.MX:
-    """Returns the weighted sum of the first stages."""
+def _sum(weights: FloatArray, values: Sequence[Any], zero: Any) -> Any:
+    """Returns the weighted sum of the stages so far."""
     pairs = zip(weights.tolist(), values, strict=False)
-    return sum((weight * each for weight, each in pairs if weight), ca.MX(0.0))
+    return sum((weight * each for weight, each in pairs if weight), zero)
 
 
 def _step(rate: ca.Function, tableau: Tableau) -> ca.Function:
     """Returns a Runge-Kutta step: (time, state, held, parameters, step) -> the state."""
     time, state, held, parameters = _symbols(rate)
-    step = ca.SX.sym("step")
-
-    def weighted(weights: FloatArray) -> ca.SX:
-        pairs = zip(weights.tolist(), rates, strict=False)
-        return sum((weight * each for weight, each in pairs if weight), ca.SX.zeros(state.shape))
-
-    rates: list[ca.SX] = []
+    step, zero, rates = ca.SX.sym("step"), ca.SX.zeros(state.shape), list[ca.SX]()
     for row, part in zip(tableau.a, tableau.c, strict=True):
-        stage = state + step * weighted(row)
+        stage = state + step * _sum(row, rates, zero)
         rates.append(rate(time + part * step, stage, held, parameters)[0])
-    reached = state + step * weighted(tableau.b)
+    reached = state + step * _sum(tableau.b, rates, zero)
     return ca.Function("step", [time, state, held, parameters, step], [reached])
 
 

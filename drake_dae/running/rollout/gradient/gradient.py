@@ -152,8 +152,8 @@ class FunctionChain:
         compiled = program.compiled
         if compiled.changes or compiled.has_stepped:
             raise ModelError(
-                f"{program.name} has no gradient: a block changes at times that a run has to locate, "
-                "as at impacts and openings, or Drake steps it"
+                f"{program.name} has no gradient: a block changes at times that a run locates, as "
+                "at impacts and openings, or Drake steps it"
             )
         seeds = None if seed is None else [seed]
         problems = problems_of(program, start, parameters, request.times, seeds)

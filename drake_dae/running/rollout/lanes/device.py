@@ -54,8 +54,8 @@ def run_on_device(program: RolloutProgram, problems: Problems, settings: Setting
     cupy = find_device()
     if not can_run(program):
         raise ModelError(
-            f'{program.name} does not run with device="cuda": a block in it changes at times that a '
-            "run has to locate, or Drake steps it, or it has an operation that lanes do not support"
+            f'{program.name} does not run with device="cuda": a block in it changes at times that '
+            "a run locates, or Drake steps it, or it has an operation that lanes do not support"
         )
     options = ("-std=c++17", "--fmad=true")
     kernel = program.kept(
