@@ -111,10 +111,13 @@ class _Changes:
 
     def is_missed(self, time: float, state: FloatArray, held: FloatArray) -> bool:
         """Whether blocks do not react to a change, whose guards are zero but for round-off."""
+        before = self.context.Clone()
         try:
             reacted, held_after, goes_on = self.react(time, state, held)
         except SimulationError:  # It is raised again by the reaction itself.
             return False
+        finally:  # A trial leaves no trace in what blocks remember.
+            self.context.SetTimeStateAndParametersFrom(before)
         return goes_on and _is_same(reacted, held_after, state, held)
 
     def has_settled(self, run: Run, time: float, state: FloatArray, held: FloatArray) -> bool:
