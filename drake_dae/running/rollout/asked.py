@@ -1,4 +1,4 @@
-"""How runs are made, as `rollout` is asked: the settings, and whether machine code is made."""
+"""A request for rollouts: the settings, and the decision on machine code."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,19 +21,19 @@ from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
 STAGES_PER_SECOND = 500
-"""About so many evaluations takes a simulated second under error control."""
+"""An estimate of the evaluations in a simulated second under error control."""
 
 FASTER = 0.05
-"""What runs side by side save of each evaluation, in the times of one that is interpreted."""
+"""The time that runs side by side save per evaluation, over that of an interpreted one."""
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutRequest:
-    """How runs are made, as `run_loop` is asked.
+    """The arguments of `run_loop`, checked.
 
     Attributes:
-        program: What is run.
-        times: When rows are written, in s.
+        program: The program.
+        times: The times of the rows in s.
         choice: Whether to make machine code.
         settings: How to step.
         lasting: As of `run_loop`.
@@ -55,7 +55,7 @@ class RolloutRequest:
         lasting: float | None,
         look: Callable[[RecordAfter], bool] | None = None,
     ) -> Self:
-        """From the arguments of `run_loop`; errors as of `rollout`."""
+        """Checks the arguments of `run_loop`; errors as of `rollout`."""
         config = config or SimulatorConfig()
         check_config(config)
         program = program_of(loop)
@@ -63,38 +63,36 @@ class RolloutRequest:
         check_choice("rollout", choice)
         moments = checked_times(times)
 
-        def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+        def look_at_rows(rows: Callable[[], FloatArray], context: Context | None) -> bool:
             if look is None:
                 return False
             return look(lambda after: record_of(program, moments, rows(), after, context))
 
-        settings = Settings.of(config, program.compiled.scale, looked)
+        settings = Settings.of(config, program.compiled.scale, look_at_rows)
         return cls(program, moments, choice, settings, lasting)
 
     def machine_code(self, program: RolloutProgram, count: int) -> machine.Library | None:
-        """A diagram as machine code, by the choice and by what its runs take without.
+        """Returns a diagram as machine code; None if it does not pay to make it.
 
-        Where it does not pay to make it, the cache is looked into if these runs are all.
+        If these runs are all, machine code in the cache is used even where making it does not pay.
         """
         if self.choice is False:
             return None
-        if program.library is None and self._is_sought(program, count, 1.0):
-            program.library = machine.load(program, self.choice, self._pays(program, count, 1.0))
+        make = self._pays(program, count, 1.0)
+        if program.library is None and (make or self.lasting is None):
+            program.library = machine.load(program, self.choice, make)
         return program.library
 
     def lanes(self, program: RolloutProgram, count: int) -> machine.Library | None:
-        """The same for runs side by side."""
+        """Returns as `machine_code`, for runs side by side."""
         can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
-        if not can_run or not self._is_sought(program, count, FASTER):
-            return None
         make = self._pays(program, count, FASTER)
+        if not can_run or not (make or self.lasting is None):
+            return None
         return program.kept(f"lanes {make}", lambda: lanes.load(program, self.choice, make))
 
-    def _is_sought(self, program: RolloutProgram, count: int, saved: float) -> bool:
-        return self.lasting is None or self._pays(program, count, saved)
-
     def _pays(self, program: RolloutProgram, count: int, saved: float) -> bool:
-        """Whether to make machine code that saves a part of each interpreted evaluation."""
+        """Whether machine code pays that saves a fraction of each interpreted evaluation."""
         if self.choice is True:
             return True
         seconds = count * float(np.ptp(self.times)) if self.lasting is None else self.lasting
@@ -102,8 +100,8 @@ class RolloutRequest:
         if self.settings.tableau is not None:
             calls = len(self.settings.tableau.b) / self.settings.longest * seconds
         calls += seconds * sum(1.0 / rate.period for rate in program.compiled.rates)
-        pays = attempts("auto", program.num_operations)
-        return any(each.make and saved * calls >= each.calls for each in pays)
+        tries = attempts("auto", program.num_operations)
+        return any(each.make and saved * calls >= each.calls for each in tries)
 
 
 def record_of(
@@ -113,13 +111,12 @@ def record_of(
     after: float | None = None,
     context: Context | None = None,
 ) -> Record:
-    """The rows of a run as a record, or those that are later than a time in s."""
+    """Returns the record of a run, or of its rows after a time in s."""
     first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
-    columns = program.signals
-    stops = np.cumsum([len(signals) for signals in columns.values()])
+    stops = np.cumsum([len(signals) for signals in program.signals.values()])
     parts = np.split(rows[first:], stops[:-1], axis=1)
     signals = {
-        name: recorded_values(part, tuple(columns[name]))
-        for name, part in zip(columns, parts, strict=True)
+        name: recorded_values(part, tuple(columns))
+        for (name, columns), part in zip(program.signals.items(), parts, strict=True)
     }
     return program.complete(Record(times[first : len(rows)], signals), context)

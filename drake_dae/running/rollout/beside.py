@@ -1,4 +1,4 @@
-"""Runs of a plant that Drake steps, where one call computes everything else of a sample."""
+"""Runs of a plant that Drake steps; one call computes all other blocks at a sample."""
 
 import ctypes
 from collections.abc import Callable
@@ -9,78 +9,81 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings
 from drake_dae.running.rollout.stepping.called import BufferedFunction
-from drake_dae.running.rollout.stepping.fused import DiagramFunctions
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
 
-LOOKED = 64
-"""The number of samples after which a run checks for Ctrl-C and divergence."""
-
 
 def run_beside(
-    fused: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
+    functions: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
 ) -> Run:
     """Runs a diagram in which Drake steps one block, and no block has a continuous state.
 
     At each sample, the input of that block and the unrestricted updates are computed from the
-    values before the sample. Then Drake steps the block, and then come the discrete updates. The
-    rows of the record are computed at the end, from the values that were held.
+    values before the sample. Then Drake steps the block, and the discrete updates follow. The rows
+    of the record are computed at the end, from the held values.
 
     Args:
-        fused: The diagram.
+        functions: The diagram.
         code: Its machine code; None if there is none.
-        problem: What to run.
-        settings: Its `look` says whether to stop.
+        problem: The run.
+        settings: Its `look` decides whether to stop.
     """
-    plant = _DrakeSteps(fused, problem)
+    plant = _DrakeSteps(functions, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
-    kept = np.empty((times.size, held.size))
+    held_of_rows = np.empty((times.size, held.size))
     rows = count = 0
     ending, error, moment = RunEnding.DONE, None, float(times[0])
-    take = _sampler(fused, code, problem, held)
+    update = _updates(functions, code, problem, held)
 
-    def written() -> FloatArray:
-        states = np.zeros((rows, 0))
-        return fused.rows(times[:rows], states, kept[:rows], problem.parameters)[0]
+    def record() -> FloatArray:
+        states, values = np.zeros((rows, 0)), held_of_rows[:rows]
+        return functions.rows(times[:rows], states, values, problem.parameters)[0]
 
     while rows < times.size:
         at = problem.events[count] if count < problem.events.size else np.inf
-        # A row has what was before the updates of its time.
+        # A row has the values before the updates of its time.
         stop = int(np.searchsorted(times, at, side="right"))
-        kept[rows:stop], rows = held, stop
+        held_of_rows[rows:stop], rows = held, stop
         if rows == times.size:
             break
-        if count % LOOKED == 0 and settings.look(written, problem.context):
+        if count % LOOKED == 0 and settings.look(record, problem.context):
             ending = RunEnding.PAUSED
             break
         moment, due = float(at), int(problem.due[count])
         try:
-            good = take(moment, count, due, True, plant.input)
-            if good and due & plant.bit:
+            is_valid = update(moment, count, due, True, plant.input)
+            if is_valid and due & plant.bit:
                 held[plant.places] = plant.after(moment)
-            good = good and take(moment, count, due, False, plant.input)
-        except SimulationError as found:
-            ending, error = RunEnding.STUCK, found
+            is_valid = is_valid and update(moment, count, due, False, plant.input)
+        except SimulationError as failure:
+            ending, error = RunEnding.STUCK, failure
             break
-        except RuntimeError as found:  # Of Drake, as where its contact solver finds no step.
+        except RuntimeError as failure:  # Of Drake, as where its contact solver finds no step.
             state = held[plant.places]
-            ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(found))
+            ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(failure))
             break
-        if not good:
+        if not is_valid:
             ending = RunEnding.INVALID
             break
         count += 1
-    given = moment, none, held, count, count, moment, np.inf, 0.0, none
-    return Run(written(), ending, *given, error=error)
+    counts = count, count, moment, np.inf
+    return Run(record(), ending, moment, none, held, *counts, 0.0, none, error=error)
 
 
 class _DrakeSteps:
-    """The block that Drake steps, in a context of its own."""
+    """The block that Drake steps, in a Simulator of its own.
 
-    def __init__(self, fused: DiagramFunctions, problem: RunProblem) -> None:
-        compiled = fused.program.compiled
+    Attributes:
+        bit: Its rate, as a bit of `due`.
+        places: The places of its outputs among the held values.
+        input: The value of its input port, shape (n,).
+    """
+
+    def __init__(self, functions: DiagramFunctions, problem: RunProblem) -> None:
+        compiled = functions.program.compiled
         rate, block = compiled.stepped
         assert block.stepped is not None
         stepped, system = block.stepped, block.stepped.system
@@ -89,58 +92,53 @@ class _DrakeSteps:
         context: Context = system.CreateDefaultContext()
         context.SetTime(float(problem.times[0]))
         stepped.put(context, problem.held[dict(compiled.held)[block.system]])
-        self._ports = [system.GetOutputPort(name) for name in stepped.ports]
-        port = system.GetInputPort(stepped.into)
-        self.input = np.zeros(port.size())
-        self._port, self._context = port, context
-        port.FixValue(context, self.input)
+        self._outputs = [system.GetOutputPort(name) for name in stepped.ports]
+        self._port, self._context = system.GetInputPort(stepped.into), context
+        self.input = np.zeros(self._port.size())
+        self._port.FixValue(context, self.input)
         self._simulator = Simulator(system, context)
         self._simulator.Initialize()
 
     def after(self, time: float) -> FloatArray:
-        """What its ports show after the step at a time in s, with `input`."""
+        """Returns its outputs after the step at a time in s, with `input`."""
         self._port.FixValue(self._context, self.input)
         # Up to the next step, which Drake then makes first.
         self._simulator.AdvanceTo((round(time / self._period) + 1) * self._period)
-        return np.concatenate([port.Eval(self._context) for port in self._ports])
+        return np.concatenate([port.Eval(self._context) for port in self._outputs])
 
 
-def _sampler(
-    fused: DiagramFunctions, code: Library | None, problem: RunProblem, held: FloatArray
+def _updates(
+    functions: DiagramFunctions, code: Library | None, problem: RunProblem, held: FloatArray
 ) -> Callable[[float, int, int, bool, FloatArray], bool]:
-    """A function that makes the updates in `held` and returns whether all values are valid.
+    """Returns a function that makes updates in `held` and returns whether all values are valid.
 
-    It takes the time, the number of the event, which rates are due, whether the updates are the
-    unrestricted ones or the discrete ones, and an array for what Drake's block reads, which comes
-    with the unrestricted ones.
+    Its arguments are the time, the number of the event, the due rates, whether the updates are the
+    unrestricted ones or the discrete ones, and an array for the input of Drake's block, which is
+    written with the unrestricted ones.
     """
-    compiled, parameters = fused.program.compiled, problem.parameters
-    kinds = sum(
-        1 << i
-        for i, rate in enumerate(compiled.rates)
-        if not rate.is_unrestricted and rate.stepped is None
-    )
+    compiled, parameters = functions.program.compiled, problem.parameters
+    discrete = sum(1 << i for i, rate in enumerate(compiled.rates) if not rate.is_unrestricted)
     if code is not None:
         call = code.sample
         array, number = ctypes.c_void_p, ctypes.c_longlong
         call.argtypes = (ctypes.c_double, *3 * (array,), number, ctypes.c_int, array)
-        own, of_diagram = held.ctypes.data, parameters.ctypes.data
+        addresses = held.ctypes.data, parameters.ctypes.data
         first_noise, size = problem.noise.ctypes.data, problem.noise.strides[0]
 
-        def sample(time: float, index: int, due: int, first: bool, into: FloatArray) -> bool:
-            if not first and not due & kinds:
+        def update(time: float, index: int, due: int, first: bool, into: FloatArray) -> bool:
+            if not first and not due & discrete:
                 return True
-            drawn = first_noise + index * size
-            return not call(time, own, of_diagram, drawn, due, first, into.ctypes.data)
+            noise = first_noise + index * size
+            return not call(time, *addresses, noise, due, first, into.ctypes.data)
 
-        return sample
+        return update
     read = BufferedFunction(compiled.stepped[0].function)
 
-    def sample_slowly(time: float, index: int, due: int, first: bool, into: FloatArray) -> bool:
+    def update_slowly(time: float, index: int, due: int, first: bool, into: FloatArray) -> bool:
         valid, noise = np.zeros(1), problem.noise[index]
         if first:
             into[:], valid = read(time, np.zeros(0), held, parameters, noise)
-        held[:] = fused.update(time, np.zeros(0), held, parameters, noise, due, first)
+        held[:] = functions.update(time, np.zeros(0), held, parameters, noise, due, first)
         return bool(np.isfinite(valid[0]) and np.isfinite(held).all())
 
-    return sample_slowly
+    return update_slowly

@@ -1,4 +1,4 @@
-"""Runs in which blocks change at moments that are found: contacts that open, phases of a task."""
+"""Runs in which blocks change at times to be located: contacts that open, phases of a task."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -6,34 +6,32 @@ from threading import Lock
 
 import numpy as np
 from pydrake.systems.framework import Context, EventStatus, System
-from scipy.integrate import DOP853
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
-from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
+from drake_dae.running.rollout.stepping.course import DOP, stage_rates
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions, GuardInputs
 from drake_dae.systems.blocks.trials import LEAST_PROGRESS
 
 WINDOW = 1e-13
-"""A moment is found to within this time, in s."""
+"""The time of a change is located to within this, in s."""
 
 MOST = 1000
-"""So many changes that hardly lead on end a run."""
+"""A run ends where so many changes add hardly any time."""
 
 MOST_REPEATED = 10
-"""So many reactions may follow each other at one moment."""
+"""The number of reactions that may follow each other at one time."""
 
 _LOCK = Lock()
-"""Runs find and make changes one at a time: functions have one place for what they compute."""
-
-_CONTROLLED = Tableau(DOP853.A[:12, :12], DOP853.B, DOP853.C[:12])
+"""Runs locate and make changes one at a time: functions have one buffer for their results."""
 
 
 @dataclass(eq=False)
 class _Changes:
     """A run in pieces, from change to change; see `run_with_changes`."""
 
-    fused: DiagramFunctions
+    functions: DiagramFunctions
     problem: RunProblem
     tableau: Tableau
     is_controlled: bool
@@ -41,42 +39,48 @@ class _Changes:
     context: Context = field(init=False)
 
     def begin(self) -> tuple[Run, RunProblem | None]:
-        """A run without steps, and how it goes on after what blocks do when it begins, if it does.
+        """Makes the initialization events of the blocks.
+
+        Returns:
+            A run without steps, and its first piece; None in place of it if an event fails.
 
         Raises:
-            InconsistentStateError: No run may start there.
+            InconsistentStateError: No run may start from this state.
         """
-        compiled, problem = self.fused.program.compiled, self.problem
+        compiled, problem = self.functions.program.compiled, self.problem
         self.context = compiled.diagram.CreateDefaultContext()
-        # Plants that need the moments of changes ask whether they are sought.
+        # Plants that need accurate times of changes read the accuracy.
         self.context.SetAccuracy(WINDOW)
-        given = problem.state, problem.held, problem.parameters
-        compiled.set_context(self.context, problem.times[0], *given)
-        start, nowhere = float(problem.times[0]), np.full_like(problem.state, np.nan)
-        counts, none = (
-            (0, 0, start, start, np.inf, nowhere),
-            np.zeros((0, self.fused.program.width)),
-        )
-        begun = Run(none, RunEnding.DONE, start, problem.state, problem.held, *counts)
+        start = float(problem.times[0])
+        compiled.set_context(self.context, start, problem.state, problem.held, problem.parameters)
+        no_rows = np.zeros((0, self.functions.program.width))
+        no_trial = np.inf, np.full_like(problem.state, np.nan)
+        counts = 0, 0, start, start
+        run = Run(no_rows, RunEnding.DONE, start, problem.state, problem.held, *counts, *no_trial)
         try:
             compiled.diagram.ExecuteInitializationEvents(self.context)
         except SimulationError as error:
-            return replace(begun, ending=RunEnding.STUCK, error=error), None
+            return replace(run, ending=RunEnding.STUCK, error=error), None
         state, held = compiled.start(self.context)
-        return begun, replace(problem, state=state, held=held, context=self.context)
+        return run, replace(problem, state=state, held=held, context=self.context)
 
     def make(self, run: Run, piece: RunProblem) -> tuple[Run, RunProblem | None]:
-        """What a run comes to with the change that ended it, and how it goes on, if it does.
+        """Makes the change that ended a piece.
 
-        The rows are those between the last step and the change.
+        Returns:
+            The run after the change, with the rows between its last step and the change; and the
+            next piece, None if the run is at its end.
         """
         moment, state, held, count = run.time, run.state, run.held, run.event
         if run.next > run.time:
             moment, state = self.located(run)
-        # At the moment of the change a record has what was before.
+            if self.is_missed(moment, state, held):
+                moment = min(moment + WINDOW, run.next)
+                state = self.reached(run, moment)
+        # A row at the time of the change has the state before it.
         times = self.problem.times
         rows = self.rows(run, times[(times > run.time) & (times <= moment)])
-        left = times[times > moment]
+        later = times[times > moment]
         is_sample = run.next == run.time and bool((piece.events[count:] <= moment).any())
         try:
             if is_sample:
@@ -87,16 +91,16 @@ class _Changes:
         except SimulationError as error:
             failed = replace(run, rows=rows, ending=RunEnding.STUCK, time=moment, state=state)
             return replace(failed, error=error), None
+        if is_sample and not later.size:  # The last row has the state after the updates.
+            columns = np.array([moment]), state[None], held[None], self.problem.parameters
+            rows = self.functions.rows(*columns)[0]
         ending = RunEnding.DONE if goes_on else RunEnding.STOPPED
         after = replace(run, rows=rows, ending=ending, time=moment, state=state, held=held)
-        if is_sample and not left.size:  # The last row comes after what happens then.
-            given = np.array([moment]), state[None], held[None], self.problem.parameters
-            after = replace(after, rows=self.fused.rows(*given)[0])
-        if not (goes_on and left.size):
+        if not (goes_on and later.size):
             return after, None
         return after, replace(
             piece,
-            times=np.concatenate([[moment], left]),
+            times=np.concatenate([[moment], later]),
             state=state,
             held=held,
             events=piece.events[count:],
@@ -105,99 +109,114 @@ class _Changes:
             has_reacted=not is_sample and self.has_settled(run, moment, state, held),
         )
 
-    def has_settled(self, run: Run, time: float, state: FloatArray, held: FloatArray) -> bool:
-        """Whether a step is to be made now, since a reaction changed nothing but round-off.
+    def is_missed(self, time: float, state: FloatArray, held: FloatArray) -> bool:
+        """Whether blocks do not react to a change, whose guards are zero but for round-off."""
+        before = self.context.Clone()
+        try:
+            reacted, held_after, goes_on = self.react(time, state, held)
+        except SimulationError:  # It is raised again by the reaction itself.
+            return False
+        finally:  # A trial leaves no trace in what blocks remember.
+            self.context.SetTimeStateAndParametersFrom(before)
+        return goes_on and _is_same(reacted, held_after, state, held)
 
-        Others may follow it at the same moment, but no more than some: of contacts that touch
-        without a force any mode fits.
+    def has_settled(self, run: Run, time: float, state: FloatArray, held: FloatArray) -> bool:
+        """Whether a step follows, since a reaction changed nothing but round-off.
+
+        Otherwise further reactions may follow at the same time, up to `MOST_REPEATED`: of contacts
+        that touch without a force any mode fits.
         """
         self.repeated = self.repeated + 1 if time == run.time else 0
-        is_same = np.allclose(state, run.state, 1e-12, 1e-12) and np.array_equal(held, run.held)
-        return self.repeated >= MOST_REPEATED or (time == run.time and is_same)
+        is_same = time == run.time and _is_same(state, held, run.state, run.held)
+        return self.repeated >= MOST_REPEATED or is_same
 
     def sample(self, run: Run, piece: RunProblem) -> tuple[FloatArray, FloatArray, bool]:
-        """What `react` returns, where blocks react that look at their guards in samples.
+        """Makes the updates of an instant, and the reactions of blocks that sample their guards.
 
-        All unrestricted updates of the instant see what was before it.
+        All unrestricted updates of the instant see the state before it. Returns as `react`.
         """
-        fused, parameters = self.fused, self.problem.parameters
+        functions, parameters = self.functions, self.problem.parameters
         noise, due = piece.noise[run.event], int(piece.due[run.event])
-        given = run.time, run.state, run.held, parameters, noise, due
-        held, compiled = fused.update(*given, True), fused.program.compiled
-        margins = fused.watched(run.time, run.state, run.held, parameters).margins
+        before = run.time, run.state, run.held, parameters
+        held, compiled = functions.update(*before, noise, due, True), functions.program.compiled
+        margins = functions.sampled_guards(*before).margins
         systems = [system for system, part in compiled.watched if (margins[part] <= 0.0).any()]
         _, reacted, goes_on = self._reacted(run.time, run.state, run.held, systems)
         for system, part in compiled.held:
             if system in systems:
                 held[part] = reacted[part]
         state = self.problem.project(run.time, run.state, run.held)
-        return state, fused.update(run.time, state, held, parameters, noise, due, False), goes_on
+        held = functions.update(run.time, state, held, parameters, noise, due, False)
+        return state, held, goes_on
 
     def ended(self, run: Run) -> Context:
-        """A context of the diagram at the end of a run."""
-        given = run.time, run.state, run.held, self.problem.parameters
-        self.fused.program.compiled.set_context(self.context, *given)
+        """Returns a context of the diagram at the end of a run."""
+        values = run.time, run.state, run.held, self.problem.parameters
+        self.functions.program.compiled.set_context(self.context, *values)
         return self.context
 
     def react(
         self, time: float, state: FloatArray, held: FloatArray
     ) -> tuple[FloatArray, FloatArray, bool]:
-        """State and what is held after blocks reacted, and whether the run goes on."""
-        compiled, parameters = self.fused.program.compiled, self.problem.parameters
-        margins = self.fused.seen(time, state, held, parameters).margins
-        due = [system for system, part in compiled.guards if (margins[part] <= 0.0).any()]
-        return self._reacted(time, state, held, due or [system for system, _ in compiled.guards])
+        """Lets blocks react whose guards have triggered.
+
+        Returns:
+            State and held values after it, and whether the run continues.
+        """
+        guards = self.functions.program.compiled.guards
+        margins = self.functions.guards(time, state, held, self.problem.parameters).margins
+        due = [system for system, part in guards if (margins[part] <= 0.0).any()]
+        return self._reacted(time, state, held, due or [system for system, _ in guards])
 
     def _reacted(
         self, time: float, state: FloatArray, held: FloatArray, systems: Sequence[System]
     ) -> tuple[FloatArray, FloatArray, bool]:
-        compiled, goes_on = self.fused.program.compiled, True
+        compiled, goes_on = self.functions.program.compiled, True
         compiled.set_context(self.context, time, state, held, self.problem.parameters)
         after = self.context.Clone()
         for system in systems:
             guard = compiled.blocks[system].guard
             assert guard is not None
-            own = system.GetMyContextFromRoot(self.context)
+            before = system.GetMyContextFromRoot(self.context)
             changed = system.GetMyMutableContextFromRoot(after).get_mutable_state()
-            status = guard.react(own, changed)
+            status = guard.react(before, changed)
             goes_on &= status.severity() != EventStatus.Severity.kReachedTermination
         self.context.SetTimeStateAndParametersFrom(after)
         return *compiled.start(self.context), goes_on
 
     def reached(self, run: Run, end: float) -> FloatArray:
-        """The state at a time within the step that a run did not take."""
-        a, b, c = self.tableau
-        step, rates = end - run.time, list[FloatArray]()
-        given = run.held, self.problem.parameters
-        for row, part in zip(a, c, strict=True):
-            change = sum((w * rate for w, rate in zip(row, rates, strict=False) if w), 0.0)
-            rates.append(self.fused.rate(run.time + part * step, run.state + step * change, *given))
-        found: FloatArray = run.state + step * (b @ np.array(rates))
-        return found
+        """Returns the state at a time within the step that was not accepted."""
+
+        def rate(time: float, state: FloatArray) -> FloatArray:
+            return self.functions.rate(time, state, run.held, self.problem.parameters)
+
+        step = end - run.time
+        rates = stage_rates(rate, self.tableau, run.time, run.state, step)
+        state: FloatArray = run.state + step * (self.tableau.b @ rates)
+        return state
 
     def rows(self, run: Run, times: FloatArray) -> FloatArray:
-        """Rows of the record at times within the step that a run did not take."""
-        if not times.size:
-            return np.zeros((0, self.fused.program.width))
-        states = np.array([self.reached(run, time) for time in times.tolist()])
-        if self.is_controlled:
-            for time, state in zip(times.tolist(), states, strict=True):
-                state[:] = self.problem.project(time, state, run.held)
+        """Returns rows of the record at times within the step that was not accepted."""
+        states = np.zeros((times.size, run.state.size))
+        for index, time in enumerate(times.tolist()):
+            states[index] = self.reached(run, time)
+            if self.is_controlled:
+                states[index] = self.problem.project(time, states[index], run.held)
         held = np.tile(run.held, (times.size, 1))
-        return self.fused.rows(times, states, held, self.problem.parameters)[0]
+        return self.functions.rows(times, states, held, self.problem.parameters)[0]
 
     def located(self, run: Run) -> tuple[float, FloatArray]:
-        """When the change is that lies within a step, and the state just after it.
+        """Locates the change within a step: returns its time, and the state just after it.
 
-        By the secant through the least margins at both ends, where that halves what is left within
+        By the secant through the least margins at both ends, where that halves the interval within
         three trials; else by bisection.
         """
-        given = run.held, self.problem.parameters
-        before = self.fused.seen(run.time, run.state, *given)
+        constants = run.held, self.problem.parameters
+        before = self.functions.guards(run.time, run.state, *constants)
         first, last, state = run.time, run.next, self.reached(run, run.next)
-        found = self.fused.seen(last, state, *given)
-        due = (found.margins <= 0.0) & (before.margins > 0.0)
-        above, below = _least(before, due), _least(found, due)
+        after = self.functions.guards(last, state, *constants)
+        due = (after.margins <= 0.0) & (before.margins > 0.0)
+        above, below = _least(before, due), _least(after, due)
         trials, goal = 0, 0.5 * (last - first)
         while last - first > WINDOW and first < 0.5 * (first + last) < last:
             share = above / (above - below) if above - below > 0.0 else 0.5
@@ -206,49 +225,55 @@ class _Changes:
             margin = min(0.25 * WINDOW / (last - first), 0.5)
             middle = first + (last - first) * min(max(share, margin), 1.0 - margin)
             tried = self.reached(run, middle)
-            found = self.fused.seen(middle, tried, *given)
-            if found.follows_change(before):
-                last, state, below = middle, tried, min(_least(found, due), 0.0)
+            after = self.functions.guards(middle, tried, *constants)
+            if after.follows_change(before):
+                last, state, below = middle, tried, min(_least(after, due), 0.0)
             else:
-                first, above = middle, max(_least(found, due), 0.0)
+                first, above = middle, max(_least(after, due), 0.0)
             trials = 0 if last - first <= goal else trials + 1
             goal = min(goal, 0.5 * (last - first)) if not trials else goal
         return last, state
 
 
-def _least(seen: GuardInputs, due: Booleans) -> float:
-    """The least of the margins that fall through zero; 0 where none does at both ends."""
-    return float(np.min(seen.margins[due], initial=np.inf)) if due.any() else 0.0
+def _is_same(
+    state: FloatArray, held: FloatArray, other_state: FloatArray, other_held: FloatArray
+) -> bool:
+    return np.allclose(state, other_state, 1e-12, 1e-12) and np.array_equal(held, other_held)
+
+
+def _least(guards: GuardInputs, due: Booleans) -> float:
+    """The least of the margins that change their sign; 0 if none does."""
+    return float(np.min(guards.margins[due], initial=np.inf)) if due.any() else 0.0
 
 
 def run_with_changes(
-    fused: DiagramFunctions,
-    take: Callable[[RunProblem], Run],
+    functions: DiagramFunctions,
+    run_piece: Callable[[RunProblem], Run],
     tableau: Tableau | None,
     problem: RunProblem,
 ) -> Run:
-    """A run in which blocks react, as Drake's Simulator lets them.
+    """Runs a diagram whose blocks react at times to be located, as Drake's Simulator does.
 
-    Between changes it is one of those without. Where a step passes a change, the moment is found by
-    steps that end earlier, and the blocks do in a context of Drake's what they do there.
+    Where a step passes a change, its time is located by shorter steps from the same state; then the
+    blocks react in a Drake context.
 
     Args:
-        fused: The diagram.
-        take: What runs up to a change.
+        functions: The diagram.
+        run_piece: Runs until the next change.
         tableau: The method of fixed steps; None for error control.
         problem: The run.
 
     Raises:
-        InconsistentStateError: No run may start there.
+        InconsistentStateError: No run may start from this state.
     """
-    changes = _Changes(fused, problem, tableau or _CONTROLLED, tableau is None)
+    changes = _Changes(functions, problem, tableau or DOP, tableau is None)
     with _LOCK:
         run, piece = changes.begin()
     rows, steps, count, mark = list[FloatArray](), 0, 0, run.time
     while piece is not None:
-        run = take(replace(piece, earlier=tuple(rows)))
+        run = run_piece(replace(piece, earlier=tuple(rows)))
         steps += run.steps
-        # A piece begins with a row; after a change that is none of the record's.
+        # The first row of a piece after a change is no row of the record.
         rows.append(run.rows[min(count, 1) :])
         if run.ending is not RunEnding.CHANGE:
             break

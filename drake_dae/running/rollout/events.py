@@ -1,4 +1,4 @@
-"""When a diagram's discrete states change, and the random numbers that they take then."""
+"""The times at which discrete states of a diagram change, and their random numbers."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,18 +12,18 @@ from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 
 Seed = int | Mapping[str, int]
-"""What chooses the noise of a run: one number for all sources, or the name of each -> its own."""
+"""The seed of the noise of a run: one number, or name of a RandomSource -> number."""
 
 SAME = 1e-9
-"""Times that differ by less than this, in periods, are one."""
+"""Times that differ by less than this, in periods, are equal."""
 
 
 class Events(NamedTuple):
     """The updates of a run.
 
     Attributes:
-        times: When there is one, in s, increasing, shape (k,).
-        due: Which rates of the diagram are due then, as bits, shape (k,).
+        times: Their times in s, increasing, shape (k,).
+        due: The rates of the diagram that are due at each time, as bits, shape (k,).
     """
 
     times: FloatArray
@@ -31,11 +31,11 @@ class Events(NamedTuple):
 
 
 def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
-    """The updates of a diagram.
+    """Returns the updates of a diagram.
 
     Args:
         compiled: The diagram.
-        times: When rows are written, in s: an update at the time of a row makes no step of its own.
+        times: The times of the rows in s; an update close to one of them is moved to it.
     """
     due: dict[float, int] = {}
     if not compiled.rates:
@@ -61,34 +61,34 @@ def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
 def noise_of(
     compiled: CompiledDiagram, events: Events, start: float, seed: Seed | None
 ) -> FloatArray:
-    """The random numbers at the start and from each update on, shape (k + 1, number of entries).
+    """Returns the random numbers of Drake's RandomSources, shape (k + 1, number of entries).
 
-    They are those of Drake's RandomSource.
+    The first row is that of the start, then there is one for each update.
 
     Args:
         compiled: The diagram.
         events: Its updates.
-        start: When the run begins, in s.
-        seed: The seed, or the name of a source -> its own; None, or a source that is not named, is
-            the noise that every run has. A second source takes another seed from a number.
+        start: The start of the run, in s.
+        seed: The seed; for None, and for sources without a seed, the noise is the same in all runs.
+            From one number, each source derives a seed of its own.
     """
-    found = np.zeros((events.times.size + 1, compiled.sizes["noise"]))
+    noise = np.zeros((events.times.size + 1, compiled.sizes["noise"]))
     for number, (source, part) in enumerate(compiled.noise):
         (update,) = compiled.blocks[source].updates
         key = update.period, update.offset, update.is_unrestricted
         keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in compiled.rates]
-        own = np.flatnonzero(events.due & (1 << keys.index(key)))
+        rows = np.flatnonzero(events.due & (1 << keys.index(key)))
         chosen = (seed + number * 2**31) % 2**32 if isinstance(seed, int) else None
         if isinstance(seed, Mapping):
             chosen = seed.get(source.get_name())
-        found[[0, *(own + 1)], part] = _drawn(source, start, events.times[own], key[0], chosen)
-    return found
+        noise[[0, *(rows + 1)], part] = _drawn(source, start, events.times[rows], key[0], chosen)
+    return noise
 
 
 def _drawn(
     source: System, start: float, times: FloatArray, period: float, seed: int | None
 ) -> FloatArray:
-    """What a source shows at the start, and after each of its updates."""
+    """Returns the output of a source at the start, and after each of its updates."""
     context = source.CreateDefaultContext()
     context.SetTime(start)
     if seed is not None:

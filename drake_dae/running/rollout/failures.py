@@ -1,4 +1,4 @@
-"""Why a rollout ended early, in the words of the blocks."""
+"""The exceptions of rollouts that ended early, with the messages of the blocks."""
 
 from collections.abc import Sequence
 
@@ -21,22 +21,22 @@ from drake_dae.systems.blocks.trials import PACE_STEPS
 from drake_dae.systems.plants.contract import Plant
 
 STATES = (STATE, "estimated_state")
-"""Where the argument of a computation comes from that says where the system is."""
+"""Arguments of a computation that are a state of the plant."""
 
 
 def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> SimulationError:
-    """The exception that the same run of Drake's raises.
+    """Returns the exception that the same run raises in Drake's Simulator.
 
     Args:
         program: The diagram.
-        problem: What was run.
-        run: What it came to.
+        problem: The run.
+        run: Its result.
     """
     if run.error is not None:
         return run.error
     name, state = program.name, run.state[program.plant]
-    given = run.held, problem.parameters
-    trial = _reason(program, run.trial_time, run.trial, *given) if run.trial_time else None
+    constants = run.held, problem.parameters
+    trial = _reason(program, run.trial_time, run.trial, *constants) if run.trial_time else None
     match run.ending:
         case RunEnding.OFF_MANIFOLD:
             try:
@@ -52,9 +52,9 @@ def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> Simula
         case RunEnding.STUCK:
             reason = "no step, however short, is as accurate as it should be"
             return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
-    found = _reason(program, run.time, run.state, *given) or trial
-    if found is not None:
-        return found
+    failure = _reason(program, run.time, run.state, *constants) or trial
+    if failure is not None:
+        return failure
     return NonFiniteError(f"{name}: a signal has no value at t = {run.time:.6g} s", run.time, state)
 
 
@@ -65,7 +65,7 @@ def _reason(
     held: FloatArray,
     parameters: FloatArray,
 ) -> SimulationError | None:
-    """What is wrong at a time and state; None if nothing is."""
+    """Returns the failure of the first computation without a value; None if all have values."""
     if not np.isfinite(state).all():
         return None
     compiled = program.compiled
@@ -73,10 +73,8 @@ def _reason(
         function = call.computation.traced
         if function is None or len(function.input_names) != len(call.arguments):
             continue
-        given = compiled.arguments_of(call)(time, state, held, parameters)
-        arguments = [
-            np.array(each)[:, 0] for each in (given if len(call.arguments) > 1 else [given])
-        ]
+        columns = compiled.arguments_of(call).call([time, state, held, parameters])
+        arguments = [np.array(column)[:, 0] for column in columns]
         function.evaluate(*arguments)
         if function.is_valid:
             continue
@@ -94,10 +92,10 @@ def _reason(
 def _where(
     sources: Sequence[str], arguments: Sequence[FloatArray], block: Block, state: FloatArray
 ) -> FloatArray:
-    """The state that a computation was given, or that of all if it was given none."""
-    for name, given in zip(sources, arguments, strict=True):
+    """Returns the state among the arguments of a computation; without one, all states."""
+    for name, values in zip(sources, arguments, strict=True):
         if name in STATES:
-            return given
+            return values
         if name == HELD and isinstance(block.system, Plant):
-            return given[: block.system.dae.num_states]
+            return values[: block.system.dae.num_states]
     return state

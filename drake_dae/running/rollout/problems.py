@@ -1,4 +1,4 @@
-"""What a rollout runs, from the arguments that it was given."""
+"""The runs of a rollout, from its arguments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,57 +23,57 @@ from drake_dae.systems.blocks.traced import Block
 
 @checked(ModelError)
 def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArray, FloatArray]:
-    """Start and parameters of a closed loop, or of any diagram, as `rollout` takes them.
+    """Returns start and parameters of a closed loop, or of any diagram, for `rollout`.
 
     Args:
         loop: The closed loop or the diagram.
         context: Its context.
 
     Returns:
-        The continuous states of all blocks in the order of Drake's, and then what blocks hold, such
-        as a sensor that samples, shape (n,); and their numeric parameters, of a closed loop those
-        of the plant, then the model's of the law and its gains, shape (m,).
+        The start, shape (n,): the continuous states of all blocks in Drake's order, and then their
+        discrete states, such as the last value of a sensor that samples. The numeric parameters,
+        shape (m,): in a closed loop those of the plant, then of the law's model, and its gains.
 
     Raises:
-        ModelError: Something in it cannot be traced; its name and why.
+        ModelError: A block cannot be traced; the message has its name and the reason.
     """
     program = program_of(loop)
     state, held = program.compiled.start(context)
     values = program.compiled.values(context)
     if program.compiled.changes and np.isnan(held).any():
-        # What a block shows before it has begun is no expression.
-        own = context.Clone()
-        own.SetAccuracy(1e-9)
-        program.compiled.diagram.ExecuteInitializationEvents(own)
-        held = np.where(np.isnan(held), program.compiled.start(own)[1], held)
+        # The initialization of a block need not be an expression.
+        begun = context.Clone()
+        begun.SetAccuracy(1e-9)
+        program.compiled.diagram.ExecuteInitializationEvents(begun)
+        held = np.where(np.isnan(held), program.compiled.start(begun)[1], held)
     held = program.compiled.initialized(context.get_time(), state, held, values)
     return np.concatenate([state, held[program.kept_places]]), values
 
 
 def checked_times(times: ArrayLike) -> FloatArray:
-    """The times of a record.
+    """Returns the times of a record as an array.
 
     Raises:
         ModelError: They are not two or more finite numbers that increase.
     """
-    found = numbers("times", times)
-    if found.ndim != 1 or found.size < 2 or not np.isfinite(found).all():
+    moments = numbers("times", times)
+    if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
         raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
-    if not (found[1:] > found[:-1]).all():
+    if not (moments[1:] > moments[:-1]).all():
         raise ModelError("times must be strictly increasing")
-    return found
+    return moments
 
 
-def _table(what: str, given: ArrayLike, size: int, hint: str) -> FloatArray:
-    found = np.atleast_2d(numbers(what, given))
-    if found.ndim != 2 or found.shape[1] != size:
+def _table(what: str, given: ArrayLike, size: int) -> FloatArray:
+    table = np.atleast_2d(numbers(what, given))
+    if table.ndim != 2 or table.shape[1] != size:
         raise ModelError(
             f"{what} must have shape ({size},), or (k, {size}) for k runs, got "
-            f"{np.shape(given)}: {hint}"
+            f"{np.shape(given)}: see start_values"
         )
-    if not np.isfinite(found).all():
+    if not np.isfinite(table).all():
         raise ModelError(f"{what} must be finite")
-    return found
+    return table
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,11 @@ class Problems:
 
     Attributes:
         compiled: The diagram.
-        times: When rows are written, in s, shape (j,).
-        states, held: Where runs start, shapes (k, n) and (k, m).
-        parameters: Their parameters, shape (k, p), or (1, p) for all.
-        events, due: When there are updates, in s, and which rates are due, as bits.
-        noise: The random numbers of each update, shape (k, len(events), q), or one for all.
+        times: The times of the rows in s, shape (j,).
+        states, held: The states and held values at the start, shapes (k, n) and (k, m).
+        parameters: The parameters, shape (k, p), or (1, p) for all runs.
+        events, due: The times of updates in s, and which rates are due then, as bits.
+        noise: The random numbers of each update, shape (k, len(events), q), or one for all runs.
     """
 
     compiled: CompiledDiagram
@@ -103,50 +103,46 @@ class Problems:
         return len(self.states)
 
     def __getitem__(self, index: int) -> RunProblem:
-        row = self._row(self.parameters, index)
+        parameters, noise = (
+            table[index if len(table) > 1 else 0] for table in (self.parameters, self.noise)
+        )
         return RunProblem(
             self.times,
             self.states[index],
             self.held[index],
-            row,
+            parameters,
             self.events,
             self.due,
-            self._row(self.noise, index),
-            partial(_project, self.compiled, self._lock, row),
+            noise,
+            partial(_project, self.compiled, self._lock, parameters),
         )
 
     def with_twins(self) -> np.ndarray:
-        """In which runs plants and laws that have one model have the same numbers, shape (k,)."""
+        """Returns in which runs the plant and the law of a model have equal numbers, shape (k,)."""
         return np.broadcast_to(self.compiled.have_twins(self.parameters), len(self))
 
-    def chosen(self, places: np.ndarray) -> "Problems":
-        """Some of them."""
-        if len(places) == len(self):
+    def chosen(self, indices: np.ndarray) -> "Problems":
+        """Returns some of the runs."""
+        if len(indices) == len(self):
             return self
         parameters, noise = (
-            each if len(each) == 1 else each[places] for each in (self.parameters, self.noise)
+            table if len(table) == 1 else table[indices] for table in (self.parameters, self.noise)
         )
-        own = {"states": self.states[places], "held": self.held[places]}
-        return replace(self, **own, parameters=parameters, noise=noise)
+        states, held = self.states[indices], self.held[indices]
+        return replace(self, states=states, held=held, parameters=parameters, noise=noise)
 
     def check(self) -> None:
-        """Refuses starts off N*.
+        """Checks that all starts are on N*.
 
         Raises:
-            InconsistentStateError: A start is not on N*.
+            InconsistentStateError: A start is not.
         """
-        time = float(self.times[0])
         for index in range(len(self)):
-            state, held = self.states[index], self.held[index]
-            row = self._row(self.parameters, index)
-            for part, now, block in _plants(self.compiled, time, state, held, row):
+            problem = self[index]
+            start = float(self.times[0]), problem.state, problem.held, problem.parameters
+            for part, values, block in _plants(self.compiled, *start):
                 assert block.check_start is not None
-                block.check_start(state[part], now)
-
-    @staticmethod
-    def _row(table: FloatArray, index: int) -> FloatArray:
-        found: FloatArray = table[index if len(table) > 1 else 0]
-        return found
+                block.check_start(problem.state[part], values)
 
 
 def problems_of(
@@ -156,10 +152,10 @@ def problems_of(
     times: FloatArray,
     seeds: Sequence[Seed] | None,
 ) -> Problems:
-    """The runs that `rollout` was asked for, whose arguments these are.
+    """Makes the runs of `rollout` from its arguments.
 
     Raises:
-        ModelError: They have wrong shapes.
+        ModelError: The arguments have wrong shapes.
         InconsistentStateError: A start is not on N*.
     """
     compiled, size = program.compiled, program.size
@@ -169,73 +165,77 @@ def problems_of(
         events = Events(events.times[is_before], events.due[is_before])
     if parameters is None:
         parameters = compiled.values(compiled.context)
-    hint = "see start_values"
-    states = _table("starts", starts, size + program.kept_places.size, hint)
-    given = _table("parameters", parameters, compiled.sizes["parameters"], hint)
-    count = max(len(states), len(given), len(seeds or ()))
+    states = _table("starts", starts, size + program.kept_places.size)
+    rows = _table("parameters", parameters, compiled.sizes["parameters"])
+    count = max(len(states), len(rows), len(seeds or ()))
     if len(states) == 1:
         states = np.repeat(states, count, axis=0)
     count = len(states)
-    if len(given) not in (1, count):
-        raise ModelError(f"{len(given)} rows of parameters for {count} starts")
+    if len(rows) not in (1, count):
+        raise ModelError(f"{len(rows)} rows of parameters for {count} starts")
     if seeds is not None and len(seeds) != count:
         raise ModelError(f"{len(seeds)} seeds for {count} starts")
-    numbers_of = [[s] if isinstance(s, int) else list(s.values()) for s in seeds or ()]
-    bad = [seed for each in numbers_of for seed in each if not 0 <= seed < 2**32]
-    if bad:
-        raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
+    for seed in seeds or ():
+        for value in [seed] if isinstance(seed, int) else seed.values():
+            if not 0 <= value < 2**32:
+                raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
     # Without noise, or without seeds, it is the same in all runs.
-    own_seeds: Sequence[Seed | None] = seeds if seeds and compiled.noise else [None]
-    noise = np.array([noise_of(compiled, events, times[0], seed) for seed in own_seeds])
+    different: Sequence[Seed | None] = seeds if seeds and compiled.noise else [None]
+    noise = np.array([noise_of(compiled, events, times[0], seed) for seed in different])
     held = np.zeros((count, compiled.sizes["held"]))
     held[:, program.kept_places] = states[:, size:]
     drawn = dict(compiled.noise)
     for system, part in compiled.held:
         if system in drawn:
             held[:, part] = noise[:, 0, drawn[system]]
-    found = Problems(
+    problems = Problems(
         compiled,
         times,
         np.ascontiguousarray(states[:, :size]),
         held,
-        np.ascontiguousarray(given),
+        np.ascontiguousarray(rows),
         events.times,
         events.due,
         np.ascontiguousarray(noise[:, 1:]),
     )
-    found.check()
-    return found
+    problems.check()
+    return problems
 
 
 def _plants(
-    compiled: CompiledDiagram, time: float, state: FloatArray, held: FloatArray, row: FloatArray
+    compiled: CompiledDiagram,
+    time: float,
+    state: FloatArray,
+    held: FloatArray,
+    parameters: FloatArray,
 ) -> list[tuple[slice, FloatArray, Block]]:
-    """The blocks with a manifold: where the state of each stands, and its parameters now."""
-    states, parameters = dict(compiled.states), dict(compiled.parameters)
-    found = []
+    """Returns the blocks with a manifold: the place of their states, their present parameters."""
+    states, places = dict(compiled.states), dict(compiled.parameters)
+    plants = []
     for system, block in compiled.blocks.items():
         if block.check_start is None:
             continue
-        now = row[parameters.get(system, slice(0, 0))]
+        values = parameters[places.get(system, slice(0, 0))]
         if system in compiled.moved_parameters:
-            now = compiled.moved_parameters[system](time, state, held, row).full()[:, 0]
-        found.append((states[system], now, block))
-    return found
+            moved = compiled.moved_parameters[system]
+            values = moved(time, state, held, parameters).full()[:, 0]
+        plants.append((states[system], values, block))
+    return plants
 
 
 def _project(
     compiled: CompiledDiagram,
     lock: Any,
-    row: FloatArray,
+    parameters: FloatArray,
     time: float,
     state: FloatArray,
     held: FloatArray,
 ) -> FloatArray:
-    """The state on N* next to one; by one thread at a time."""
-    found, parts = state.copy(), dict(compiled.held)
+    """Returns the projection of a state onto N*, by one thread at a time."""
+    projected, places = state.copy(), dict(compiled.held)
     with lock:
-        for part, now, block in _plants(compiled, time, state, held, row):
+        for part, values, block in _plants(compiled, time, state, held, parameters):
             if block.projection is not None:
-                own = held[parts.get(block.system, slice(0, 0))]
-                found[part] = block.projection.project(state[part], now, own)
-    return found
+                held_by_block = held[places.get(block.system, slice(0, 0))]
+                projected[part] = block.projection.project(state[part], values, held_by_block)
+    return projected

@@ -1,4 +1,4 @@
-"""What a rollout steps: a compiled diagram, and the names of what its rows have."""
+"""The program of a rollout: a compiled diagram, and the signals of its record."""
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
-import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
@@ -27,14 +26,14 @@ class RolloutProgram:
 
     Attributes:
         compiled: Its functions.
-        signals: The columns of a row: name -> names and units.
-        complete: A record with what follows from it; and from a context after the run, where
-            blocks reacted to what happened.
-        name: What messages call it.
-        choice: Whether it becomes machine code, where nobody says otherwise.
+        signals: The columns of a row: name of a signal -> names and units of its entries.
+        complete: Adds derived signals to a record; and events, from a context after the run, where
+            blocks reacted to changes.
+        name: Its name in messages.
+        choice: Whether it becomes machine code by default.
         ends_updated: Whether the last row comes after the updates of its time: as in Drake's logs
             of each step, but not in those of the steps of a discrete plant.
-        library: Its machine code, if there is any by now.
+        library: Its machine code; None if there is none yet.
     """
 
     compiled: CompiledDiagram
@@ -47,65 +46,61 @@ class RolloutProgram:
     _made: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def kept(self, name: str, make: Callable[[], T]) -> T:
-        """What is made once."""
+        """Returns the value of a function that is called once; later the same value."""
         if name not in self._made:
             self._made[name] = make()
-        found: T = self._made[name]
-        return found
+        value: T = self._made[name]
+        return value
 
     @property
     def twins(self) -> "RolloutProgram":
-        """The same where plants and laws of one model have the same numbers."""
+        """The program of runs in which the plant and the law of a model have equal numbers."""
 
         def make() -> RolloutProgram:
-            found = with_twins(self.compiled)
-            if found is self.compiled:
+            compiled = with_twins(self.compiled)
+            if compiled is self.compiled:
                 return self
-            return replace(self, compiled=found, library=None, _made={})
+            return replace(self, compiled=compiled, library=None, _made={})
 
         return self.kept("twins", make)
 
     @property
     def plant(self) -> slice:
-        """Which states are those of the first block that is not content with any; all if none."""
+        """The place of the plant's states; all states if there is no plant."""
         compiled = self.compiled
-        found = [part for each, part in compiled.states if compiled.blocks[each].check_start]
-        return found[0] if found else slice(0, self.size)
+        parts = [part for each, part in compiled.states if compiled.blocks[each].check_start]
+        return parts[0] if parts else slice(0, self.size)
 
     @property
     def size(self) -> int:
-        """How many states there are."""
+        """The number of continuous states."""
         return self.compiled.sizes["state"]
 
     @property
     def width(self) -> int:
-        """How many numbers a row has."""
+        """The number of columns of a row."""
         return sum(map(len, self.signals.values()))
 
     @cached_property
     def kept_places(self) -> np.ndarray:
-        """Which entries of what is held a start has: all but random numbers."""
+        """The places of the held values that a start contains: all except random numbers."""
         drawn = np.zeros(self.compiled.sizes["held"], dtype=bool)
         for system, part in self.compiled.held:
             drawn[part] = self.compiled.blocks[system].draws
         return np.flatnonzero(~drawn)
 
-    @cached_property
-    def functions(self) -> dict[str, ca.Function]:
-        """Name -> function, of all that machine code is made of."""
-        return dict(self.compiled.staged)
-
     @property
     def num_operations(self) -> int:
-        """How many operations all functions have together."""
-        return sum(int(function.n_instructions()) for function in self.functions.values())
+        """The number of operations of all functions together."""
+        return sum(int(each.n_instructions()) for each in self.compiled.staged.values())
 
 
 def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
-    """The program of a closed loop or of any diagram, made once.
+    """Returns the program of a closed loop or of any diagram; that of a loop is made once.
 
     Raises:
-        ModelError: Something in it cannot be traced, its name and why; or a diagram has no output.
+        ModelError: A block cannot be traced, with its name and the reason; or a diagram has no
+            output port with a vector.
     """
     if isinstance(loop, Diagram):
         compiled = compile_diagram(loop)
@@ -117,20 +112,22 @@ def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
         name = loop.get_name() or "the diagram"
         return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
     if "program" not in loop.memory:
-        compiled = compile_diagram(loop.diagram, list(loop.signals))
-        name, choice = loop.plant.get_name(), loop.plant.dae.compiled
-        complete = partial(_completed, loop)
-        ends_updated = not loop.plant.time_step
-        given = compiled, loop.signals, complete, name, choice, ends_updated
-        loop.memory["program"] = RolloutProgram(*given)
-    found: RolloutProgram = loop.memory["program"]
-    return found
+        loop.memory["program"] = RolloutProgram(
+            compile_diagram(loop.diagram, list(loop.signals)),
+            loop.signals,
+            partial(_completed, loop),
+            loop.plant.get_name(),
+            loop.plant.dae.compiled,
+            ends_updated=not loop.plant.time_step,
+        )
+    program: RolloutProgram = loop.memory["program"]
+    return program
 
 
 def _completed(loop: ClosedLoop, record: Record, context: Context | None) -> Record:
-    """A record of a loop with errors, and with what happened to contacts."""
-    found = loop.with_errors(record, context)
-    if context is None or not found.time.size:
-        return found
+    """Adds errors, and what happened to contacts."""
+    complete = loop.with_errors(record, context)
+    if context is None or not complete.time.size:
+        return complete
     events = loop.plant.events(loop.plant.GetMyContextFromRoot(context))
-    return replace(found, events=tuple(one for one in events if one.time <= found.time[-1]))
+    return replace(complete, events=tuple(e for e in events if e.time <= complete.time[-1]))

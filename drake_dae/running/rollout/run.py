@@ -1,4 +1,4 @@
-"""What a rollout steps, how, and how it ends; the same for machine code and without."""
+"""The data of a run: its problem, its settings, its ending; with machine code and without."""
 
 import os
 from collections.abc import Callable
@@ -17,14 +17,18 @@ from drake_dae.errors import ModelError, SimulationError
 Look = Callable[[Callable[[], FloatArray], Context | None], bool]
 
 SHARE = 1e-3
-"""Of the accuracy that a step may use up: then what is read between long steps is as good."""
+"""The error of a step over the accuracy: rows between long steps are then as accurate as these."""
 
 SMALLEST = 1e-13
-"""Less than this, relative to the state, no step can promise."""
+"""The least relative error of a step: below it is round-off."""
+
+
+LOOKED = 64
+"""The number of fixed steps or samples after which a run checks for Ctrl-C and divergence."""
 
 
 def num_cores() -> int:
-    """How many cores this process may use."""
+    """Returns the number of cores that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # macOS has none.
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
@@ -57,7 +61,7 @@ FIXED = {
 class RunEnding(IntEnum):
     """How the stepping ended; stepper.c has the same list.
 
-    At a CHANGE a block has to react before it goes on; a run is STOPPED by a block.
+    At a CHANGE, a block has to react before the next step. STOPPED: a block ended the run.
     """
 
     DONE = 0
@@ -77,11 +81,11 @@ class Settings:
 
     Attributes:
         longest: The longest step, or the fixed one, in s.
-        tableau: The method of fixed steps; None for error control, by DOP853.
-        absolute: The error that a step may make, for each state, shape (n,).
-        relative: The same relative to the state.
-        look: Called now and then with what returns the rows written up to then, and with the
-            context of `RunProblem`; whether to stop where the run is.
+        tableau: The method of fixed steps; None for error control by DOP853.
+        absolute: The absolute tolerance of a step for each state, shape (n,).
+        relative: The relative tolerance.
+        look: Called from time to time with a function that returns the rows up to then, and with
+            the context of `RunProblem`; returns whether to stop.
     """
 
     longest: float
@@ -92,15 +96,15 @@ class Settings:
 
     @classmethod
     def of(cls, config: SimulatorConfig, scale: FloatArray, look: Look) -> Self:
-        """The settings of a scenario.
+        """Makes the settings from Drake's.
 
         Args:
             config: Drake's settings.
-            scale: How large the states are, shape (n,).
+            scale: The sizes of the states, shape (n,).
             look: As the attribute.
 
         Raises:
-            ModelError: Its scheme has fixed steps, and is implicit.
+            ModelError: The steps are fixed, and the scheme is implicit.
         """
         tableau, scheme = None, config.integration_scheme
         if not config.use_error_control:
@@ -110,7 +114,7 @@ class Settings:
                     f"{', '.join(FIXED)}, or use_error_control"
                 )
             tableau = FIXED[scheme]
-        elif not scale.size:  # Without a state there is no error.
+        elif not scale.size:  # Without a state, there is no error to control.
             tableau = FIXED["explicit_euler"]
         relative = max(SHARE * config.accuracy, SMALLEST)
         return cls(config.max_step_size, tableau, relative * scale, relative, look)
@@ -121,18 +125,18 @@ class RunProblem:
     """One run.
 
     Attributes:
-        times: When rows of the record are written, in s, from the start to the end, shape (k,).
-        state: The continuous state at the start.
-        held: What blocks hold at the start, random numbers included.
+        times: The times of the rows in s, from the start to the end, shape (k,).
+        state: The continuous state at the start, shape (n,).
+        held: The discrete states at the start, and random numbers, shape (m,).
         parameters: All parameters.
-        events: When there are updates, in s.
-        due: Which rates are due at each of these, as bits.
-        noise: The random numbers of each of these, shape (len(events), number of entries).
+        events: The times of updates in s.
+        due: The rates that are due at each update, as bits.
+        noise: The random numbers of each update, shape (len(events), number of entries).
         project: (time, state, held) -> the state on N*; raises InconsistentStateError.
-        has_reacted: Whether blocks have reacted to how the run begins.
-        earlier: Where this is a piece of a run, the rows of those before; the first row of the
-            piece is then none of the record's.
-        context: A context of the diagram in which blocks changed so far, where they do.
+        has_reacted: Whether blocks have reacted already to the guards at the start.
+        earlier: In a piece of a run, the rows of all pieces before. The first row of the piece is
+            then no row of the record.
+        context: The Drake context of blocks that react; None without such blocks.
     """
 
     times: FloatArray
@@ -148,27 +152,26 @@ class RunProblem:
     context: Context | None = None
 
     def whole(self, rows: FloatArray) -> FloatArray:
-        """All rows of a run, where a piece has some by now."""
+        """Returns the rows of all pieces, from those of this one."""
         return np.concatenate([*self.earlier, rows[1:]]) if self.earlier else rows
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a run came to.
+    """The result of a run.
 
     Attributes:
-        rows: The rows of the record, up to where it came.
+        rows: The rows of the record up to its end.
         ending: How it ended.
         time: The time of the last accepted state, in s.
-        state, held: That state, and what is held.
-        event: How many of the problem's events were made.
-        steps: How many steps were accepted.
+        state, held: The last accepted state, and the held values there.
+        event: The number of updates made.
+        steps: The number of accepted steps.
         mark: The time a thousand steps ago, in s.
-        next: The time that a step led to that was no step, in s; at a change that is found before
-            a step, the time of the state.
-        trial_time, trial: The earliest trial that failed after it, not finite if none did.
-        context: A context of the diagram after the run, where blocks reacted to what happened.
-        error: What a block raised there.
+        next: The end of a step that was not accepted, in s; `time` if a guard triggered before it.
+        trial_time, trial: The earliest trial after `time` that failed; not finite if none did.
+        context: A Drake context after the run, if blocks reacted to changes.
+        error: An exception that a block raised.
     """
 
     rows: FloatArray

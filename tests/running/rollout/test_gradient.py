@@ -213,7 +213,7 @@ def test_what_has_no_gradient_is_refused():
     with pytest.raises(InconsistentStateError):
         rollout_gradient(loop, start + 0.1, *given[2:], weights, config=config)
     opening, start, parameters, config = problem("two_link_wall", "plant=!Unilateral {}")
-    with pytest.raises(ModelError, match="has no gradient: a block in it changes at moments"):
+    with pytest.raises(ModelError, match="has no gradient: a block changes"):
         rollout_tangent(opening, start, parameters, [0.0, 0.01], config=config)
     stiff, start, parameters, config = problem("two_link_wall", "gains.all=[-4000]")
     config.max_step_size = 0.01

@@ -1,7 +1,6 @@
 """Runs side by side against the same runs one after the other, and their arithmetic alone."""
 
 import ctypes
-import re
 import shutil
 import signal
 import threading
@@ -268,7 +267,7 @@ def test_operations_are_those_of_casadi(options):
 
 def test_what_lanes_do_not_know_is_refused():
     function = ca.Function("odd", [X], [ca.erf(X)])
-    with pytest.raises(ModelError, match=re.escape("odd has an operation that lanes do not know")):
+    with pytest.raises(ModelError, match="odd has an operation that lanes"):
         emitted(function, "odd")
 
 

@@ -2,31 +2,32 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.compiler.rates import dense_function
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import RunProblem, Tableau
 from drake_dae.running.rollout.stepping.called import BufferedFunction
-from drake_dae.running.rollout.stepping.course import REACHED
+from drake_dae.running.rollout.stepping.functions import REACHED
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
 
 MOST = 8
-"""So often two Newton steps may follow each other, as the rollout has it."""
+"""The largest number of pairs of Newton steps, as in a rollout."""
 
 
 class ComputedFunction(NamedTuple):
-    """A function that a run has computed.
+    """A function that a run has evaluated.
 
     Attributes:
-        kind: What it determines: "row", "state" or "held".
-        function: (time, state, held, parameters, and others) -> a column.
-        arguments: What it was given.
-        row: Which row of the record it is.
+        kind: The kind of its result: "row", "state" or "held".
+        function: (time, state, held, parameters, ...) -> a column.
+        arguments: The arguments.
+        row: The index of a row in the record.
     """
 
     kind: str
@@ -36,7 +37,7 @@ class ComputedFunction(NamedTuple):
 
 
 class Differentiable:
-    """A function with its derivatives in both directions, made when they are needed."""
+    """A function with its derivatives in forward and backward mode, made when they are needed."""
 
     def __init__(self, function: ca.Function) -> None:
         self._function, self.value = function, BufferedFunction(function)
@@ -47,7 +48,7 @@ class Differentiable:
         """(arguments, changes of state, held and parameters) -> the result, and its change.
 
         Args:
-            count: How many changes are followed at once, side by side.
+            count: The number of changes, in columns.
         """
         return BufferedFunction(_forward(self._function, count))
 
@@ -56,8 +57,8 @@ class Differentiable:
         symbols = _symbols(self._function)
         value = self._function.call(symbols)[0]
         weights = ca.SX.sym("weights", value.numel())
-        found = [ca.jtimes(value, x, weights, True) for x in symbols[1:4]]
-        return BufferedFunction(_dense("backward", [*symbols, weights], found))
+        gradients = [ca.jtimes(value, x, weights, True) for x in symbols[1:4]]
+        return BufferedFunction(dense_function("backward", [*symbols, weights], gradients))
 
 
 class RungeKuttaStep(Differentiable):
@@ -78,47 +79,45 @@ class RungeKuttaStep(Differentiable):
         time, state, held, parameters = (ca.MX.sym("x", size) for size in sizes)
         step = ca.MX.sym("step")
         changes = [ca.MX.sym("d", size, count) for size in sizes[1:]]
-        values, slopes = list[ca.MX](), list[ca.MX]()
+        values, slopes, zero = list[ca.MX](), list[ca.MX](), ca.MX(0.0)
         for row, part in zip(self._tableau.a, self._tableau.c, strict=True):
-            x, d = state + step * _sum(row, values), changes[0] + step * _sum(row, slopes)
+            x = state + step * _sum(row, values, zero)
+            d = changes[0] + step * _sum(row, slopes, zero)
             value, slope = rate(time + part * step, x, held, parameters, d, *changes[1:])
             values.append(value)
             slopes.append(slope)
         b = self._tableau.b
-        found = [state + step * _sum(b, values), changes[0] + step * _sum(b, slopes)]
+        results = [state + step * _sum(b, values, zero), changes[0] + step * _sum(b, slopes, zero)]
         symbols = [time, state, held, parameters, step, *changes]
-        return BufferedFunction(ca.Function("forward", symbols, found))
+        return BufferedFunction(ca.Function("forward", symbols, results))
 
 
 class ComputedFunctions:
-    """The functions of a run, found as they are computed, in the order of stepper.c."""
+    """The functions of a run, in the order in which stepper.c evaluates them."""
 
     def __init__(self, program: RolloutProgram, problem: RunProblem, tableau: Tableau) -> None:
         self._program, self._problem, self._tableau = program, problem, tableau
         self._state, self._held, self._event = problem.state, problem.held, 0
-        self._given = (problem.parameters,)
+        self._parameters = problem.parameters
         self._key = repr(tableau)
         self._functions: dict[str, Differentiable] = {}
-        self.found: list[ComputedFunction] = []
+        self.links: list[ComputedFunction] = []
 
     def run(self, longest: float) -> None:
         """Runs from the start to the end."""
-        times, number = self._problem.times, 0
-        for block in fixed_steps(self._problem, longest):
-            for first, after, is_row in block.tolist():
-                if not number:
-                    self._add("row", "row", first)
-                    number = 1
-                self._update(first)
-                self._add("state", "step", first, after - first)
-                if is_row and number < times.size - 1:
-                    self._add("row", "row", after, row=number)
-                    number += 1
+        times, number = self._problem.times, 1
+        self._add("row", "row", times[0])
+        for first, after, is_row in fixed_steps(self._problem, longest):
+            self._update(first)
+            self._add("state", "step", first, after - first)
+            if is_row and number < times.size - 1:
+                self._add("row", "row", after, row=number)
+                number += 1
         self._update(times[-1])
         self._add("row", "row", times[-1], row=number)
 
     def _update(self, time: float) -> None:
-        """What happens at the start of a step: the projection, and the updates that are due."""
+        """Projects the state and makes the updates that are due, at the start of a step."""
         problem, projects = self._problem, self._program.compiled.projects
         while True:
             is_due = self._event < problem.events.size and problem.events[self._event] <= time
@@ -144,9 +143,9 @@ class ComputedFunctions:
         self, kind: str, name: str, time: float, *others: FloatArray | float, row: int = 0
     ) -> None:
         function = self._function(name)
-        arguments = (time, self._state, self._held, *self._given, *others)
+        arguments = (time, self._state, self._held, self._parameters, *others)
         value = function.value(*arguments)[0].copy()
-        self.found.append(ComputedFunction(kind, function, arguments, row))
+        self.links.append(ComputedFunction(kind, function, arguments, row))
         if kind == "state":
             self._state = value
         elif kind == "held":
@@ -177,10 +176,10 @@ def projected(
     held: FloatArray,
     parameters: FloatArray,
 ) -> tuple[FloatArray, list[ComputedFunction]]:
-    """A state brought to N*, and the functions that did it.
+    """Projects a state onto N*; returns it, and the functions of its Newton steps.
 
     Raises:
-        InconsistentStateError: Newton's steps do not reach it.
+        InconsistentStateError: The Newton steps do not converge.
     """
     links = list[ComputedFunction]()
     if not program.compiled.projects:
@@ -189,15 +188,15 @@ def projected(
     for _ in range(MOST):
         arguments = time, state, held, parameters
         links.append(ComputedFunction("state", newton, arguments))
-        found, left = newton.value(*arguments)
-        state = found.copy()
+        reached, left = newton.value(*arguments)
+        state = reached.copy()
         if left[0] <= REACHED:
             return state, links
     raise InconsistentStateError(f"{program.name}: no start on N* near {show(start)}", left.copy())
 
 
 def _newton(program: RolloutProgram) -> Differentiable:
-    """Two Newton steps to N*."""
+    """Returns the function of two Newton steps to N*."""
     return program.kept("gradient newton", lambda: Differentiable(program.compiled.newton(2)))
 
 
@@ -205,48 +204,37 @@ def _symbols(function: ca.Function) -> list[ca.SX]:
     return [ca.SX.sym("x", function.numel_in(i)) for i in range(function.n_in())]
 
 
-def _dense(name: str, given: Sequence[ca.SX], found: Sequence[ca.SX]) -> ca.Function:
-    dense = [ca.densify(each) for each in found]
-    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})
-
-
 def _forward(function: ca.Function, count: int) -> ca.Function:
     """(arguments, changes of state, held and parameters) -> the result, and its change."""
     symbols = _symbols(function)
     changes = [ca.SX.sym("d", symbol.numel(), count) for symbol in symbols[1:4]]
     value = function.call(symbols)[0]
-    found = sum(
+    change = sum(
         (ca.jtimes(value, x, d) for x, d in zip(symbols[1:4], changes, strict=True)),
         ca.SX.zeros(value.numel(), count),
     )
-    return _dense("forward", [*symbols, *changes], [value, found])
+    return dense_function("forward", [*symbols, *changes], [value, change])
 
 
-def _sum(weights: FloatArray, values: Sequence[ca.MX]) -> ca.MX:
-    """The weighted sum of the values that there are so far."""
+def _sum(weights: FloatArray, values: Sequence[Any], zero: Any) -> Any:
+    """Returns the weighted sum of the stages so far."""
     pairs = zip(weights.tolist(), values, strict=False)
-    return sum((weight * each for weight, each in pairs if weight), ca.MX(0.0))
+    return sum((weight * each for weight, each in pairs if weight), zero)
 
 
 def _step(rate: ca.Function, tableau: Tableau) -> ca.Function:
-    """A Runge-Kutta step: (time, state, held, parameters, step) -> the state."""
+    """Returns a Runge-Kutta step: (time, state, held, parameters, step) -> the state."""
     time, state, held, parameters = _symbols(rate)
-    step = ca.SX.sym("step")
-
-    def weighted(weights: FloatArray) -> ca.SX:
-        pairs = zip(weights.tolist(), rates, strict=False)
-        return sum((weight * each for weight, each in pairs if weight), ca.SX.zeros(state.shape))
-
-    rates: list[ca.SX] = []
+    step, zero, rates = ca.SX.sym("step"), ca.SX.zeros(state.shape), list[ca.SX]()
     for row, part in zip(tableau.a, tableau.c, strict=True):
-        stage = state + step * weighted(row)
+        stage = state + step * _sum(row, rates, zero)
         rates.append(rate(time + part * step, stage, held, parameters)[0])
-    reached = state + step * weighted(tableau.b)
+    reached = state + step * _sum(tableau.b, rates, zero)
     return ca.Function("step", [time, state, held, parameters, step], [reached])
 
 
 def _updates(compiled: CompiledDiagram, due: int, is_unrestricted: bool) -> ca.Function:
-    """All updates of one kind at an instant: (time, ..., noise) -> what is held."""
+    """Returns all updates of one kind at an instant: (time, ..., noise) -> held values."""
     names = (*ARGUMENTS, "noise")
     symbols = [ca.SX.sym(name, compiled.sizes[name]) for name in names]
     held = ca.SX(symbols[2])

@@ -1,4 +1,4 @@
-"""Exact derivatives of rollouts with fixed steps: of a cost backward, along a change forward."""
+"""Exact derivatives of rollouts with fixed steps, in backward and in forward mode."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -61,15 +61,15 @@ def rollout_gradient(
 
     Raises:
         ModelError: The arguments do not fit; or steps are under error control, or blocks change at
-            moments that are found, as at impacts, where the state has no such derivative.
+            times to be located, as at impacts, where the state has no such derivative.
         InconsistentStateError: The start is not on N*.
         SimulationError: The run fails.
     """
     chain = FunctionChain.of(loop, start, parameters, times, config, seed)
     seeds = np.zeros((chain.problem.times.size, chain.program.width))
-    for name, given in weights.items():
+    for name, signal_weights in weights.items():
         part = chain.part(name)
-        values = numbers(f"weights of '{name}'", given)
+        values = numbers(f"weights of '{name}'", signal_weights)
         if values.shape != seeds[:, part].shape:
             raise ModelError(
                 f"weights of '{name}' must have the shape {seeds[:, part].shape} of this signal in "
@@ -118,13 +118,13 @@ def rollout_tangent(
 
 @dataclass(frozen=True, eq=False)
 class FunctionChain:
-    """A run as a chain of functions, each of which has a derivative.
+    """A run as a chain of differentiable functions.
 
     Attributes:
-        program: What is run.
+        program: The program.
         run: The run.
-        problem: Its start and its settings.
-        links: The functions, in their order.
+        problem: Its start, parameters and times.
+        links: The functions in their order.
     """
 
     program: RolloutProgram
@@ -142,8 +142,8 @@ class FunctionChain:
         config: SimulatorConfig,
         seed: Seed | None,
     ) -> "FunctionChain":
-        asked = RolloutRequest.of(loop, times, config, None, None)
-        program, settings = asked.program, asked.settings
+        request = RolloutRequest.of(loop, times, config, None, None)
+        program, settings = request.program, request.settings
         if settings.tableau is None:
             raise ModelError(
                 "a gradient is that of fixed steps: choose use_error_control=False, a "
@@ -152,11 +152,11 @@ class FunctionChain:
         compiled = program.compiled
         if compiled.changes or compiled.has_stepped:
             raise ModelError(
-                f"{program.name} has no gradient: a block in it changes at moments that are found, "
-                "as at impacts and openings, or is stepped by Drake"
+                f"{program.name} has no gradient: a block changes at times that a run locates, as "
+                "at impacts and openings, or Drake steps it"
             )
         seeds = None if seed is None else [seed]
-        problems = problems_of(program, start, parameters, asked.times, seeds)
+        problems = problems_of(program, start, parameters, request.times, seeds)
         if len(problems) != 1:
             raise ModelError(f"a gradient is that of one run, got {len(problems)} starts")
         (run,) = run_loop(loop, start, parameters, times, config=config, seeds=seeds)
@@ -165,15 +165,15 @@ class FunctionChain:
         problem = problems[0]
         links = ComputedFunctions(program, problem, settings.tableau)
         links.run(settings.longest)
-        return cls(program, run, problem, links.found)
+        return cls(program, run, problem, links.links)
 
     @property
     def size(self) -> int:
-        """How many numbers a start has."""
+        """The number of entries of a start."""
         return self.program.size + int(self.program.kept_places.size)
 
     def part(self, name: str) -> slice:
-        """Where a signal stands in a row."""
+        """Returns the columns of a signal in a row."""
         names = list(self.program.signals)
         if name not in names:
             raise ModelError(unknown_name("signal", name, names))
@@ -182,13 +182,10 @@ class FunctionChain:
         return slice(stops[index], stops[index + 1])
 
     def forward(self, start: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The changes of all rows, by those of the start and the parameters.
+        """Returns the changes of all rows, shape (k, j, width).
 
         Args:
-            start, parameters: The changes, shapes (k, n) and (k, m).
-
-        Returns:
-            Those of the rows, shape (k, j, width).
+            start, parameters: k changes of start and parameters, shapes (k, n) and (k, m).
         """
         count, size = len(start), self.program.size
         state, held = start[:, :size], np.zeros((count, self.problem.held.size))
@@ -206,7 +203,7 @@ class FunctionChain:
         return rows
 
     def backward(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The gradient by start and parameters, by the weights of all rows."""
+        """Returns the gradient of the weighted rows with respect to start and parameters."""
         state, held = np.zeros(self.program.size), np.zeros(self.problem.held.size)
         parameters = np.zeros(self.problem.parameters.size)
         for link in reversed(self.links):

@@ -1,4 +1,4 @@
-"""Many runs side by side: what C is given, and what comes back."""
+"""Many runs side by side: the arguments and results of lanes.c."""
 
 import ctypes
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping.machine import Library, RunState, go_on
 
 STOPPED = 1 << 62
-"""No more runs are taken, and those under way end; lanes.c has the same number."""
+"""A value of "next" with which no more runs start, and all others end; lanes.c has the same."""
 
 ENDLESS = 1 << 62
 """More steps than a run takes."""
@@ -42,30 +42,39 @@ def run_many(
     """Runs a diagram many times, on all cores.
 
     Args:
-        lanes: What `library.load` returned.
-        code: The diagram as machine code, which goes on with runs that are handed over to it.
+        lanes: The machine code of runs side by side, as `library.load` returns it.
+        code: The machine code of one run, which continues runs that need it.
         program: The diagram.
-        problems: What to run.
-        settings: How to step; nothing looks at these runs while they go on.
+        problems: The runs.
+        settings: How to step; its `look` is not called.
     """
-    many = RunBatch(program, problems, settings, ENDLESS)
-    _run(lanes, many)
-    return many.ended(partial(go_on, code), num_cores())
+    batch = RunBatch(program, problems, settings, ENDLESS)
+    structure, count = batch.on_processor(), len(problems)
+    threads = max(1, min(num_cores(), count // 8))
+    with ThreadPoolExecutor(threads) as pool:
+        try:  # Machine code releases Python's lock; Ctrl-C ends it.
+            calls = [pool.submit(lanes.run_lanes, ctypes.byref(structure)) for _ in range(threads)]
+            for call in calls:
+                call.result()
+        except BaseException:
+            batch.arrays["next"][0] = STOPPED
+            raise
+    return batch.ended(partial(go_on, code), num_cores())
 
 
 def run_briefly(
     lanes: Library, program: RolloutProgram, problems: Problems, settings: Settings, most: int
 ) -> list[Run | None]:
-    """The same on one core, of runs that come to their end side by side; None for the others.
+    """Runs a diagram many times, on one core; returns None for runs that do not end side by side.
 
     Args:
         lanes, program, problems, settings: As of `run_many`.
-        most: A run that takes more steps is none of them.
+        most: The number of steps after which a run does not continue.
     """
-    many = RunBatch(program, problems, settings, most)
-    lanes.run_lanes(ctypes.byref(many.here()))
-    endings = many.arrays["endings"].tolist()
-    return [None if ending else many.done(index) for index, ending in enumerate(endings)]
+    batch = RunBatch(program, problems, settings, most)
+    lanes.run_lanes(ctypes.byref(batch.on_processor()))
+    endings = batch.arrays["endings"].tolist()
+    return [None if ending else batch.done(index) for index, ending in enumerate(endings)]
 
 
 class RunBatch:
@@ -73,14 +82,14 @@ class RunBatch:
 
     Args:
         program: The diagram.
-        problems: What to run.
+        problems: The runs.
         settings: How to step.
-        most: A run that takes more steps is to go on elsewhere.
+        most: The number of steps after which a run has to continue elsewhere.
 
     Attributes:
-        arrays: What C reads and writes, by the names that lanes.c has: of each run "runs", where it
-            is, "endings", whether it is to go on elsewhere, "states", "held", and "rows", shape
-            (k, j, width).
+        arrays: The arrays that C reads and writes, by their names in lanes.c. Of each run: "runs",
+            its `RunState`; "endings", whether it has to continue elsewhere; "states", "held" and
+            "rows", shape (k, j, width).
     """
 
     def __init__(
@@ -107,12 +116,8 @@ class RunBatch:
             "next": np.zeros(1, dtype=np.longlong),
         }
 
-    def batch(self, places: Mapping[str, int]) -> ctypes.Structure:
-        """What C takes.
-
-        Args:
-            places: The addresses of `arrays`.
-        """
+    def structure(self, addresses: Mapping[str, int]) -> ctypes.Structure:
+        """Returns the Batch of lanes.c, with the addresses of all arrays."""
         problems, settings = self._problems, self._settings
         return _Batch(
             num_runs=len(problems),
@@ -124,58 +129,39 @@ class RunBatch:
             stages=self.arrays["b"].size,
             longest=settings.longest,
             relative=settings.relative,
-            **places,
+            **addresses,
         )
 
-    def here(self) -> ctypes.Structure:
-        """The same with the arrays of this processor."""
-        return self.batch({name: array.ctypes.data for name, array in self.arrays.items()})
+    def on_processor(self) -> ctypes.Structure:
+        """Returns the Batch of lanes.c with the arrays of this processor."""
+        return self.structure({name: array.ctypes.data for name, array in self.arrays.items()})
 
     def done(self, index: int) -> Run:
-        """A run that has come to its end."""
-        own = RunState.from_buffer(self.arrays["runs"][index])
-        state, held = self.arrays["states"][index], self.arrays["held"][index]
-        given = own.time, state, held, own.event, own.steps, own.before, own.next
-        return Run(self.arrays["rows"][index], RunEnding.DONE, *given, np.inf, _NOWHERE)
+        """Returns a run that has reached its end."""
+        at, arrays = RunState.from_buffer(self.arrays["runs"][index]), self.arrays
+        values = at.time, arrays["states"][index], arrays["held"][index]
+        counts = at.event, at.steps, at.before, at.next
+        return Run(arrays["rows"][index], RunEnding.DONE, *values, *counts, np.inf, np.zeros(0))
 
     def ended(self, go_on: Callable[..., Run], threads: int) -> list[Run]:
-        """What all runs come to.
+        """Returns all runs; those that have to continue elsewhere do so first.
 
         Args:
-            go_on: (problem, settings, where it is, state, held, rows) -> a run that goes on
-                elsewhere.
-            threads: How many of these go on at once.
+            go_on: (problem, settings, run state, state, held, rows) -> the run.
+            threads: The number of runs that continue at once.
         """
 
         def other(index: int) -> Run:
-            own = RunState.from_buffer(self.arrays["runs"][index])
-            given = (self.arrays[name][index] for name in ("states", "held", "rows"))
-            return go_on(self._problems[index], self._settings, own, *given)
+            at = RunState.from_buffer(self.arrays["runs"][index])
+            values = (self.arrays[name][index] for name in ("states", "held", "rows"))
+            return go_on(self._problems[index], self._settings, at, *values)
 
         others = np.flatnonzero(self.arrays["endings"]).tolist()
-        found = {}
-        if others:
-            with ThreadPoolExecutor(threads) as pool:
-                found = dict(zip(others, pool.map(other, others), strict=True))
-        return [found.get(index) or self.done(index) for index in range(len(self._problems))]
-
-
-_NOWHERE = np.zeros(0)
-
-
-def _run(lanes: Library, many: RunBatch) -> None:
-    """Runs all in threads, which need no lock of Python's; Ctrl-C ends them."""
-    arrays, batch = many.arrays, many.here()
-    threads = max(1, min(num_cores(), len(arrays["endings"]) // 8))
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for done in [pool.submit(lanes.run_lanes, ctypes.byref(batch)) for _ in range(threads)]:
-                done.result()
-        except BaseException:
-            arrays["next"][0] = STOPPED
-            raise
+        with ThreadPoolExecutor(threads) as pool:
+            continued = dict(zip(others, pool.map(other, others), strict=True))
+        return [continued.get(index) or self.done(index) for index in range(len(self._problems))]
 
 
 def _row(table: FloatArray) -> int:
-    """How many numbers lead from a run to the next one."""
+    """The distance between the rows of two runs, in numbers; 0 if all runs have the same."""
     return 0 if len(table) == 1 else int(np.prod(table.shape[1:]))

@@ -1,4 +1,4 @@
-/* Error control by DOP853, each run with its own step; the order of things is that of stepper.c. */
+/* Error control by DOP853, each run with its own step; in the order of stepper.c. */
 
 ON_DEVICE static real weighted(const real *vector, const real *unit) {
   real sum = K(0.0);
@@ -62,7 +62,7 @@ ON_DEVICE static void interpolant(real size, const real *x, const real *reached,
   }
 }
 
-/* Which runs have a row before some times. */
+/* Returns which runs have a row before given times. */
 ON_DEVICE static mask with_row(const Batch *b, mask wanted, const Run *run, real end) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
@@ -72,7 +72,7 @@ ON_DEVICE static mask with_row(const Batch *b, mask wanted, const Run *run, real
   return wanted;
 }
 
-/* Writes the rows within steps; returns where they could be written. */
+/* Writes the rows within steps; returns for which runs this succeeds. */
 ON_DEVICE static mask write_between(const Batch *b, Lanes *l, mask wanted, real time, real size,
                                     real end, const real *reached, real (*k)[SIZE], Run *run) {
   real f[7][SIZE], at[SIZE];
@@ -103,17 +103,17 @@ ON_DEVICE static mask write_between(const Batch *b, Lanes *l, mask wanted, real 
   return good;
 }
 
-/* Runs that stand side by side, each at a step of its own. */
+/* Runs side by side, each with its own step. */
 typedef struct {
   Lanes l;
   Run run[LANES], before[LANES];
-  real k[16][SIZE], x[SIZE], held[HELD + 1]; /* what was before the step, too */
+  real k[16][SIZE], x[SIZE], held[HELD + 1]; /* before the step */
   real time, size, limit;
-  mask fresh, known; /* just loaded; the rate where the last step ended is that where this begins */
+  mask fresh, known; /* run just loaded; rate at the end of the last step is valid */
   int trials[LANES], rejected[LANES];
 } Stepping;
 
-/* Begins a step of some runs; returns where it could be begun. */
+/* Begins a step of some runs; returns for which runs this succeeds. */
 ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
   real rate[SIZE], first;
   long long rows[LANES];
@@ -157,7 +157,7 @@ ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
   return good;
 }
 
-/* Where a trial of a step leads to; returns which steps are long enough to be any. */
+/* Computes the end of a trial step; returns which steps are long enough. */
 ON_DEVICE static mask bounded(Stepping *p, mask alive, real *end) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
@@ -171,7 +171,7 @@ ON_DEVICE static mask bounded(Stepping *p, mask alive, real *end) {
   return alive;
 }
 
-/* Takes over a step of a run, or tries a shorter one; returns 0 where the run hardly leads on. */
+/* Accepts a step of a run, or shortens it; returns 0 if the run adds hardly any time. */
 ON_DEVICE static int decide(const Batch *b, Stepping *p, int lane, int accepted, double end,
                             double factor) {
   Run *run = &p->run[lane];
@@ -194,7 +194,7 @@ ON_DEVICE static int decide(const Batch *b, Stepping *p, int lane, int accepted,
   return run->steps < b->most;
 }
 
-/* Writes the rows at the ends of steps; returns where they could be written. */
+/* Writes the rows at the ends of steps; returns for which runs this succeeds. */
 ON_DEVICE static mask write_ends(const Batch *b, Stepping *p, mask wanted, real end) {
   long long rows[LANES];
   mask at_row = wanted, at_last, changed;

@@ -1,4 +1,4 @@
-"""Many runs on a GPU, one in each thread, by the same source as side by side on the processor."""
+"""Many runs on a GPU, one in each thread, by the source of runs side by side."""
 
 from importlib import import_module
 from typing import Any
@@ -13,16 +13,16 @@ from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Settings
 
 BLOCK = 64
-"""So many threads are a block: each has some hundred live numbers."""
+"""The number of threads of a block: each has some hundred live numbers."""
 
 THREADS = 1 << 16
-"""At most so many threads take runs under error control, each after it has ended one."""
+"""The largest number of threads under error control; each makes one run after the other."""
 
 _GET = 'pip install "drake_dae[cuda]" on a machine with an NVIDIA GPU, or leave out device="cuda"'
 
 
 def find_device() -> Any:
-    """CuPy, where it finds a GPU.
+    """Returns CuPy, after it has found a GPU.
 
     Raises:
         ModelError: It is not installed, or there is no GPU.
@@ -45,8 +45,8 @@ def run_on_device(program: RolloutProgram, problems: Problems, settings: Setting
 
     Args:
         program: The diagram.
-        problems: What to run.
-        settings: How to step; nothing looks at these runs while they go on.
+        problems: The runs.
+        settings: How to step; its `look` is not called.
 
     Raises:
         ModelError: There is no GPU, or the diagram does not run side by side.
@@ -54,19 +54,19 @@ def run_on_device(program: RolloutProgram, problems: Problems, settings: Setting
     cupy = find_device()
     if not can_run(program):
         raise ModelError(
-            f'{program.name} does not run with device="cuda": a block in it changes at moments '
-            "that are found, or is stepped by Drake, or has an operation that lanes do not know"
+            f'{program.name} does not run with device="cuda": a block in it changes at times that '
+            "a run locates, or Drake steps it, or it has an operation that lanes do not support"
         )
     options = ("-std=c++17", "--fmad=true")
     kernel = program.kept(
         "device", lambda: cupy.RawModule(code=source(program), options=options)
     ).get_function("run_on_device")
-    many = RunBatch(program, problems, settings, ENDLESS)
-    there = {name: cupy.asarray(array) for name, array in many.arrays.items()}
-    batch = many.batch({name: array.data.ptr for name, array in there.items()})
-    given = cupy.asarray(np.frombuffer(bytes(batch), dtype=np.uint8))
+    batch = RunBatch(program, problems, settings, ENDLESS)
+    on_device = {name: cupy.asarray(array) for name, array in batch.arrays.items()}
+    structure = batch.structure({name: array.data.ptr for name, array in on_device.items()})
+    argument = cupy.asarray(np.frombuffer(bytes(structure), dtype=np.uint8))
     threads = len(problems) if settings.tableau else min(len(problems), THREADS)
-    kernel((-(-threads // BLOCK),), (BLOCK,), (given,))
+    kernel((-(-threads // BLOCK),), (BLOCK,), (argument,))
     for name in ("states", "held", "rows", "runs", "endings"):
-        many.arrays[name][...] = there[name].get()
-    return many
+        batch.arrays[name][...] = on_device[name].get()
+    return batch

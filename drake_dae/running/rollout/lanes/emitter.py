@@ -1,4 +1,4 @@
-"""CasADi functions as C text on `real`, which is a number or several side by side; see lanes.h."""
+"""CasADi functions as C on `real`: a number, or several side by side; see lanes.h."""
 
 import casadi as ca
 
@@ -43,64 +43,64 @@ _OPERATIONS: dict[int, str] = {
     ca.OP_ATAN2: "each_atan2({0}, {1})",
     ca.OP_COPYSIGN: "each_copysign({0}, {1})",
 }
-"""CasADi's operations in the words of lanes.h."""
+"""CasADi's operations, by the functions of lanes.h."""
 
 _TURNS = (ca.OP_SIN, ca.OP_COS)
-"""These are computed together, since most angles have both."""
+"""Both are computed together, since most angles need both."""
 
 
 def can_be_emitted(function: ca.Function) -> bool:
-    """Whether all operations of a function are known here."""
-    known = {*_OPERATIONS, *_TURNS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+    """Whether all operations of a function are supported."""
+    supported = {*_OPERATIONS, *_TURNS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
     codes = (function.instruction_id(i) for i in range(function.n_instructions()))
-    return known.issuperset(codes)
+    return supported.issuperset(codes)
 
 
 def emitted(function: ca.Function, name: str) -> str:
-    """A function as C text: a value is named once, in the order in which CasADi computes them.
+    """Returns a function as C, with its values in the order in which CasADi computes them.
 
     Args:
         function: A function of expressions (SX), whose inputs and outputs are dense columns.
         name: The name of the C function, `void name(const real *a0, ..., real *r0, ...)`.
 
     Raises:
-        ModelError: It has an operation that `can_be_emitted` does not know.
+        ModelError: An operation is not supported, see `can_be_emitted`.
     """
     if not can_be_emitted(function):
-        raise ModelError(f"{function.name()} has an operation that lanes do not know")
+        raise ModelError(f"{function.name()} has an operation that lanes do not support")
     places: dict[int, str] = {}
     turned, inverted = set[str](), set[str]()
     often = _divisors(function)
     lines = []
     for i in range(function.n_instructions()):
         code = function.instruction_id(i)
-        given, found = function.instruction_input(i), function.instruction_output(i)
+        operands, results = function.instruction_input(i), function.instruction_output(i)
         value = f"v{i}"
         if code == ca.OP_OUTPUT:
-            lines.append(f"r{found[0]}[{found[1]}] = {places[given[0]]};")
+            lines.append(f"r{results[0]}[{results[1]}] = {places[operands[0]]};")
             continue
         if code == ca.OP_CONST:
             text = f"K({_number(function.instruction_constant(i))})"
         elif code == ca.OP_INPUT:
-            text = f"a{given[0]}[{given[1]}]"
+            text = f"a{operands[0]}[{operands[1]}]"
         elif code in _TURNS:
-            angle = places[given[0]]
+            angle = places[operands[0]]
             if angle not in turned:
                 turned.add(angle)
                 lines.append(f"real sin_{angle}, cos_{angle};")
                 lines.append(f"turn({angle}, &sin_{angle}, &cos_{angle});")
-            places[found[0]] = f"{'sin' if code == ca.OP_SIN else 'cos'}_{angle}"
+            places[results[0]] = f"{'sin' if code == ca.OP_SIN else 'cos'}_{angle}"
             continue
         elif code == ca.OP_DIV and i in often:
-            divided, by = (places[place] for place in given)
+            divided, by = (places[place] for place in operands)
             if by not in inverted:
                 inverted.add(by)
                 lines.append(f"const real over_{by} = K(1.0) / {by};")
             text = f"{divided} * over_{by}"
         else:
-            text = _OPERATIONS[code].format(*(places[place] for place in given))
+            text = _OPERATIONS[code].format(*(places[place] for place in operands))
         lines.append(f"const real {value} = {text};")
-        places[found[0]] = value
+        places[results[0]] = value
     arguments = [f"const real *a{i}" for i in range(function.n_in())]
     arguments += [f"real *r{i}" for i in range(function.n_out())]
     unused = " ".join(f"(void)a{i};" for i in range(function.n_in()))
@@ -109,12 +109,12 @@ def emitted(function: ca.Function, name: str) -> str:
 
 
 def _divisors(function: ca.Function) -> set[int]:
-    """The divisions whose divisor others have, too: one of them takes as long as ten products."""
+    """Returns divisions with a common divisor: a division takes as long as ten products."""
     places, divisions = dict[int, int](), dict[int, list[int]]()
     for i in range(function.n_instructions()):
-        code, given = function.instruction_id(i), function.instruction_input(i)
+        code, operands = function.instruction_id(i), function.instruction_input(i)
         if code == ca.OP_DIV:
-            divisions.setdefault(places[given[1]], []).append(i)
+            divisions.setdefault(places[operands[1]], []).append(i)
         if code != ca.OP_OUTPUT:
             places[function.instruction_output(i)[0]] = i
     return {i for same in divisions.values() if len(same) > 1 for i in same}

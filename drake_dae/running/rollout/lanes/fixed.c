@@ -8,7 +8,7 @@ ON_DEVICE static int first_of(mask some) {
 /* Fixed steps of LANES runs, all at the same times. */
 ON_DEVICE static void run_together(const Batch *b, long long first) {
   Lanes l;
-  Run run[LANES], before; /* those that go on are alike: the first one stands for all */
+  Run run[LANES], before; /* equal for all active runs: that of the first */
   real k[16][SIZE], reached[SIZE], x[SIZE], held[HELD + 1];
   long long rows[LANES];
   mask alive = none(), changed;

@@ -1,5 +1,5 @@
-/* Many runs, LANES of them side by side. What cannot go on as a matter of course is handed over:
-   stepper.c goes on from the last accepted state, and says why a run fails. */
+/* Many runs, LANES of them side by side. stepper.c continues runs that fail here, or need more than
+   the usual Newton steps, from the last accepted state, and finds why a run fails. */
 
 $header
 $functions
@@ -9,13 +9,13 @@ $constants
 #define NEAR K(1e-5)
 
 $run
-/* How a run ended here; Python has the same list. */
+/* How a run ended; Python has the same list. */
 enum { DONE, HANDED_OVER };
 
-/* So many trials of a step may be rejected. */
+/* The largest number of rejected trials of a step. */
 enum { TRIALS = 30 };
 
-/* The first run that nobody has taken yet, where Python was interrupted. */
+/* A value of `next` after Python was interrupted. */
 #define STOPPED (1LL << 62)
 #ifdef __CUDACC__
 #define IS_STOPPED(b) 0
@@ -23,10 +23,10 @@ enum { TRIALS = 30 };
 #define IS_STOPPED(b) (*(b)->next >= STOPPED)
 #endif
 
-/* What Python gives; an array of runs stands row by row. A step of 0 means that all have one row. */
+/* The arguments from Python. Arrays of runs have a row for each run; with a step of 0, one for all. */
 typedef struct {
-  long long num_runs, most; /* after `most` steps a run is handed over */
-  double *states, *held;    /* where runs start, and where they end */
+  long long num_runs, most; /* after `most` steps Python continues the run */
+  double *states, *held;    /* at the start, and then at the end */
   const double *parameters, *noise;
   long long parameter_step, noise_step;
   long long num_rows, num_events, stages;
@@ -38,13 +38,13 @@ typedef struct {
   const double *absolute;   /* of error control */
   Run *runs;
   int *endings;
-  volatile long long *next; /* the first run that nobody has taken yet */
+  volatile long long *next; /* the first run that is not started yet */
 } Batch;
 
-/* Runs under way, and what does not change within a step. */
+/* Active runs, and the constants of a step. */
 typedef struct {
   real x[SIZE], held[HELD + 1], parameters[PARAMETERS + 1], given[GIVEN + 1];
-  real time; /* to which `given` belongs */
+  real time; /* of `given` */
   long long run[LANES], event[LANES];
 } Lanes;
 
@@ -77,7 +77,7 @@ ON_DEVICE static Run begun(const Batch *b) {
   return run;
 }
 
-/* The number of the next run, or of the first of several. */
+/* Returns the number of the next run, or of the first of several. */
 ON_DEVICE static long long take(const Batch *b, long long count) {
 #ifdef __CUDACC__
   return (long long)atomicAdd((unsigned long long *)b->next, (unsigned long long)count);
@@ -92,7 +92,7 @@ ON_DEVICE static void set_time(real time, Lanes *l) {
   l->time = time;
 }
 
-/* The derivative of the state; returns where it has a value. */
+/* Computes the derivative of the state; returns for which runs it has a value. */
 ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
   real valid;
   set_time(time, l);
@@ -100,7 +100,7 @@ ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
   return is_number(valid);
 }
 
-/* Brings some states to N*; returns which are there. */
+/* Projects some states onto N*; returns which are on it. */
 ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
   real found[SIZE], at[SIZE], left;
   const real *from = x;
@@ -122,7 +122,7 @@ ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
   return wanted & ~open;
 }
 
-/* One row of the record for some runs; returns which could be written. */
+/* Writes a row of the record for some runs; returns for which it has values. */
 ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, const real *x,
                             const long long *row) {
   real values[WIDTH + 1], valid;
@@ -138,7 +138,7 @@ ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, co
   return wanted;
 }
 
-/* Which runs have an update of one of some rates now. */
+/* Returns which runs have an update of a rate now. */
 ON_DEVICE static mask due(const Batch *b, const Lanes *l, mask now, int number) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
@@ -147,7 +147,7 @@ ON_DEVICE static mask due(const Batch *b, const Lanes *l, mask now, int number) 
   return now;
 }
 
-/* The updates of one kind that are due; returns where they have values. */
+/* Makes the updates of one kind that are due; returns for which runs they have values. */
 ON_DEVICE static mask apply(const Batch *b, real time, Lanes *l, mask now, int unrestricted) {
   real fresh[HELD + 1], noise[NOISE + 1];
   mask good = now;
@@ -168,14 +168,14 @@ $updates
   return good;
 }
 
-/* What happens at the start of a step; returns where it could be done. */
+/* Makes one instant of updates and the projection; returns for which runs this succeeds. */
 ON_DEVICE static mask update(const Batch *b, real time, Lanes *l, mask to_project, mask now) {
   mask good = apply(b, time, l, now, 1) | ~now;
   good &= project(time, l->x, l, to_project) | ~to_project;
   return good & (apply(b, time, l, now, 0) | ~now);
 }
 
-/* Which runs have samples at their time. */
+/* Returns which runs have samples at their time. */
 ON_DEVICE static mask sampled(const Batch *b, const Lanes *l, mask wanted, const Run *run) {
   int lane;
   (void)l;
@@ -186,7 +186,7 @@ ON_DEVICE static mask sampled(const Batch *b, const Lanes *l, mask wanted, const
   return wanted;
 }
 
-/* All that happens at the start of a step; returns where it could be done. */
+/* Makes all updates and the projection at the start of a step; returns for which runs this succeeds. */
 ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, mask to_project,
                               Run *run, mask *changed) {
   mask good = wanted, now = none();
@@ -204,7 +204,7 @@ ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, 
   }
 }
 
-/* x and the weighted sum of rates; most weights of a high order are zero. */
+/* reached = x + step * weighted sum of rates; most weights of a high order are zero. */
 ON_DEVICE static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE],
                             real *reached) {
   real weights[16];
@@ -238,7 +238,7 @@ __global__ void run_on_device(const Batch *b) {
   }
 }
 #else
-/* What Python calls, from any number of threads at once. */
+/* Called by Python, from any number of threads at once. */
 __attribute__((visibility("default"))) void run_lanes(const Batch *b) {
   long long first;
   if (!b->stages) {

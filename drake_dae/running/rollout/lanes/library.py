@@ -1,47 +1,44 @@
-"""Many runs of a diagram as one library of machine code, in which they go side by side."""
+"""Machine code that runs a diagram many times, side by side in vector registers."""
 
 import ctypes
-from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from drake_dae.running.rollout.lanes.emitter import can_be_emitted, emitted
 from drake_dae.running.rollout.program import RolloutProgram
-from drake_dae.running.rollout.stepping.machine import DOP_TABLES, RUN, c_table
+from drake_dae.running.rollout.stepping.machine import DOP_TABLES, RUN, c_places, c_table
 from drake_dae.trace.compiled import Compiled, library
 
 FOLDER = Path(__file__).parent
 
 OPTIONS = ("-O2", "-ffp-contract=fast")
-"""A product and a sum are one operation where the processor can; -O2 takes a tenth less time."""
-
+"""Fused multiply-add where the processor has it; with -O2, runs take a tenth less time."""
 
 SLOWER = 4
-"""Operations of registers take so many times as long to compile."""
+"""The compile time of an operation on registers over that of an operation on numbers."""
 
 
 def can_run(program: RolloutProgram) -> bool:
-    """Whether runs of a diagram can go side by side: no block changes, and Drake steps none."""
+    """Whether runs can go side by side: no block changes at guards, and Drake steps none."""
     compiled = program.compiled
     if compiled.changes or compiled.has_stepped:
         return False
-    return all(can_be_emitted(each) for each in _functions(program).values())
+    return all(can_be_emitted(each) for each in compiled.staged.values())
 
 
 def load(program: RolloutProgram, compiled: Compiled, make: bool) -> ctypes.CDLL | None:
-    """The library of a diagram; None if there is none.
+    """Returns the library of a diagram; None if there is none.
 
     Args:
         program: The diagram.
         compiled: The choice, True or "auto".
-        make: Whether to make it where the cache has none.
+        make: Whether to make it if it is not in the cache.
 
     Warns:
-        MachineCodeWarning: It should be made and cannot be.
+        MachineCodeWarning: It cannot be made.
     """
     operations = program.num_operations * (SLOWER if compiled is True else 1)
     path = library(source(program), operations, compiled, make, OPTIONS)
@@ -49,13 +46,13 @@ def load(program: RolloutProgram, compiled: Compiled, make: bool) -> ctypes.CDLL
 
 
 def source(program: RolloutProgram) -> str:
-    """The C source of a diagram."""
-    functions, compiled = _functions(program), program.compiled
-    texts = [emitted(function, f"dae_{name}") for name, function in functions.items()]
-    words: dict[str, Any] = {
+    """Returns the C source of a diagram."""
+    compiled = program.compiled
+    texts = [emitted(function, f"dae_{name}") for name, function in compiled.staged.items()]
+    parts: dict[str, Any] = {
         "header": _text("lanes.h"),
         "functions": "\n".join(texts),
-        "constants": _constants(program, functions),
+        "constants": _constants(program),
         "run": RUN.read_text(encoding="utf-8"),
         "updates": "\n".join(
             _updated(number, len(rate.places), rate.is_unrestricted)
@@ -64,18 +61,14 @@ def source(program: RolloutProgram) -> str:
         "fixed": _text("fixed.c"),
         "controlled": _text("controlled.c"),
     }
-    return Template(_text("lanes.c")).substitute(words)
-
-
-def _functions(program: RolloutProgram) -> Mapping[str, ca.Function]:
-    return program.functions
+    return Template(_text("lanes.c")).substitute(parts)
 
 
 def _text(name: str) -> str:
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
-def _constants(program: RolloutProgram, functions: Mapping[str, ca.Function]) -> str:
+def _constants(program: RolloutProgram) -> str:
     compiled = program.compiled
     sizes = {
         "SIZE": program.size,
@@ -83,20 +76,19 @@ def _constants(program: RolloutProgram, functions: Mapping[str, ca.Function]) ->
         "PARAMETERS": compiled.sizes["parameters"],
         "NOISE": compiled.sizes["noise"],
         "WIDTH": program.width,
-        "GIVEN": functions["given"].numel_out(0),
+        "GIVEN": compiled.staged["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
         "RATES": len(compiled.rates),
     }
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
-        listed = ", ".join(map(str, [*rate.places, 0]))
-        lines.append(f"CONSTANT int places_{number}[] = {{{listed}}};")
+        lines.append(c_places(number, rate, "CONSTANT"))
     lines += [c_table(name, np.asarray(values), "CONSTANT") for name, values in DOP_TABLES.items()]
     return "\n".join([*lines, ""])
 
 
 def _updated(number: int, count: int, is_unrestricted: bool) -> str:
-    """How lanes.c computes an update where it is due."""
+    """Returns the C of an update of the runs in which it is due."""
     return f"""  if (unrestricted == {int(is_unrestricted)}) {{
     const mask own = due(b, l, now, {number});
     if (any(own)) {{

@@ -1,63 +1,49 @@
-"""A closed loop stepped without a compiler: a step, or many, are one call of CasADi."""
+"""A diagram stepped without a compiler, in the order of stepper.c."""
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from math import isfinite, sqrt
+from itertools import pairwise
+from math import ceil, isfinite, sqrt
 
 import numpy as np
+from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings, Tableau
+from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings, Tableau
 from drake_dae.running.rollout.stepping.course import (
-    REACHED,
+    DOP,
     Dop853Step,
-    RecordRows,
     RunEnded,
     RunStepper,
+    stage_rates,
 )
-from drake_dae.running.rollout.stepping.fused import CHUNK, DiagramFunctions
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 
 SHORTEST = 1e-12
-"""A step that is shorter than this, relative to the time, is none."""
+"""The run ends where a step becomes shorter than this, relative to the time."""
 
 MOST_FAILURES = 100
-"""So many trials of a step may fail for another reason than its error."""
+"""The number of trials of one step that may fail for another reason than their error."""
 
 
-def runner(fused: DiagramFunctions, settings: Settings) -> Callable[[RunProblem], Run]:
-    """What runs a closed loop.
-
-    Args:
-        fused: The closed loop.
-        settings: How to step.
-    """
-    steps = None
-    if settings.tableau is not None:
-        steps = _FixedSteps(fused, settings.tableau, settings)
-
-    def run(problem: RunProblem) -> Run:
-        start = float(problem.times[0])
-        course = RunStepper(
-            fused, problem, start, problem.state, problem.held, before=start, mark=start
-        )
-        try:
-            if steps is None:
-                _control(course, settings)
-            else:
-                steps.run(course)
-        except RunEnded as ended:
-            return course.finish(ended.ending)
-        return course.finish(RunEnding.DONE)
-
-    return run
+def run(functions: DiagramFunctions, settings: Settings, problem: RunProblem) -> Run:
+    """Runs a diagram until its end, or to where it cannot go on."""
+    course = RunStepper(functions, problem)
+    try:
+        if settings.tableau is None:
+            _run_controlled(course, settings)
+        else:
+            _run_fixed(course, settings, settings.tableau)
+    except RunEnded as ended:
+        return course.finish(ended.ending)
+    return course.finish(RunEnding.DONE)
 
 
-def _control(course: RunStepper, settings: Settings) -> None:
-    """Error control by DOP853 as in stepper.c; rows between steps from its interpolant, on N*."""
+def _run_controlled(course: RunStepper, settings: Settings) -> None:
+    """Error control by DOP853; rows between steps from its interpolant, on N*."""
     times, row, tried = course.problem.times, 1, 0.0
     moments = times.tolist()
     rate: FloatArray | None = None
-    course.write(course.time, course.state)
+    course.write()
     while course.time < moments[-1]:
         if settings.look(course.so_far, course.problem.context):
             raise RunEnded(RunEnding.PAUSED)
@@ -66,33 +52,39 @@ def _control(course: RunStepper, settings: Settings) -> None:
         if rate is None:
             rate = course.accepted_rate()
         course.look()
-        limit = course.boundary()
         tried = tried or _first_step(course, rate, settings)
-        step = _controlled(course, settings, rate, min(tried, settings.longest), limit)
+        step = _controlled_step(course, settings, rate, min(tried, settings.longest))
         course.check(step.end, step.reached)
         stop = min(bisect_left(moments, step.end, row), times.size - 1)
         if row < stop:
             course.write_between(step, times[row:stop])
         row = stop
         course.accept(step.end, step.reached)
-        rate = step.rate if step.is_on else None
+        rate = step.rates[-1] if step.is_on else None
         if row < times.size - 1 and moments[row] == course.time:
             if not step.is_on:
                 course.state = course.projected(course.time, course.state)
-            course.write(course.time, course.state)
+            course.write()
             row += 1
         # A step that only ended early, at a sample, says nothing against longer ones.
         shortened = step.size < tried and not step.rejected
         tried = max(step.following, tried if shortened else 0.0)
     course.update(is_on=rate is not None)
-    course.write(course.time, course.state)
+    course.write()
 
 
-def _controlled(
-    course: RunStepper, settings: Settings, rate: FloatArray, size: float, limit: float
+def _controlled_step(
+    course: RunStepper, settings: Settings, first: FloatArray, size: float
 ) -> Dop853Step:
-    """An accepted step from where a course is, at most to a limit in s."""
-    problem, failures, rejected = course.problem, 0, False
+    """Returns an accepted step, at most to the next event.
+
+    Args:
+        course: The run.
+        settings: How to step.
+        first: The derivative at its state.
+        size: The step to try, in s.
+    """
+    failures, rejected, limit = 0, False, course.boundary()
     while True:
         end = course.time + size
         if end >= limit - SHORTEST * abs(limit):
@@ -100,36 +92,31 @@ def _controlled(
         size = end - course.time
         if not size > SHORTEST * abs(course.time) or failures > MOST_FAILURES:
             raise RunEnded(RunEnding.STUCK)
-        reached, last, checks, stages = course.fused.controlled(
-            course.time,
-            course.state,
-            course.held,
-            problem.parameters,
-            rate,
-            size,
-            settings.absolute,
-            settings.relative,
+        rates = stage_rates(course.rate, DOP, course.time, course.state, size, first)
+        reached = course.state + size * (DOP.b @ rates)
+        larger = np.maximum(np.abs(course.state), np.abs(reached))
+        unit = settings.absolute + larger * settings.relative
+        fifth, third = (
+            float(np.sum(np.square((e[:-1] @ rates) / unit))) for e in (DOP853.E5, DOP853.E3)
         )
-        fifth, third, finite, left, valid = checks.tolist()
-        is_on, good = left <= REACHED, isfinite(finite)
-        error = size * fifth / sqrt((fifth + 0.01 * third) * rate.size) if fifth else 0.0
+        error = size * fifth / sqrt((fifth + 0.01 * third) * first.size) if fifth else 0.0
         factor = 10.0 if error == 0.0 else min(10.0, max(0.2, 0.9 * error**-0.125))
-        if not good:
-            course.note_stages(rate, size)
-        elif error < 1.0 and is_on and not isfinite(valid):
-            course.rate(end, reached)
-            good = False
-        elif error < 1.0:
-            following = size * (min(1.0, factor) if rejected else factor)
-            values = reached.copy(), last.copy(), stages
-            return Dop853Step(end, size, *values, is_on, following, rejected)
-        failures += not good
-        size *= factor if good else 0.2
+        is_good = isfinite(error)
+        if error < 1.0:
+            reached, is_on = course.nearly_projected(end, reached)
+            last = course.rate(end, reached)
+            is_good = not np.isnan(last[0])
+            if is_good:
+                following = size * (min(1.0, factor) if rejected else factor)
+                rates = np.vstack([rates, last])
+                return Dop853Step(end, size, reached, rates, is_on, following, rejected)
+        failures += not is_good
+        size *= factor if is_good else 0.2
         rejected = True
 
 
 def _first_step(course: RunStepper, rate: FloatArray, settings: Settings) -> float:
-    """A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4)."""
+    """Returns a first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4)."""
     state, longest = course.state, settings.longest
     unit = settings.absolute + np.abs(state) * settings.relative
 
@@ -147,88 +134,42 @@ def _first_step(course: RunStepper, rate: FloatArray, settings: Settings) -> flo
     return min(100.0 * h0, h1, longest)
 
 
-def fixed_steps(problem: RunProblem, longest: float) -> Iterator[FloatArray]:
-    """Times of steps between samples: where each begins, where it ends, and what is a row."""
+def fixed_steps(problem: RunProblem, longest: float) -> list[tuple[float, float, bool]]:
+    """Returns the fixed steps of a run: begin and end in s, and whether a row is at the end.
+
+    Their number divides the time between two rows or events.
+    """
     times = problem.times
     inside = problem.events[(problem.events > times[0]) & (problem.events < times[-1])]
     ends = np.union1d(times, inside)
-    lengths = np.diff(ends)
-    numbers = np.maximum(1, np.ceil(lengths / longest - 0.01)).astype(int)
-    # The last steps of all intervals, then the place of each step in its own one.
-    last = np.cumsum(numbers)
-    own = np.repeat(np.arange(len(numbers)), numbers)
-    place = np.arange(last[-1]) - (last - numbers)[own]
-    shares = np.array([place, place + 1]) / numbers[own]
-    first, after = ends[own] + lengths[own] * shares
-    after[last - 1] = ends[1:]
-    is_row = np.zeros(last[-1])
-    is_row[last - 1] = np.isin(ends[1:], times)
-    block = np.column_stack([first, after, is_row])
-    yield from np.split(block, last[np.flatnonzero(np.isin(ends[1:-1], inside))])
+    is_row = np.isin(ends, times).tolist()
+    steps: list[tuple[float, float, bool]] = []
+    for index, (first, last) in enumerate(pairwise(ends.tolist()), start=1):
+        count = max(1, ceil((last - first) / longest - 0.01))
+        inner = [first + (last - first) * (i / count) for i in range(count)]
+        steps += [(*step, False) for step in pairwise(inner)]
+        steps.append((inner[-1], last, is_row[index]))
+    return steps
 
 
-class _FixedSteps:
-    """Fixed steps, many in one call of CasADi."""
-
-    def __init__(self, fused: DiagramFunctions, tableau: Tableau, settings: Settings) -> None:
-        self._tableau, self._longest, self._look = tableau, settings.longest, settings.look
-        self._one, self._many = fused.steps(tableau)
-
-    def run(self, course: RunStepper) -> None:
-        """Runs to the end of the record."""
-        times = course.problem.times
-        course.write(course.time, course.state)
-        for block in fixed_steps(course.problem, self._longest):
-            course.update()
-            done = 0
-            while done < len(block):
-                if self._look(course.so_far, course.problem.context):
-                    raise RunEnded(RunEnding.PAUSED)
-                done += self._advance(course, block[done : done + CHUNK])
-        course.rows[-1] = course.rows[-1].without_last()
+def _run_fixed(course: RunStepper, settings: Settings, tableau: Tableau) -> None:
+    times = course.problem.times
+    course.write()
+    for start, end, is_row in fixed_steps(course.problem, settings.longest):
+        if course.steps % LOOKED == 0 and settings.look(course.so_far, course.problem.context):
+            raise RunEnded(RunEnding.PAUSED)
         course.update()
-        course.write(times[-1], course.state)
-
-    def _advance(self, course: RunStepper, block: FloatArray) -> int:
-        """Takes some steps, and says how many."""
-        problem = course.problem
-        step, is_guarded = self._many, bool(course.fused.program.compiled.guards)
-        if len(block) < CHUNK or is_guarded:
-            step, block = self._one, block[:1]
-        if is_guarded:
-            course.state = course.projected(course.time, course.state)
-            course.look()
-        starts, ends, is_row = block.T
-        given = (starts[:, None], (ends - starts)[:, None], course.held, problem.parameters)
-        states, checks = (
-            values.copy().reshape(len(block), -1) for values in step(course.state, *given)
-        )
-        # The first number is not finite where a step has no value, the second is a Newton step.
-        good = np.isfinite(checks[:, 0]) & (checks[:, 1] <= REACHED)
-        count = int(np.argmin(np.append(good, False)))
-        for end, state in zip(ends[:count].tolist(), states, strict=False):
-            course.check(end, state)
-            course.accept(end, state)
-        chosen = np.flatnonzero(is_row[:count])
-        course.rows.append(RecordRows(ends[chosen], states[chosen], course.held, False))
-        if count == len(block):
-            return count
-        self._advance_slowly(course, *block[count])
-        return count + 1
-
-    def _advance_slowly(self, course: RunStepper, start: float, end: float, is_row: float) -> None:
-        """A step where two Newton steps do not reach N*, or where something has no value."""
-        course.state = course.projected(start, course.state)
-        a, b, c = self._tableau
-        step, rates = end - start, [course.accepted_rate()]
-        for row, part in zip(a[1:], c[1:], strict=True):
-            change = sum(weight * rate for weight, rate in zip(row, rates, strict=False))
-            rates.append(course.rate(start + part * step, course.state + step * change))
-        state = course.state + step * (b @ np.array(rates))
+        course.look()
+        rates = stage_rates(course.rate, tableau, start, course.state, end - start)
+        if np.isnan(rates[0]).any():
+            raise RunEnded(RunEnding.INVALID)
+        state = course.state + (end - start) * (tableau.b @ rates)
         course.next = end
         if not np.isfinite(state).all():
             raise RunEnded(RunEnding.SPOILT)
         course.check(end, state)
         course.accept(end, state)
-        if is_row:
-            course.write(end, state)
+        if is_row and end < times[-1]:
+            course.write()
+    course.update()  # The last row comes after the updates of its time.
+    course.write()

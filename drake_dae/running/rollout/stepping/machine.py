@@ -1,4 +1,4 @@
-"""A diagram as one library of machine code, which steps it without Python in between."""
+"""A diagram as one library of machine code, which steps it without calls of Python."""
 
 import ctypes
 import time
@@ -25,10 +25,10 @@ RUN = Path(__file__).parent / "run.h"
 Library = ctypes.CDLL
 
 _PROJECTION, _ALL = 2, 7
-"""What is pending before a step, as stepper.c has it."""
+"""Bits of `RunState.pending`, as in run.h."""
 
 FIRST, PAUSE = 500, 0.1
-"""So many steps are taken before Python looks at the run, then as many as take this time, in s."""
+"""The steps before Python first checks a run; then the time between checks, in s."""
 
 
 class RunState(ctypes.Structure):
@@ -37,13 +37,8 @@ class RunState(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("time", "step", "start", "mark", "before")),
         *((name, ctypes.c_double) for name in ("begin", "next", "trial")),
-        *(
-            (name, ctypes.c_longlong)
-            for name in (
-                *("row", "event", "steps", "number", "index", "failures", "pending"),
-                "reacted",
-            )
-        ),
+        *((name, ctypes.c_longlong) for name in ("row", "event", "steps", "number", "index")),
+        *((name, ctypes.c_longlong) for name in ("failures", "pending", "reacted")),
     )
 
 
@@ -57,94 +52,95 @@ DOP_TABLES = {
     "dop_a_more": DOP853.A_EXTRA,
     "dop_c_more": DOP853.C_EXTRA,
 }
-"""The tables of DOP853 by the names that the C sources have for them."""
+"""The tables of DOP853, by their names in the C sources."""
 
 
 def load(program: RolloutProgram, compiled: Compiled, make: bool) -> Library | None:
-    """The library of a diagram; None if there is none.
+    """Returns the library of a diagram; None if there is none.
 
     Args:
         program: The diagram.
         compiled: The choice, True or "auto".
-        make: Whether to make it where the cache has none.
+        make: Whether to make it if it is not in the cache.
 
     Warns:
-        MachineCodeWarning: It should be made and cannot be.
+        MachineCodeWarning: It cannot be made.
     """
     path = library(_source(program), program.num_operations, compiled, make)
     return None if path is None else ctypes.CDLL(str(path))
 
 
 def run(code: Library, program: RolloutProgram, problem: RunProblem, settings: Settings) -> Run:
-    """Runs a diagram until its end, or to where it cannot go on by machine code alone.
+    """Runs a diagram until its end, or until machine code cannot continue.
 
     Args:
-        code: What `load` returned.
+        code: The machine code of the diagram.
         program: The diagram.
-        problem: What to run.
+        problem: The run.
         settings: How to step.
     """
     start = float(problem.times[0])
-    own = RunState(
+    run_state = RunState(
         time=start, start=start, mark=start, pending=_ALL, reacted=int(problem.has_reacted)
     )
+    state, held = problem.state.copy(), problem.held.copy()
     rows = np.empty((problem.times.size, program.width))
-    return go_on(code, problem, settings, own, problem.state.copy(), problem.held.copy(), rows)
+    return go_on(code, problem, settings, run_state, state, held, rows)
 
 
 def go_on(
     code: Library,
     problem: RunProblem,
     settings: Settings,
-    own: RunState,
+    run_state: RunState,
     state: FloatArray,
     held: FloatArray,
     rows: FloatArray,
 ) -> Run:
-    """Goes on with a run until its end, or to where it cannot go on by machine code alone.
+    """Continues a run until its end, or until machine code cannot continue.
 
     Args:
-        code: What `load` returned.
-        problem: What to run.
+        code: The machine code of the diagram.
+        problem: The run.
         settings: How to step.
-        own: Where the run is.
-        state, held: The accepted state and what is held; written over.
-        rows: All rows of its record, shape (k, width), of which some are written.
+        run_state: The progress of the run; overwritten.
+        state, held: The accepted state and the held values; overwritten.
+        rows: The rows of its record, shape (k, width), of which the first ones are written.
     """
     trial = np.full_like(problem.state, np.nan)
     step, tables = code.run_controlled, [settings.longest, settings.absolute, settings.relative]
     if settings.tableau is not None:
         a, b, c = settings.tableau
         step, tables = code.run_fixed, [settings.longest, b.size, a, b, c]
-    given = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
-    given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
-    arguments = [_argument(value) for value in given]
+    values = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
+    values += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
+    arguments = [_argument(value) for value in values]
     ending, budget = RunEnding.PAUSED, FIRST
     while ending is RunEnding.PAUSED and not settings.look(
-        lambda: problem.whole(rows[: own.row]), problem.context
+        lambda: problem.whole(rows[: run_state.row]), problem.context
     ):
         began = time.perf_counter()
-        ending = RunEnding(step(ctypes.byref(own), *arguments, _argument(budget)))
+        ending = RunEnding(step(ctypes.byref(run_state), *arguments, _argument(budget)))
         passed = time.perf_counter() - began
         budget = max(1, int(budget * min(4.0, PAUSE / max(passed, 1e-9))))
         if ending is RunEnding.OFF_MANIFOLD:
             try:
-                state[:] = problem.project(own.time, state, held)
+                state[:] = problem.project(run_state.time, state, held)
             except InconsistentStateError:
                 break
-            own.pending &= ~_PROJECTION
+            run_state.pending &= ~_PROJECTION
             ending = RunEnding.PAUSED
     return Run(
-        rows[: own.row],
+        rows[: run_state.row],
         ending,
-        own.time,
+        run_state.time,
         state,
         held,
-        own.event,
-        own.steps,
-        own.before,
-        own.next,
-        own.trial,
+        run_state.event,
+        run_state.steps,
+        run_state.before,
+        run_state.next,
+        run_state.trial,
         trial,
     )
 
@@ -156,7 +152,7 @@ def _argument(value: Any) -> Any:
 
 
 def _source(program: RolloutProgram) -> str:
-    compiled, calls = program.compiled, program.functions
+    compiled, calls = program.compiled, program.compiled.staged
     sizes: dict[str, int] = {
         "SIZE": max(1, program.size),  # An array has one entry at least.
         "HELD": compiled.sizes["held"],
@@ -175,8 +171,7 @@ def _source(program: RolloutProgram) -> str:
         sizes[f"{name.upper()}_RES"] = max(4, function.sz_res())
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
-        listed = ", ".join(map(str, [*rate.places, 0]))
-        lines.append(f"static const int places_{number}[] = {{{listed}}};")
+        lines.append(c_places(number, rate, "static const"))
     lines.append(f"static const double TOUCHING = {TOUCHING!r};")
     lines += [c_table(name, np.asarray(values)) for name, values in DOP_TABLES.items()]
     words = {
@@ -196,7 +191,7 @@ def _source(program: RolloutProgram) -> str:
 
 
 def _updated(number: int, rate: UpdateRate) -> str:
-    """How stepper.c computes an update that is due."""
+    """Returns the C of an update that is due."""
     count = len(rate.places)
     return f"""  if (due >> {number} & 1 && unrestricted == {int(rate.is_unrestricted)}) {{
     double values[{count + 1}], valid;
@@ -210,9 +205,9 @@ def _updated(number: int, rate: UpdateRate) -> str:
 
 
 def _sampled(number: int) -> str:
-    """What stepper.c has for a diagram with a block that Drake steps."""
+    """Returns the C function of a sample, for a diagram with a block that Drake steps."""
     return f"""
-/* What Drake's step reads and the unrestricted updates; or, after it, the discrete ones. */
+/* The input of Drake's step and the unrestricted updates; or, after it, the discrete ones. */
 __attribute__((visibility("default"))) int sample(
     double time, double *held, const double *parameters, const double *noise, long long due,
     int unrestricted, double *input) {{
@@ -238,7 +233,7 @@ _GUARDS = """\
   set_time(time, g);
   dae_guard(arg, res, 0, 0, 0);
   for (i = 0; !isfinite(valid) && i < MARGINS; i++) seen->margins[i] = INFINITY;"""
-"""How stepper.c computes what the guards see."""
+"""The C that evaluates the guards."""
 
 _WATCH = """\
   double margins[WATCHED], valid;
@@ -247,16 +242,21 @@ _WATCH = """\
   set_time(time, g);
   dae_watch(arg, res, 0, 0, 0);
   for (i = 0; isfinite(valid) && i < WATCHED; i++) due |= margins[i] <= 0.0;"""
-"""The same for those that are looked at in samples."""
+"""The C that evaluates the guards which are checked at samples."""
+
+
+def c_places(number: int, rate: UpdateRate, kind: str) -> str:
+    """Returns the places of an update among the held values as an array of C."""
+    return f"{kind} int places_{number}[] = {{{', '.join(map(str, [*rate.places, 0]))}}};"
 
 
 def c_table(name: str, values: FloatArray, kind: str = "static const") -> str:
-    """A vector or a matrix as an array of C.
+    """Returns a vector or a matrix as an array of C.
 
     Args:
         name: Its name.
         values: Its entries.
-        kind: What stands before its type.
+        kind: The qualifiers of its type.
     """
     if values.ndim == 1:
         listed = ", ".join(map(repr, [*values.tolist(), 0.0]))

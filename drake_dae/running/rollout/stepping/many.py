@@ -1,6 +1,6 @@
-"""A CasADi function at many moments at once: each of its operations on arrays of NumPy's.
+"""CasADi functions of many arguments at once, by operations of NumPy on arrays.
 
-CasADi's own `map` interprets every operation for each moment, this once for hundreds of them.
+CasADi's `map` interprets each operation for each argument; NumPy does it once for hundreds.
 """
 
 from collections.abc import Callable
@@ -13,10 +13,10 @@ from drake_dae.arrays import FloatArray
 from drake_dae.running.rollout.stepping.called import BufferedFunction
 
 BLOCK = 512
-"""So many moments are computed together: what they need in between stays near the processor."""
+"""The number of moments computed together: intermediate results then fit the cache."""
 
 FEW = 96
-"""For fewer moments than this CasADi's interpreter is as fast."""
+"""For fewer moments, CasADi's interpreter is as fast."""
 
 
 def _if_else_zero(condition: FloatArray, value: FloatArray, out: FloatArray) -> None:
@@ -64,7 +64,7 @@ UFUNCS: dict[int, Callable[..., Any]] = {
     ca.OP_COPYSIGN: np.copysign,
     ca.OP_IF_ELSE_ZERO: _if_else_zero,
 }
-"""What NumPy does for an operation of CasADi's; a function with another one is mapped."""
+"""Operation of CasADi -> that of NumPy; a function with another one is interpreted."""
 
 
 class VectorizedFunction:
@@ -77,58 +77,62 @@ class VectorizedFunction:
     def __init__(self, function: ca.Function) -> None:
         self._function = function
         codes = [function.instruction_id(i) for i in range(function.n_instructions())]
-        known = {*UFUNCS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
+        supported = {*UFUNCS, ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT}
         self._steps: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         sizes = [
             [function.numel_in(i) for i in range(function.n_in())],
             [function.numel_out(i) for i in range(function.n_out())],
         ]
-        self._given, self._found = ([np.zeros((k, BLOCK)) for k in each] for each in sizes)
+        self._inputs, self._outputs = ([np.zeros((k, BLOCK)) for k in each] for each in sizes)
         self._one = BufferedFunction(function)
-        if known.issuperset(codes):
+        if supported.issuperset(codes):
             self._steps = self._program(codes)
 
     def _program(self, codes: list[int]) -> list[tuple[Callable[..., Any], tuple[Any, ...]]]:
-        """What is called in turn, each with its arrays; constants and inputs are not copied."""
+        """Returns NumPy functions to call in turn, with their arrays; inputs are not copied."""
         function, work = self._function, np.zeros((self._function.sz_w(), BLOCK))
         places: dict[int, FloatArray] = {}
         steps: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         for i, code in enumerate(codes):
-            given, found = function.instruction_input(i), function.instruction_output(i)
+            operands, result = function.instruction_input(i), function.instruction_output(i)
             if code == ca.OP_CONST:
-                places[found[0]] = np.array([function.instruction_constant(i)])
+                places[result[0]] = np.array([function.instruction_constant(i)])
             elif code == ca.OP_INPUT:
-                places[found[0]] = self._given[given[0]][given[1]]
+                places[result[0]] = self._inputs[operands[0]][operands[1]]
             elif code == ca.OP_OUTPUT:
-                steps.append((np.copyto, (self._found[found[0]][found[1]], places[given[0]])))
+                steps.append(
+                    (np.copyto, (self._outputs[result[0]][result[1]], places[operands[0]]))
+                )
             else:
-                operands = [places[j] for j in given]
-                places[found[0]] = work[found[0]]
-                steps.append((UFUNCS[code], (*operands, work[found[0]])))
+                inputs = [places[j] for j in operands]
+                places[result[0]] = work[result[0]]
+                steps.append((UFUNCS[code], (*inputs, work[result[0]])))
         return steps
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
-        """The outputs, one row for each moment.
+        """Returns the outputs, with one row for each moment.
 
         Args:
-            arguments: One row for each moment, shape (k, n), or one for all, shape (n,).
+            arguments: Arrays with a row for each moment, shape (k, n), or for all, shape (n,).
         """
         count = max(len(each) for each in arguments if each.ndim == 2)
         if count < FEW or not self._steps:
             rows = [np.broadcast_to(each, (count, each.shape[-1])) for each in arguments]
-            found = [np.empty((count, each.size)) for each in self._one.results]
+            results = [np.empty((count, each.size)) for each in self._one.results]
             for i in range(count):
-                for column, value in zip(found, self._one(*(row[i] for row in rows)), strict=True):
+                for column, value in zip(
+                    results, self._one(*(row[i] for row in rows)), strict=True
+                ):
                     column[i] = value
-            return found
+            return results
         parts = [self._block(arguments, i, min(i + BLOCK, count)) for i in range(0, count, BLOCK)]
         return [np.concatenate(values) for values in zip(*parts, strict=True)]
 
     def _block(self, arguments: tuple[FloatArray, ...], first: int, last: int) -> list[FloatArray]:
         number = last - first
-        for array, given in zip(self._given, arguments, strict=True):
-            array[:, :number] = given[first:last].T if given.ndim == 2 else given[:, None]
+        for array, values in zip(self._inputs, arguments, strict=True):
+            array[:, :number] = values[first:last].T if values.ndim == 2 else values[:, None]
         with np.errstate(all="ignore"):
             for function, arrays in self._steps:
                 function(*arrays)
-        return [array[:, :number].T.copy() for array in self._found]
+        return [array[:, :number].T.copy() for array in self._outputs]

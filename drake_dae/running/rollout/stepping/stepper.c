@@ -1,4 +1,4 @@
-/* A diagram over time: what CasADi generated comes first, then the constants of this diagram. */
+/* The steps of a diagram: functions that CasADi generated, constants of this diagram, the steppers. */
 
 #ifdef __FAST_MATH__
 #error "not with -ffast-math: nan would pass for a number"
@@ -10,19 +10,19 @@ $generated
 #include <string.h>
 
 $constants
-/* A Newton step to a state on N* after which what is left, its square, is round-off; and one after
-   which those that follow are sure to reach. */
+/* After a Newton step of length REACHED, the error is its square, which is round-off. After one of
+   length NEAR, further steps are sure to converge. */
 static const double REACHED = 1e-8, NEAR = 1e-5;
 
 /* How a call ended; Python has the same list. */
 enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW, CHANGE };
 
 $run
-/* What does not change within a step, and what the time alone determines. */
+/* Constants of a step, and functions of the time alone. */
 typedef struct {
   const double *held, *parameters;
   double given[GIVEN + 1];
-  double time; /* to which it belongs; not a number before the first */
+  double time; /* of `given`; nan before the first */
 } Given;
 
 static int is_finite(const double *vector, int size) {
@@ -33,7 +33,7 @@ static int is_finite(const double *vector, int size) {
   return 1;
 }
 
-/* A row, the last stage of a step and the first of the next one have one time. */
+/* A row, the last stage of a step and the first of the next one are at the same time. */
 static void set_time(double time, Given *g) {
   const double *arg[GIVEN_ARG] = {&time, g->parameters};
   double *res[GIVEN_RES] = {g->given};
@@ -42,7 +42,7 @@ static void set_time(double time, Given *g) {
   g->time = time;
 }
 
-/* The derivative of the state; where it has no value all of it is nan. */
+/* Computes the derivative of the state; returns 0, and nan, if it has no value. */
 static int rates(double time, const double *x, Given *g, double *rate) {
   double valid;
   const double *arg[RATE_ARG] = {&time, x, g->held, g->parameters, g->given};
@@ -55,7 +55,7 @@ static int rates(double time, const double *x, Given *g, double *rate) {
   return good;
 }
 
-/* One row of the record. */
+/* Computes a row of the record; returns 0 if it has no value. */
 static int write(double time, const double *x, Given *g, double *row) {
   double valid;
   const double *arg[ROW_ARG] = {&time, x, g->held, g->parameters, g->given};
@@ -65,7 +65,7 @@ static int write(double time, const double *x, Given *g, double *row) {
   return isfinite(valid) != 0;
 }
 
-/* The state on N*, by Newton steps; 0 where Python has to decide. */
+/* Projects the state onto N* by Newton steps; returns 0 if Python has to decide. */
 static int project(double time, double *x, Given *g) {
   double at[SIZE + 1], found[SIZE + 1], left;
   const double *arg[NEWTON_ARG] = {&time, at, g->held, g->parameters, g->given};
@@ -86,12 +86,12 @@ static int project(double time, double *x, Given *g) {
   return 0;
 }
 
-/* What the guards see at a moment. */
+/* The values of the guards at a time. */
 typedef struct {
   double time, margins[MARGINS + 1], gaps[GAPS + 1], rates[GAPS + 1];
 } Seen;
 
-/* Whether a block has to react; what has no value is no change. */
+/* Evaluates the guards; returns whether a block has to react. Guards without a value do not trigger. */
 static int look(double time, const double *x, Given *g, Seen *seen) {
   int i, due = 0;
   seen->time = time;
@@ -100,7 +100,7 @@ $guards
   return due;
 }
 
-/* Whether a block has to react that looks at its guards in samples. */
+/* Evaluates the guards that are checked at samples; returns whether a block has to react. */
 static int watch(double time, const double *x, Given *g) {
   int i, due = 0;
   (void)i;
@@ -108,7 +108,7 @@ $watch
   return due;
 }
 
-/* Whether something happened between two moments, by Python's dips.py within. */
+/* Whether a guard triggered between two times; in between as in dips.py. */
 static int changed(const Seen *before, const Seen *now) {
   double step = now->time - before->time;
   int i, found = 0;
@@ -125,7 +125,7 @@ static int changed(const Seen *before, const Seen *now) {
   return found;
 }
 
-/* The updates of one kind that are due, all at once. */
+/* Makes the updates of one kind that are due, all at once; returns 0 if one has no value. */
 static int apply(double time, const double *x, double *held, Given *g, const double *noise,
                  long long due, int unrestricted) {
   double fresh[HELD + 1];
@@ -134,11 +134,11 @@ static int apply(double time, const double *x, double *held, Given *g, const dou
   set_time(time, g);
   memcpy(fresh, held, HELD * sizeof(double));
 $updates
-  if (good) memcpy(held, fresh, HELD * sizeof(double)); /* Else it says what was wrong. */
+  if (good) memcpy(held, fresh, HELD * sizeof(double)); /* Else Python needs the old ones, to report why. */
   return good;
 }
 
-$sample/* What happens at the start of a step: the projection, and the updates that are due. */
+$sample/* Projects the state and makes the updates that are due, at the start of a step. */
 static int update(Run *run, double *x, double *held, Given *g, long long num_events,
                   const double *events, const long long *due, const double *noise) {
   while (run->pending) {
@@ -163,7 +163,7 @@ static int update(Run *run, double *x, double *held, Given *g, long long num_eve
   return DONE;
 }
 
-/* Takes over a step; refuses one in a thousand that hardly led on. */
+/* Accepts a step; ends the run where a thousand steps add hardly any time. */
 static int accept(Run *run, double time, double *x, const double *reached) {
   memcpy(x, reached, SIZE * sizeof(double));
   run->time = time;
@@ -184,7 +184,7 @@ static void note(Run *run, double time, const double *x, double *trial) {
   memcpy(trial, x, SIZE * sizeof(double));
 }
 
-/* x and the weighted sum of rates; most weights of a high order are zero. */
+/* reached = x + step * weighted sum of rates; most weights of a high order are zero. */
 static void weigh(double step, int count, const double *b, const double *x, double (*k)[SIZE],
                   double *reached) {
   double sum[SIZE] = {0.0};
@@ -196,7 +196,7 @@ static void weigh(double step, int count, const double *b, const double *x, doub
   for (i = 0; i < SIZE; i++) reached[i] = x[i] + step * sum[i];
 }
 
-/* The state and the rate at a stage of an explicit Runge-Kutta method. */
+/* Computes the rate at a stage of an explicit Runge-Kutta method. */
 static void stage(Run *run, double time, double step, int count, const double *a, double c,
                   const double *x, Given *g, double (*k)[SIZE], double *trial) {
   double at[SIZE];
@@ -204,7 +204,7 @@ static void stage(Run *run, double time, double step, int count, const double *a
   if (!rates(time + c * step, at, g, k[count])) note(run, time + c * step, at, trial);
 }
 
-/* Fixed steps, whose number divides what lies between two times of the record or of a sample. */
+/* Fixed steps; their number divides the time between two rows or samples. */
 __attribute__((visibility("default"))) int run_fixed(
     Run *run, double *x, double *held, const double *parameters, double *trial, long long num_rows,
     const double *times, double *rows, long long num_events, const double *events,
@@ -334,7 +334,7 @@ __attribute__((visibility("default"))) int run_controlled(
     status = update(run, x, held, &g, num_events, events, due, noise);
     if (status != DONE) return status;
     if (known && event == run->event) {
-      memcpy(k[0], k[12], sizeof(k[0])); /* The rate where the last step ended. */
+      memcpy(k[0], k[12], sizeof(k[0])); /* The rate at the end of the last step. */
     } else if (!rates(run->time, x, &g, k[0])) {
       return INVALID;
     }
@@ -366,7 +366,8 @@ __attribute__((visibility("default"))) int run_controlled(
       }
       if (valid && error < 1.0) {
         /* A step that only ended early, at a sample, says nothing against longer ones. */
-        run->step = rejected ? size * fmin(1.0, factor) : fmax(size * factor, size < run->step ? run->step : 0.0);
+        run->step = rejected ? size * fmin(1.0, factor)
+                             : fmax(size * factor, size < run->step ? run->step : 0.0);
         limit = end;
         break;
       }

@@ -1,0 +1,163 @@
+"""The functions of a diagram for CasADi's interpreter: its derivative, its updates, its record."""
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.stepping.called import BufferedFunction
+from drake_dae.running.rollout.stepping.many import VectorizedFunction
+from drake_dae.systems.blocks.dips import TOUCHING, lowest
+
+REACHED = 1e-11
+"""N* is reached if the second of two Newton steps is not longer than this."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuardInputs:
+    """The values of all guards at a moment, see `Guard`.
+
+    Attributes:
+        time: In s.
+        margins, gaps, rates: As `Guard` defines them.
+    """
+
+    time: float
+    margins: FloatArray
+    gaps: FloatArray
+    rates: FloatArray
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a block has to react."""
+        return bool((self.margins <= 0.0).any())
+
+    def follows_change(self, before: "GuardInputs") -> bool:
+        """Whether a guard has triggered between an earlier moment and this one."""
+        if ((self.margins <= 0.0) & (before.margins > 0.0)).any():
+            return True
+        gaps = before.gaps, before.rates, self.gaps, self.rates
+        return bool((lowest(self.time - before.time, *gaps) < -TOUCHING).any())
+
+
+class DiagramFunctions:
+    """The functions of a diagram.
+
+    All of them take the time, the state, the held values and the parameters.
+
+    Attributes:
+        program: The diagram.
+        watched_rates: As of `CompiledDiagram`.
+    """
+
+    def __init__(self, program: RolloutProgram) -> None:
+        self.program, compiled = program, program.compiled
+        newton = compiled.newton(2)
+        self._rate, self._newton = BufferedFunction(compiled.rate), BufferedFunction(newton)
+        self._rows, self._projections = (
+            VectorizedFunction(compiled.row),
+            VectorizedFunction(newton),
+        )
+        self._updates = [
+            (rate.is_unrestricted, list(rate.places), BufferedFunction(rate.function))
+            for rate in compiled.rates
+            if rate.stepped is None
+        ]
+        self._guard = BufferedFunction(compiled.guard) if compiled.guards else None
+        self._watch = BufferedFunction(compiled.watch) if compiled.watched else None
+        self.watched_rates = compiled.watched_rates
+
+    def rate(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> FloatArray:
+        """Returns the derivative of the state, as a new array; nan where it has no value."""
+        rate, valid = self._rate(time, state, held, parameters)
+        return rate.copy() if isfinite(valid[0]) else np.full_like(rate, np.nan)
+
+    def projected(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> FloatArray | None:
+        """Returns the state on N* after two Newton steps; None if these do not reach it."""
+        projected, left = self._newton(time, state, held, parameters)
+        return projected.copy() if left[0] <= REACHED else None
+
+    def guards(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> GuardInputs:
+        """Evaluates the guards of a diagram that has some."""
+        return _evaluated(self._guard, time, state, held, parameters)
+
+    def sampled_guards(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> GuardInputs:
+        """Evaluates the guards that are checked at samples, of a diagram that has some."""
+        return _evaluated(self._watch, time, state, held, parameters)
+
+    def update(
+        self,
+        time: float,
+        state: FloatArray,
+        held: FloatArray,
+        parameters: FloatArray,
+        noise: FloatArray,
+        due: int,
+        is_unrestricted: bool,
+    ) -> FloatArray:
+        """Returns the held values after all updates of one kind that are due.
+
+        They are not finite where an update has no value.
+
+        Args:
+            time, state, held, parameters: As of all functions.
+            noise: The random numbers of this moment.
+            due: Which rates are due, as bits.
+            is_unrestricted: The kind of updates.
+        """
+        updated = held.copy()
+        for number, (kind, places, function) in enumerate(self._updates):
+            if due >> number & 1 and kind == is_unrestricted:
+                values, valid = function(time, state, held, parameters, noise)
+                updated[places] = values + 0.0 * valid
+        return updated
+
+    def rows(
+        self, times: FloatArray, states: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, Booleans]:
+        """Returns rows of the record, and which of them have values.
+
+        Args:
+            times: The times, shape (k,).
+            states: The states, shape (k, n).
+            held: The held values, shape (k, m).
+            parameters: The parameters.
+        """
+        rows, valid = self._rows(times[:, None], states, held, parameters)
+        return rows, np.isfinite(valid[:, 0])
+
+    def projections(
+        self, times: FloatArray, states: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, Booleans]:
+        """Returns states after two Newton steps, and which are on N*; arguments as of `rows`."""
+        states, left = self._projections(times[:, None], states, held, parameters)
+        return states, left[:, 0] <= REACHED
+
+
+def functions_of(program: RolloutProgram) -> DiagramFunctions:
+    """Returns the functions of a diagram, which are made once."""
+    return program.kept("functions", lambda: DiagramFunctions(program))
+
+
+def _evaluated(
+    guard: BufferedFunction | None,
+    time: float,
+    state: FloatArray,
+    held: FloatArray,
+    parameters: FloatArray,
+) -> GuardInputs:
+    assert guard is not None
+    margins, gaps, rates, valid = (values.copy() for values in guard(time, state, held, parameters))
+    if not isfinite(valid[0]):  # No change: the step reports why there is no value.
+        margins[:] = np.inf
+    return GuardInputs(time, margins, gaps, rates)
