@@ -301,7 +301,7 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
             )
         raise AssumptionError(
             f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
-            f"singular at isolated states, which more integrators do not mend. {remedy}",
+            f"singular at isolated states, which more integrators do not change. {remedy}",
             error.assumption,
             error.state,
         ) from error

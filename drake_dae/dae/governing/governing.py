@@ -115,8 +115,8 @@ class Governing:
             row = reference.expression(degrees, time)
             if row is None:
                 raise ReferenceSignalError(
-                    f"a {type(reference).__name__} of so many pieces is no expression of time, "
-                    "which a governor needs: give a shorter path, or fewer points"
+                    f"a {type(reference).__name__} of so many pieces has no symbolic expression, "
+                    "which a governor needs. Use a shorter path, or fewer points"
                 )
             rows.append(row)
         return ca.vertcat(*rows)

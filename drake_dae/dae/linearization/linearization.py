@@ -84,8 +84,8 @@ def linearize_loop(
     """
     if law.integral.outputs:
         raise ModelError(
-            f"{law.system.name}: a law with integral action has a state of its own; convert the "
-            "closed loop's diagram to AutoDiffXd for Drake's Linearize instead"
+            f"{law.system.name}: a law with integral action has a state, which this function does "
+            "not support. Convert the loop's diagram to AutoDiffXd and use Drake's Linearize"
         )
     system, values = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)

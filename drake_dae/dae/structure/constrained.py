@@ -168,7 +168,7 @@ def checked_structure(
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
-            f"'{system.name}'; leave it out, or find that of this one"
+            f"'{system.name}'. Omit it, or pass the structure of this system"
         )
     return structure
 

@@ -171,5 +171,6 @@ def _check(structure: Structure) -> None:
     if system.exogenous.moving:
         names = ", ".join(parameter.name for parameter in system.exogenous.moving)
         raise ReferenceSignalError(
-            f"{system.name}: {names} moves with the time, which a path cannot stretch"
+            f"{system.name}: {names} moves with time, but the timing of a path changes; it must be "
+            "constant"
         )

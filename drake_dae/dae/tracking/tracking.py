@@ -205,9 +205,7 @@ class TrackingLaw:
         if not isinstance(designed, FeedbackGains):
             designed = result_of("gains", designed, names, degrees, error=GainError)
         if not isinstance(designed, FeedbackGains):
-            raise GainError(
-                f"gains must be a design such as poles(-4.0), got one of {brief(designed)}"
-            )
+            raise GainError(f"gains must be a design such as poles(-4.0), got {brief(designed)}")
         if (designed.names, designed.degrees) != (names, degrees):
             raise GainError(
                 f"the gains are for the outputs {', '.join(designed.names)} with degrees "

@@ -269,7 +269,7 @@ class ZeroDynamics:
         p, n = self.system.parameter_vector(parameters), self.system.num_states
         if motion.states.shape != (motion.times.size, n):
             raise ModelError(
-                f"{self.system.name}: the motion is one of another system: its states have shape "
+                f"{self.system.name}: the motion belongs to another system: its states have shape "
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
         moving = self._moving(p, exogenous)

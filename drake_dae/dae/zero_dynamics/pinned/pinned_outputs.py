@@ -112,8 +112,8 @@ class PinnedOutputs:
             )
         raise InconsistentStateError(
             f"{name}: {outputs} are not reached near the given state: "
-            f"{self.residual_signals[worst].name} stays off by {residual[worst]:.3g}. Ask for "
-            "outputs that the system can have, or start nearer to the state that has them",
+            f"{self.residual_signals[worst].name} stays off by {residual[worst]:.3g}. Request "
+            "outputs within reach of the system, or start closer to a state with these outputs",
             residual,
         )
 
