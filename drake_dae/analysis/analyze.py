@@ -183,10 +183,7 @@ def analyze(
 
 
 def _equilibria(
-    dynamics: ZeroDynamics,
-    stability: Stability,
-    states: FloatArray,
-    outputs: FloatArray | None,
+    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
 ) -> tuple[Stability, ...]:
     """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
     if not dynamics.dimension:

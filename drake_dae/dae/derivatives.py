@@ -22,10 +22,7 @@ import numpy as np
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
-from drake_dae.trace.factorization import (
-    Factorization,
-    nonzeros,
-)
+from drake_dae.trace.factorization import Factorization, nonzeros
 
 
 class Derivatives:

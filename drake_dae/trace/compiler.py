@@ -75,12 +75,7 @@ class Compiler(NamedTuple):
     target: tuple[str, ...] = ()
 
     def compile(
-        self,
-        source: str,
-        file: Path,
-        level: str,
-        seconds: float,
-        more: tuple[str, ...] = (),
+        self, source: str, file: Path, level: str, seconds: float, more: tuple[str, ...] = ()
     ) -> None:
         """Writes C source to file.c and compiles it to file.so.
 

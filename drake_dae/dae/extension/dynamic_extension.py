@@ -20,12 +20,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
-from drake_dae.dae.extension.extension import (
-    Extension,
-    integrated,
-    nominal_controls,
-    refuse_metric,
-)
+from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at

@@ -237,10 +237,7 @@ class _PlantModel:
             "m": system.m,
         }
         slope, constraint_slope, k_slope, z_slope, z_force = self._values(
-            outputs,
-            rate=point.rate,
-            constraint_input=point.constraint_input,
-            control=point.control,
+            outputs, rate=point.rate, constraint_input=point.constraint_input, control=point.control
         )
         # In descriptor form, in (x, v).
         none = np.zeros((m, m))

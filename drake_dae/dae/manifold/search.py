@@ -54,10 +54,7 @@ class ConsistentStateSearch:
             self._sine = residual.system.trace("independence", sines, often=False)
 
     def searched(
-        self,
-        start: FloatArray,
-        p: FloatArray,
-        crosses: Callable[[FloatArray], bool] | None = None,
+        self, start: FloatArray, p: FloatArray, crosses: Callable[[FloatArray], bool] | None = None
     ) -> FloatArray:
         """Acts as `project` from a state from which `first_steps` did not converge.
 

@@ -217,9 +217,5 @@ def rank_violation(
         return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
     names = tuple(signal.name for signal in signals)
     return Violation(
-        *dependent,
-        names,
-        state=margin.state,
-        singular_value=margin.relative,
-        least=margin.least,
+        *dependent, names, state=margin.state, singular_value=margin.relative, least=margin.least
     )

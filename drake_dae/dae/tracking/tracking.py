@@ -214,9 +214,7 @@ class TrackingLaw:
         return designed
 
     def all_parameters(
-        self,
-        parameters: ArrayLike | None = None,
-        gains: GainDesign | FeedbackGains | None = None,
+        self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None
     ) -> FloatArray:
         """Returns the parameters of `function`: those of the system, then the entries of K.
 

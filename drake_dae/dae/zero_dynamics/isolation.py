@@ -62,10 +62,7 @@ class Isolation:
 
 
 def isolation(
-    pinned: PinnedOutputs,
-    state: FloatArray,
-    reference: FloatArray,
-    parameters: FloatArray,
+    pinned: PinnedOutputs, state: FloatArray, reference: FloatArray, parameters: FloatArray
 ) -> Isolation | None:
     """Returns the accuracy of the equilibrium at which a search ends; None if it is none.
 

@@ -10,11 +10,7 @@ from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow, MotionLost
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.returns import PeriodicMotion, find_multiple, find_return
-from drake_dae.dae.zero_dynamics.stability import (
-    Stability,
-    Verdict,
-    judge,
-)
+from drake_dae.dae.zero_dynamics.stability import Stability, Verdict, judge
 from drake_dae.errors import InconsistentStateError
 
 FOLDINGS = 40.0
@@ -248,11 +244,7 @@ def judge_at_rest(
 
 
 def judge_without_rest(
-    equilibria: Equilibria,
-    goal: FloatArray,
-    start: FloatArray,
-    parameters: FloatArray,
-    reason: str,
+    equilibria: Equilibria, goal: FloatArray, start: FloatArray, parameters: FloatArray, reason: str
 ) -> Stability:
     """Judges by the motion from a state if no equilibrium is found near it.
 
