@@ -221,8 +221,8 @@ def stable_scales(
     """Returns the range of relative stiffnesses for which a `TorqueLoop` is stable.
 
     Args:
-        mobilities: Those of the links, free and held; the other arguments are those of
-            `spring_loop_radius`.
+        mobilities: The mobilities of free and of constrained links; the other arguments are those
+            of `spring_loop_radius`.
 
     Returns:
         The lowest and the highest of `SCALES` between which all examined ones are stable; None if

@@ -127,7 +127,7 @@ class Governing:
         Args:
             commanded: ubar of (28) for s'' = 0, shape (p, 1).
             now: d ubar / d s'', shape (p, 1).
-            ahead: The same with its effect AHEAD of time.
+            ahead: d ubar / d s'' with the effect AHEAD of time, shape (p, 1).
         """
         structure = self.law.structure
         limited = LimitedSignals(structure, self.limits)

@@ -41,7 +41,7 @@ class ConsistentStateSearch:
     """Searches a consistent state by Newton's method, then by least squares or a pseudoinverse.
 
     Args:
-        residual: What is zero on N*.
+        residual: The residual of N*.
         first_steps: The first Newton steps; see `trace_first_steps`.
     """
 

@@ -193,7 +193,7 @@ def examine_constraints(
     Args:
         system: The system (1)-(3).
         guesses: States near which consistent ones are sought, shape (count, n).
-        region: Where the consistent states must be; None for anywhere.
+        region: The region of the consistent states; None for no restriction.
 
     Returns:
         The structure, and the consistent states with the numbers at them.

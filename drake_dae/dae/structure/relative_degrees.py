@@ -39,7 +39,7 @@ def constraint_chains(
     Args:
         system: The system (1)-(3).
         guesses: States near which consistent ones are sought, shape (count, n).
-        region: Where the consistent states must be; None for anywhere.
+        region: The region of the consistent states; None for no restriction.
 
     Returns:
         The chains, and consistent states with the numbers at them.

@@ -113,7 +113,7 @@ class AlongCurve:
         """Returns states on Z(R) for rows of R, by Newton's method from guesses, shape (k, n).
 
         Raises:
-            ReferenceSignalError: It does not converge.
+            ReferenceSignalError: Newton's method does not converge.
         """
         scale, x = self.system.scale, start.copy()
         for _ in range(12):

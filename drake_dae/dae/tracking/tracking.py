@@ -53,11 +53,11 @@ class TrackingLaw:
             measured forces; see `IntegralAction`. They have one more pole.
 
     Attributes:
-        layout: How references and chains are stacked.
+        layout: The layout of reference vectors and chains.
         reference_signals: Names and units of R.
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
-        measured_force: How the measurement enters; None without one.
+        measured_force: The measurement of v in the law; None without one.
         exogenous_degrees: The number of derivatives of each entry of w that the law needs.
         coordinates_function: (state, reference, integral, parameters) -> the error coordinates.
         integral: The integrated outputs; then `function` takes "integral" before the parameters,

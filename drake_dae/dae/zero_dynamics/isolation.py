@@ -68,7 +68,7 @@ def isolation(
 
     Args:
         pinned: Z(R).
-        state: Where the search ends, shape (n,).
+        state: The state at which the search ends, shape (n,).
         reference: R.
         parameters: Values of all parameters.
     """

@@ -97,7 +97,7 @@ def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
 
     Args:
         passage: The interval.
-        halves: Its two halves.
+        halves: The two halves of the interval.
     """
     grows = passage.growth > 0.8 * sum(max(half.growth, 0.0) for half in halves)
     if passage.growth > PLAIN and grows:
@@ -195,7 +195,8 @@ def leave(
         state: A state of the unstable motion, shape (n,).
         time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.
-        fastest: Its fastest frequency in rad/s; motions of too many turns are not followed.
+        fastest: The highest frequency of disturbances in rad/s; motions of too many turns are not
+            followed.
         period: The period of the reference; None if it is constant.
 
     Returns:

@@ -35,7 +35,7 @@ class PinnedOutputs:
         structure: The structure of the system.
 
     Attributes:
-        layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
+        layout: The layout of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...).
         residual_signals: The residuals of Z(R): the constraints, then the output errors, each with
             its derivatives.
     """
