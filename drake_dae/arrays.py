@@ -84,7 +84,7 @@ def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
     """Converts a finite real number to a float.
 
     Raises:
-        ModelError: It is none.
+        ModelError: It is not such a number.
     """
     array = numbers(what, value, error)
     if array.shape != () or not np.isfinite(array):
@@ -96,7 +96,7 @@ def positive(what: str, value: Any, error: type[Exception] = ModelError) -> floa
     """Converts a finite real number above 0 to a float.
 
     Raises:
-        ModelError: It is none.
+        ModelError: It is not such a number.
     """
     checked = number(what, value, error)
     if checked <= 0.0:

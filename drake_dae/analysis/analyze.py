@@ -87,9 +87,9 @@ def analyze(
         times: Times in s at which the reference is examined, increasing, shape (k,).
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None; only with a reference.
-        exogenous: How the exogenous signals move along the reference; all else is examined with
+        exogenous: The references of the exogenous signals; all else is examined with
             these signals at rest at their parameters' values.
-        count: How many random states are drawn.
+        count: The number of random states.
         seed: The seed of the random numbers.
 
     Returns:
@@ -183,10 +183,7 @@ def analyze(
 
 
 def _equilibria(
-    dynamics: ZeroDynamics,
-    stability: Stability,
-    states: FloatArray,
-    outputs: FloatArray | None,
+    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
 ) -> tuple[Stability, ...]:
     """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
     if not dynamics.dimension:

@@ -26,9 +26,9 @@ class ExaminedStates:
 
     Attributes:
         guesses: States near which consistent ones are sought, shape (count, n).
-        num_given: How many of them, the first ones, were given as they are; 0 if they were drawn.
+        num_given: The number of states of the user, which come first; 0 if all are drawn.
         bounds: The requested region; empty if there is none.
-        region: The same region as a box; None without one.
+        region: The requested region as a box; None without one.
     """
 
     guesses: FloatArray
@@ -80,8 +80,8 @@ class ExaminedStates:
         """Returns a text that says which states were examined.
 
         Args:
-            count: How many of the drawn ones were inside the domain and on N*.
-            noun: What they are called.
+            count: The number of drawn states that are inside the domain and on N*.
+            noun: The noun for the examined states.
         """
         if self.num_given:
             return f"{count_of(self.num_given, noun)} as given"

@@ -33,13 +33,13 @@ class Assumption:
     """One of Assumptions (1)-(5), with the verdict on it.
 
     Attributes:
-        number: Its number in the paper.
-        statement: What it requires.
+        number: The number of the assumption in the paper.
+        statement: The requirement, in one line.
         finding: Whether it holds at the examined states and between them.
         margin: The margin of A(x) for (2), and of B(x) for (5); for (1) and (4) where a row of
             these vanishes; else None.
-        reason: How it is violated and what to change, or why it was not examined; else empty.
-        violation: The same as data; None if it is not violated.
+        reason: The violation and its remedy, or why it was not examined; else empty.
+        violation: The violation as data; None if the assumption is not violated.
     """
 
     number: int
@@ -67,7 +67,7 @@ class Findings:
 
     Attributes:
         system: The system.
-        where: Which states were examined, in words.
+        where: A text that says which states were examined.
         region: The requested region; None if there is none.
         states: The states, consistent where the constraints have degrees, shape (samples, n).
         assumptions: Assumptions (1), ..., (5), in this order.
@@ -81,7 +81,7 @@ class Findings:
         zero_dynamics_along: Assumption 2.2 along the reference; None also without one.
         motion: The motion along the reference; None also without one.
         contact_margin: The distance of friction from the Painleve paradox; None without friction.
-        contact_margin_along: The same along the reference; None also without one.
+        contact_margin_along: That distance along the reference; None also without a reference.
         constraint_structure: The structure of the constraints alone, for `DaePlant`; None if A(x)
             is singular at an examined state, or a constraint has no degree.
         structure: The structure, for laws and blocks; None if A(x) or B(x) is singular at an

@@ -24,7 +24,7 @@ def check_reference(
 
     Args:
         system: The system (1)-(3).
-        layout: How R(t) is stacked.
+        layout: The layout of R(t).
         reference: The function t -> R(t).
         times: Times in s, shape (k,), between the first and last of which it is checked.
 

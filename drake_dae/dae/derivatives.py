@@ -22,10 +22,7 @@ import numpy as np
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
-from drake_dae.trace.factorization import (
-    Factorization,
-    nonzeros,
-)
+from drake_dae.trace.factorization import Factorization, nonzeros
 
 
 class Derivatives:
@@ -102,7 +99,7 @@ class Derivatives:
         """Returns the time derivative of an expression along the motion.
 
         Args:
-            expression: Of the state and of the unknowns, shape (k, 1).
+            expression: An expression of the state and of the unknowns, shape (k, 1).
 
         Returns:
             The derivative in terms of the state and of unknowns, shape (k, 1); see `expand`.
@@ -122,7 +119,7 @@ class Derivatives:
         differentiating the expanded expression.
 
         Args:
-            expression: Of the state and of the unknowns, shape (k, 1).
+            expression: An expression of the state and of the unknowns, shape (k, 1).
 
         Returns:
             a and B in terms of the state alone, shapes (k, 1) and (k, p); B is sparse.
@@ -174,7 +171,7 @@ class Derivatives:
         it is inverse dynamics.
 
         Args:
-            expression: Of the state and of the unknowns, shape (p, 1).
+            expression: An expression of the state and of the unknowns, shape (p, 1).
             desired: The desired values, shape (p, 1).
             shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
 

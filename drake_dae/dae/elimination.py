@@ -23,7 +23,7 @@ class Elimination:
         constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
         alpha: v where u = 0, equation (13), shape (m, 1).
-        beta: How u enters v, equation (14), shape (m, p).
+        beta: The factor of u in v, equation (14), shape (m, p).
         f_star: f + g alpha (9), shape (n, 1).
         h_star: h + g beta (10), shape (n, p).
         l_star: l + m alpha (11), shape (p, 1).
@@ -76,7 +76,7 @@ def eliminate_numbers(
         fields: g, h and m of the system with E = 1, by letter.
         constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
         constraint_matrix: A, shape (m, m).
-        scale: How large each state is, shape (n,).
+        scale: The size of each state, shape (n,).
         negligible: `DaeSystem.negligible`.
     """
     h, size = fields["h"], np.abs(fields["h"])

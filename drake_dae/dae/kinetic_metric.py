@@ -84,7 +84,7 @@ class KineticMetric:
             state: x, shape (n,).
             parameters: Values of all parameters.
             gradient: The rows, by the states of the level, shape (k, c).
-            depth: How many derivatives of the rows are left until the constraint inputs act.
+            depth: The number of further derivatives of the rows until the constraint inputs act.
         """
         mass, _, *rates = self._values(state, parameters)
         moved: FloatArray = gradient.T

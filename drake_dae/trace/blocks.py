@@ -5,11 +5,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from drake_dae.trace.factorization import (
-    Factorization,
-    PositiveDefiniteFactorization,
-    nonzeros,
-)
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization, nonzeros
 
 
 def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:

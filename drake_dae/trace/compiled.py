@@ -100,7 +100,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
         make: Whether to make it where the cache has none.
 
     Warns:
-        MachineCodeWarning: It should be made and cannot be.
+        MachineCodeWarning: Machine code is requested and cannot be made.
     """
     # With many results, a branch for each takes the compiler ten times as long.
     source = without_branches(generate(function))
@@ -127,7 +127,7 @@ def library(
         options: Options of the compiler, which override others.
 
     Warns:
-        MachineCodeWarning: It should be made and cannot be.
+        MachineCodeWarning: Machine code is requested and cannot be made.
     """
     try:
         return _library(source, operations, compiled, make, tuple(options))

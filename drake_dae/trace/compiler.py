@@ -65,7 +65,7 @@ class Compiler(NamedTuple):
     """A C compiler: its command, its identity and its options.
 
     Attributes:
-        command: How it is called.
+        command: The command that starts it.
         identity: Its identity: its version text and its target machine.
         target: The options that choose the processor.
     """
@@ -75,12 +75,7 @@ class Compiler(NamedTuple):
     target: tuple[str, ...] = ()
 
     def compile(
-        self,
-        source: str,
-        file: Path,
-        level: str,
-        seconds: float,
-        more: tuple[str, ...] = (),
+        self, source: str, file: Path, level: str, seconds: float, more: tuple[str, ...] = ()
     ) -> None:
         """Writes C source to file.c and compiles it to file.so.
 

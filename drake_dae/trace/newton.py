@@ -183,9 +183,7 @@ def _orthogonalized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def steps_along(
-    gradients: FloatArray,
-    directions: FloatArray,
-    residual: Callable[[FloatArray], FloatArray],
+    gradients: FloatArray, directions: FloatArray, residual: Callable[[FloatArray], FloatArray]
 ) -> NewtonModel | None:
     """Returns the Newton model of steps D y with C D y = -residual(x); None if y is not determined.
 

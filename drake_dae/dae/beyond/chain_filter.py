@@ -29,7 +29,8 @@ class ChainFilter:
 
     Attributes:
         gain: K, shape (3, 1), or (3, 2) with a measured v.
-        covariance: That of (q, v, a) after a correction, relative to sigma^2, shape (3, 3).
+        covariance: The covariance of (q, v, a) after a correction, relative to sigma^2, shape (3,
+            3).
         period: T in s.
     """
 

@@ -123,7 +123,8 @@ class AdvisedGains:
         state_rate: w of the estimator in 1/s; None without one.
         position_error: The rms error of a point in m: by noise, and by an unknown force of
             `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
-        force_error: The same of the contact force in N, also by a reference that changes by `RAMP`.
+        force_error: The rms error of the contact force in N, also by a reference that changes by
+            `RAMP`.
         noise_error, noise_force: The parts of the errors by noise.
         roughness: The rms change of the controls from sample to sample, over all joints, in N m.
     """

@@ -289,7 +289,7 @@ def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
             name = system.state_signals[i].name
             raise ModelError(
                 f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "
-                "whose rate is no function of the state alone"
+                "whose rate does not depend only on the state"
             )
         rate[i] = system.f[i]
     return rate

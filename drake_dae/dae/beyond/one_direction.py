@@ -19,8 +19,8 @@ class SensorNoise:
         position: In m, or rad.
         velocity: In m/s, or rad/s; 0 if it is exact, not measured, or a difference.
         force: In N, or N m.
-        velocity_bandwidth: That of filtered differences of the positions, in rad/s, which are then
-            the velocities; 0 for measured velocities. See `Encoders`.
+        velocity_bandwidth: The bandwidth of filtered differences of positions, in rad/s, which are
+            then the velocities; 0 for measured velocities. See `Encoders`.
     """
 
     position: float = 0.0
@@ -53,8 +53,8 @@ class DirectionGains:
     """The gains of a law and its observer in a direction, in 1/s.
 
     Attributes:
-        gains: Of the integral of the error, of the error, and of its derivative, in 1/s^3, 1/s^2
-            and 1/s; along a contact only the last is used, the damping c.
+        gains: The gains of the integral of the error, of the error, and of its derivative, in
+            1/s^3, 1/s^2 and 1/s; along a contact only the last is used, the damping c.
         force_gain: K_i of the integral of a contact's force.
         observer_rate: k_o, or k_n along a contact.
         state_rate: w of a `StateEstimator`; None with a measured velocity.

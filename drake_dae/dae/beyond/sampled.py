@@ -75,8 +75,8 @@ def sampled_poles(
     size, late = len(A), floor(delay / period + _SAME)
     if (late + 2) * size > MOST_STATES:
         raise ModelError(
-            f"a delay of {delay:g} s is {late} periods of {period:g} s, each with {size} states, "
-            f"and there may be {MOST_STATES}; take a longer period"
+            f"a delay of {delay:g} s is {late} periods of {period:g} s, which needs "
+            f"{late + 2} x {size} states; at most {MOST_STATES} are allowed. Use a longer period"
         )
     rest = max(delay - late * period, 0.0)
     begin, end = (_held(A, G, length) for length in (rest, period - rest))
@@ -141,7 +141,7 @@ def sampling_error(
     period, delay = positive("period", period), _delay(delay)
     moments = vector("times", times, None)
     if moments.size < 3 or np.any(np.diff(moments) <= 0.0):
-        raise ModelError("times must be three or more, and increase")
+        raise ModelError("times must be three or more numbers, and increase")
     count, system = moments.size, law.system
     courses = [
         _course("states", states, (count, system.num_states)),
@@ -205,9 +205,9 @@ def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> No
     if moves[worst] > RESTS * fastest:
         signal = law.system.state_signals[worst]
         raise ModelError(
-            f"{law.system.name}: the poles are those about an equilibrium under the law, and there "
-            f"{signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second; give a "
-            "reference at rest, and the state that it leads to"
+            f"{law.system.name}: poles are computed at an equilibrium under the law, but at this "
+            f"state {signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second. Give "
+            "a constant reference, and its steady state"
         )
 
 

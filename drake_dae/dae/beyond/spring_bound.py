@@ -71,7 +71,9 @@ def spring_error_bound(
     x, tau = numbers("states", states), numbers("torques", torques)
     K, B = (_square(value) for value in (stiffness, inertia))
     if moments.size < 5 or x.shape[0] != moments.size or tau.shape[0] != moments.size:
-        raise ModelError("times, states and torques must have as many rows, five or more")
+        raise ModelError(
+            "times, states and torques must have the same number of rows, five or more"
+        )
     elimination, system = law.structure.elimination, law.system
     rows = [i for i in range(system.num_states) if system.h[i, :].nnz()]
     function = system.trace(
@@ -219,8 +221,8 @@ def stable_scales(
     """Returns the range of relative stiffnesses for which a `TorqueLoop` is stable.
 
     Args:
-        mobilities: Those of the links, free and held; the other arguments are those of
-            `spring_loop_radius`.
+        mobilities: The mobilities of free and of constrained links; the other arguments are those
+            of `spring_loop_radius`.
 
     Returns:
         The lowest and the highest of `SCALES` between which all examined ones are stable; None if

@@ -20,12 +20,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
-from drake_dae.dae.extension.extension import (
-    Extension,
-    integrated,
-    nominal_controls,
-    refuse_metric,
-)
+from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at
@@ -301,7 +296,7 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
             )
         raise AssumptionError(
             f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
-            f"singular at isolated states, which more integrators do not mend. {remedy}",
+            f"singular at isolated states, which more integrators do not change. {remedy}",
             error.assumption,
             error.state,
         ) from error

@@ -115,8 +115,8 @@ class Governing:
             row = reference.expression(degrees, time)
             if row is None:
                 raise ReferenceSignalError(
-                    f"a {type(reference).__name__} of so many pieces is no expression of time, "
-                    "which a governor needs: give a shorter path, or fewer points"
+                    f"a {type(reference).__name__} of so many pieces has no symbolic expression, "
+                    "which a governor needs. Use a shorter path, or fewer points"
                 )
             rows.append(row)
         return ca.vertcat(*rows)
@@ -127,7 +127,7 @@ class Governing:
         Args:
             commanded: ubar of (28) for s'' = 0, shape (p, 1).
             now: d ubar / d s'', shape (p, 1).
-            ahead: The same with its effect AHEAD of time.
+            ahead: d ubar / d s'' with the effect AHEAD of time, shape (p, 1).
         """
         structure = self.law.structure
         limited = LimitedSignals(structure, self.limits)

@@ -84,8 +84,8 @@ def linearize_loop(
     """
     if law.integral.outputs:
         raise ModelError(
-            f"{law.system.name}: a law with integral action has a state of its own; convert the "
-            "closed loop's diagram to AutoDiffXd for Drake's Linearize instead"
+            f"{law.system.name}: a law with integral action has a state, which this function does "
+            "not support. Convert the loop's diagram to AutoDiffXd and use Drake's Linearize"
         )
     system, values = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
@@ -237,10 +237,7 @@ class _PlantModel:
             "m": system.m,
         }
         slope, constraint_slope, k_slope, z_slope, z_force = self._values(
-            outputs,
-            rate=point.rate,
-            constraint_input=point.constraint_input,
-            control=point.control,
+            outputs, rate=point.rate, constraint_input=point.constraint_input, control=point.control
         )
         # In descriptor form, in (x, v).
         none = np.zeros((m, m))

@@ -58,7 +58,7 @@ def _followed(
     Args:
         start: The state, shape (n, 1).
         steps: The Newton steps that follow each other from there.
-        lengths: Their lengths, in states over their scale.
+        lengths: The lengths of the steps, in states over their scale.
         size, left: The sizes of the first two, relative to the state.
     """
     # Newton's method ends at the start, or after its first step; then it is polished.

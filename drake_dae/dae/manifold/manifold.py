@@ -89,10 +89,7 @@ class Manifold(Residual):
         return self.projected(start, p, crosses)
 
     def projected(
-        self,
-        start: FloatArray,
-        p: FloatArray,
-        crosses: Callable[[FloatArray], bool] | None = None,
+        self, start: FloatArray, p: FloatArray, crosses: Callable[[FloatArray], bool] | None = None
     ) -> FloatArray:
         """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
         moved = self.first_steps(start, p)

@@ -25,10 +25,10 @@ class Residual:
     Attributes:
         residual_expression: The residual, shape (sum r_i, 1).
         gradient: Its derivative by the state, shape (sum r_i, n).
-        layout: Where the derivatives of each constraint stand.
+        layout: The layout of the constraints' derivatives.
         residual_signals: Names and units of the residual.
         residual_function: The residual as a function of state and parameters.
-        scale: How large the states are in use, shape (n,).
+        scale: The sizes of the states in use, shape (n,).
         lengths: The lengths of the gradients at the nominal state, over the scale of the states; 0
             if they are not finite there. Shape (sum r_i,).
     """

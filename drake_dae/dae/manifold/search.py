@@ -41,7 +41,7 @@ class ConsistentStateSearch:
     """Searches a consistent state by Newton's method, then by least squares or a pseudoinverse.
 
     Args:
-        residual: What is zero on N*.
+        residual: The residual of N*.
         first_steps: The first Newton steps; see `trace_first_steps`.
     """
 
@@ -54,10 +54,7 @@ class ConsistentStateSearch:
             self._sine = residual.system.trace("independence", sines, often=False)
 
     def searched(
-        self,
-        start: FloatArray,
-        p: FloatArray,
-        crosses: Callable[[FloatArray], bool] | None = None,
+        self, start: FloatArray, p: FloatArray, crosses: Callable[[FloatArray], bool] | None = None
     ) -> FloatArray:
         """Acts as `project` from a state from which `first_steps` did not converge.
 

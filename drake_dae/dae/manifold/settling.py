@@ -22,7 +22,7 @@ class Settling:
 
     Args:
         system: The system.
-        residual: What is zero on N*.
+        residual: The residual of N*.
     """
 
     def __init__(self, system: DaeSystem, residual: Residual) -> None:
@@ -60,7 +60,7 @@ def _settle_level(
     """Changes some states so that some rows of the residual vanish; returns whether they do.
 
     Args:
-        residual: What is zero on N*.
+        residual: The residual of N*.
         state: The state, which is changed.
         rows, columns: The rows and the states.
         parameters: Values of all parameters.

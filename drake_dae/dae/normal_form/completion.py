@@ -47,8 +47,8 @@ def check_completion(
     unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
     if unknown:
         raise ModelError(
-            f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
-            "state nor a parameter"
+            f"{system.name}: the completion xi of the coordinates depends on "
+            f"{', '.join(unknown)}, which is neither a state nor a parameter"
         )
     flaw = find_flaw(xi, system.state, system.parameter_symbol)
     if flaw:
@@ -84,7 +84,7 @@ def check_completion(
         f"{system.name}: the completion '{signals[worst].name}' = "
         f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
         f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
-        "the span of theirs, there and around"
+        "their span at this state and around it"
     )
 
 

@@ -92,7 +92,7 @@ def assigned(
         name: The name.
         reference: The reference, with one row for each output of the name.
         outputs: The names of all outputs.
-        degrees: Their degrees mu_1, ..., mu_p.
+        degrees: The degrees mu_1, ..., mu_p of the outputs.
 
     Raises:
         ReferenceSignalError: The name has no output, the number of rows differs, or the reference
@@ -143,7 +143,7 @@ def references_by_name(
     Args:
         references: Name -> reference, or a number for a constant.
         outputs: The names of all outputs.
-        degrees: Their degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
+        degrees: The degrees mu_1, ..., mu_p of the outputs, `TrackingLaw.degrees`.
 
     Raises:
         ReferenceSignalError: A name has no output, an output has no reference or two, or a

@@ -13,12 +13,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number_in, positive, unknown_name
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.splines import (
-    MOST_POINTS,
-    SplineReference,
-    TimeSpline,
-    rounded_up,
-)
+from drake_dae.dae.references.splines import MOST_POINTS, SplineReference, TimeSpline, rounded_up
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.files import read_text
 

@@ -163,8 +163,8 @@ class ExpressionReference(FormulaReference):
         unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in allowed]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
-                "a reference must be a column of expressions of the time and its parameters "
-                f"alone, got shape {rows.shape} with {', '.join(unknown) or 'no'} other symbols"
+                "a reference must be a column of expressions of only the time and its parameters, "
+                f"got shape {rows.shape} with {', '.join(unknown) or 'no'} other symbols"
             )
 
     @property
@@ -211,7 +211,7 @@ def settle(reference: Reference, *names: str) -> None:
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ReferenceSignalError(
-            f"{listed} need as many entries as each other, or one number for all: {counts}"
+            f"{listed} need the same number of entries, or one number for all: {counts}"
         )
     length = next(iter(lengths.values()), 1)
     for name, array in arrays.items():

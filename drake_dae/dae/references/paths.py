@@ -155,7 +155,7 @@ class CircleReference(PathReference):
         turns: The number of turns with limits; negative for clockwise.
         phase: The angle a at the start, in rad.
         start_time: The start of the motion, in s; with a period, when the angle is `phase`.
-        order: How many derivatives are continuous with limits, from 2 to 12; at least mu of the
+        order: The number of continuous derivatives with limits, from 2 to 12; at least mu of the
             outputs.
 
     Raises:

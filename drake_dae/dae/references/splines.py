@@ -32,8 +32,8 @@ class TimeSpline:
     Attributes:
         points: c_0, ..., c_(n-1), shape (n, k).
         step: The time between two points, in s.
-        start_time: When it leaves the first point, in s.
-        order: How many derivatives are continuous.
+        start_time: The time at which it leaves the first point, in s.
+        order: The number of continuous derivatives.
     """
 
     points: FloatArray
@@ -122,8 +122,8 @@ def spline_within(
     Args:
         points: The points, shape (n, k).
         limits: The largest speed, acceleration and jerk, of the first `among` columns.
-        start_time: When it leaves the first point, in s.
-        order: How many derivatives are continuous.
+        start_time: The time at which it leaves the first point, in s.
+        order: The number of continuous derivatives.
         among: The number of columns with limits; None for all.
     """
     padded = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")

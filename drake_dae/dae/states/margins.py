@@ -22,7 +22,7 @@ class RankMargin:
         singular_value: The smallest singular value over all examined states.
         relative: The smallest one after rows and columns are scaled to about length one, by factors
             that are common to all states, so that units do not matter.
-        state: Where `relative` is smallest, shape (n,).
+        state: The state with the smallest `relative`, shape (n,).
         matrix: The matrix there.
         vanishing_row: The row that is zero there; None if none is.
         least: The threshold of `relative` for singular: `DaeSystem.least_margin`.

@@ -23,7 +23,7 @@ class Samples:
     Args:
         manifold: N*, or the constraints known so far.
         guesses: The nominal state first, shape (count, n).
-        region: Where the states must be; None for anywhere.
+        region: The region of the states; None for no restriction.
 
     Attributes:
         states: The consistent states, shape (samples, n).
@@ -130,7 +130,7 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
 
     Args:
         system: The system (1)-(3).
-        spread: Their standard deviation, as in `spread_of`.
+        spread: The standard deviation of the states, as in `spread_of`.
         count: The number of random states.
         seed: The seed of the random numbers.
     """

@@ -12,7 +12,7 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
     """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k).
 
     Args:
-        gradients: Of the constraints, independent rows, shape (k, n).
+        gradients: The gradients of the constraints, independent rows, shape (k, n).
         scale: The sizes of the states, shape (n,).
     """
     rows = unit_rows(gradients * scale)

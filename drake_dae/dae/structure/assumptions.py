@@ -66,8 +66,8 @@ class Violation:
     """A violation of one of Assumptions (1)-(5) by a system.
 
     Attributes:
-        assumption: Its number in the paper.
-        cause: What is wrong.
+        assumption: The number of the assumption in the paper.
+        cause: The kind of the violation.
         names: The names of the constraints or outputs concerned.
         order: The order of the derivative concerned, if any.
         state: A consistent state where the assumption fails, shape (n,); None if it fails
@@ -217,9 +217,5 @@ def rank_violation(
         return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
     names = tuple(signal.name for signal in signals)
     return Violation(
-        *dependent,
-        names,
-        state=margin.state,
-        singular_value=margin.relative,
-        least=margin.least,
+        *dependent, names, state=margin.state, singular_value=margin.relative, least=margin.least
     )

@@ -168,7 +168,7 @@ def checked_structure(
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
-            f"'{system.name}'; leave it out, or find that of this one"
+            f"'{system.name}'. Omit it, or pass the structure of this system"
         )
     return structure
 
@@ -193,7 +193,7 @@ def examine_constraints(
     Args:
         system: The system (1)-(3).
         guesses: States near which consistent ones are sought, shape (count, n).
-        region: Where the consistent states must be; None for anywhere.
+        region: The region of the consistent states; None for no restriction.
 
     Returns:
         The structure, and the consistent states with the numbers at them.

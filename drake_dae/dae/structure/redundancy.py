@@ -189,7 +189,7 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
         if _rank(fields["g"].T[remaining]) < _rank(fields["g"].T):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: the constraint inputs of the same "
-                "numbers act in directions in which no other one does"
+                "numbers act in directions in which no other input acts"
             )
 
 

@@ -19,10 +19,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind
-from drake_dae.dae.structure.dependence import (
-    following_outputs,
-    redundant_constraints,
-)
+from drake_dae.dae.structure.dependence import following_outputs, redundant_constraints
 from drake_dae.dae.structure.elsewhere import Elsewhere, Row
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
@@ -42,7 +39,7 @@ def constraint_chains(
     Args:
         system: The system (1)-(3).
         guesses: States near which consistent ones are sought, shape (count, n).
-        region: Where the consistent states must be; None for anywhere.
+        region: The region of the consistent states; None for no restriction.
 
     Returns:
         The chains, and consistent states with the numbers at them.

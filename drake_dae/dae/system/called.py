@@ -40,7 +40,9 @@ def called_functions(
             raise ModelError(f"{owner}: {unknown_name('field', label, allowed)}")
     bad = [name for name in parameters if not name.isidentifier()]
     if bad:
-        raise ModelError(f"parameter names must be Python identifiers, to be read as p.name: {bad}")
+        raise ModelError(
+            f"parameter names must be Python identifiers, for use as p.name, got {bad}"
+        )
     names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
     named = as_signals(f"{owner}: the states", names)
     if not named:

@@ -121,7 +121,9 @@ def _choice(
         arguments[key] is not None for key in ("control_metric", "free_control")
     )
     if has_free and not has_metric:
-        raise ModelError(f"{name}: free_control needs a control_metric that it is near in")
+        raise ModelError(
+            f"{name}: free_control needs a control_metric, which measures the distance from it"
+        )
     if has_metric and controls <= outputs:
         raise ModelError(
             f"{name}: control_metric chooses among controls, but with "

@@ -62,8 +62,8 @@ class Contacts:
     Args:
         owner: The name of the system, for messages.
         inputs: The constraint inputs of the system.
-        parameters: Its parameters.
-        contacts: Its contacts.
+        parameters: The parameters of the system.
+        contacts: The unilateral constraint inputs of the system.
 
     Attributes:
         rows: The indices of the contacts among the constraint inputs. Contacts whose input was

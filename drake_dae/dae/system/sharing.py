@@ -20,8 +20,8 @@ class ForceSharing:
         signals: Names and units of v_all.
         undetermined: The names of those that (1)-(3) do not determine: another split moves the
             system in the same way.
-        left_out: The constraint outputs that follow from k on N*, shape (M - m, 1).
-        left_out_signals: Their names and units.
+        left_out: The removed constraint outputs, which are zero where k is zero, shape (M - m, 1).
+        left_out_signals: Names and units of `left_out`.
     """
 
     split: ca.SX

@@ -69,7 +69,7 @@ class DaeSystem:
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
             output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
             unit. Made up ("x0", "x1", ...) where not given.
-        nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
+        nominal_state: The initial guess for consistent states, shape (n,); zero if None.
         state_scale: The typical size of each state, positive, shape (n,). Random states, searches
             and tolerances are relative to it. If None, `scale` is computed from the equations.
         name: The name of the system in messages.
@@ -77,7 +77,7 @@ class DaeSystem:
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
-        sharing: How v is shared among redundant constraints; k holds those that are kept. None
+        sharing: The distribution of forces among redundant constraints; k contains the others. None
             without redundant constraints. Made by `share_forces`.
         control_metric: W, shape (p, p), symmetric positive definite, for more controls than
             outputs; None otherwise.

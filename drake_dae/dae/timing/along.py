@@ -113,7 +113,7 @@ class AlongCurve:
         """Returns states on Z(R) for rows of R, by Newton's method from guesses, shape (k, n).
 
         Raises:
-            ReferenceSignalError: It does not converge.
+            ReferenceSignalError: Newton's method does not converge.
         """
         scale, x = self.system.scale, start.copy()
         for _ in range(12):
@@ -171,5 +171,6 @@ def _check(structure: Structure) -> None:
     if system.exogenous.moving:
         names = ", ".join(parameter.name for parameter in system.exogenous.moving)
         raise ReferenceSignalError(
-            f"{system.name}: {names} moves with the time, which a path cannot stretch"
+            f"{system.name}: {names} moves with time, but the timing of a path changes; it must be "
+            "constant"
         )

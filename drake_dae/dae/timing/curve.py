@@ -84,7 +84,7 @@ class Curve:
 
     Args:
         references: The references, in the order of the outputs.
-        layout: How R is stacked; degrees are 0 or 2.
+        layout: The layout of R; degrees are 0 or 2.
         begin, end: The first and the last time of the reference, in s.
         count: The number of intervals between points.
 

@@ -20,9 +20,9 @@ class LimitedSignals:
     Attributes:
         signals: Names and units, k of them: controls, rates, forces, cones.
         low, high: The lowest and highest values, shape (k,), infinite without a limit.
-        states: The places of the limited states among all.
-        state_signals: Their names and units.
-        state_low, state_high: Their lowest and highest values.
+        states: The indices of the limited states.
+        state_signals: Names and units of the limited states.
+        state_low, state_high: The lowest and highest values of the limited states.
 
     Raises:
         ModelError: A limit names no signal of the system.

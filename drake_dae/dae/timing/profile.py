@@ -55,7 +55,8 @@ class ProfilePiece:
         b: s'^2 at the points, shape (N + 1,); zeros in a pause.
         a: s'' at the points, shape (N + 1,).
         highest: The largest b from which the motion can brake, shape (N + 1,).
-        limiting: What limits each interval: an index into `TimeProfile.causes`, shape (N,).
+        limiting: The cause of the limit of each interval, as an index into `TimeProfile.causes`,
+            shape (N,).
     """
 
     piece: Piece
@@ -72,9 +73,9 @@ class TimeProfile:
 
     Attributes:
         pieces: Its motions from rest to rest and its pauses, in their order.
-        causes: What limits it: signals, by the indices of `ProfilePiece.limiting`.
-        start_time: When it begins, in s.
-        layout: How R is stacked.
+        causes: The limits that can act, to which `ProfilePiece.limiting` refers.
+        start_time: The begin of the motion, in s.
+        layout: The layout of R.
     """
 
     pieces: tuple[ProfilePiece, ...]
@@ -151,7 +152,7 @@ class PathTiming:
         Args:
             references: The references of all outputs; or name -> reference, or a number.
             end: The last time of the reference, in s.
-            begin: Its first time, in s.
+            begin: The first time of the reference, in s.
             start: A state near which the motion begins, shape (n,); the nominal one if None.
             parameters: Values of all parameters; the defaults if None.
             largest_rate: The largest rate of the reference's time: with 1 the motion is nowhere

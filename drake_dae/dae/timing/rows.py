@@ -48,7 +48,7 @@ class LimitRows:
     """The limited signals along a piece.
 
     Attributes:
-        along: What the system needs along curves.
+        along: The feedforward along curves.
         piece: The piece.
         parameters: Values of all parameters.
         at_rest: x at rest, shape (N + 1, n).
@@ -149,7 +149,7 @@ def rows_along(
     """Computes the limited signals along a piece.
 
     Args:
-        along: What the system needs along curves.
+        along: The feedforward along curves.
         piece: The piece; no pause.
         guess: A state near its begin, shape (n,).
         parameters: Values of all parameters.
@@ -188,7 +188,7 @@ def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> No
     """Checks that friction in slow motion is within the limits.
 
     Raises:
-        ReferenceSignalError: Which signal, and where.
+        ReferenceSignalError: A signal exceeds a limit; the message has the signal and the time.
     """
     room = np.hstack([above, below])
     if not room.size or room.min() > 0.0:
@@ -206,7 +206,7 @@ def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: Flo
     """Checks that the system is within the limits at rest on a piece.
 
     Raises:
-        ReferenceSignalError: Which signal, where, and by how much.
+        ReferenceSignalError: A signal exceeds a limit; the message has signal, time and excess.
     """
     limited = along.limited
     both = (

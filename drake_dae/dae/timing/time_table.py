@@ -40,10 +40,10 @@ def time_table(
     """Returns the polynomials of r along the pieces of a curve, a row for each output.
 
     Args:
-        parts: Of each piece: it, the times of its points in s after its begin, b = s'^2 at these,
-            a = s'' at these.
-        layout: How R is stacked.
-        start_time: When the first piece begins, in s.
+        parts: For each piece: the piece, the times of its points in s after its begin, b = s'^2
+            there, a = s'' at these.
+        layout: The layout of R.
+        start_time: The begin of the first piece, in s.
     """
     breaks, factors = [np.array([start_time])], []
     for piece, times, b, a in parts:

@@ -200,11 +200,11 @@ def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> 
     Args:
         lost: The result of `unstable_from`.
         stiffness: The given k in N/m.
-        swing: Its w T.
+        swing: w T of this contact.
         advice: The recommended gain, in words.
 
     Warns:
-        AdviceWarning: It is outside.
+        AdviceWarning: The gain is outside its range.
     """
     if lost is None:
         return

@@ -200,8 +200,8 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
         occurring = sorted({degree for degree in degrees if degree}, reverse=True)
         if len(groups) != len(occurring):
             raise GainError(
-                f"the outputs have the degrees {occurring}, so {len(occurring)} groups of "
-                f"matrices are needed, got {len(groups)}"
+                f"the outputs have the degrees {occurring}. Give a group of gain matrices for "
+                f"each degree: {len(occurring)} are needed, got {len(groups)}"
             )
         matrix = np.zeros((len(names), sum(degrees)))
         starts = DerivativeLayout(tuple(degrees)).starts

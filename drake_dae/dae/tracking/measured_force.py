@@ -21,7 +21,7 @@ class ForceMeasurement:
         mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
 
     Attributes:
-        layout: How references and chains are stacked.
+        layout: The layout of reference vectors and chains.
         inputs: Output index i -> constraint input index j.
         gain: Gbar, shape (m, m), positive semidefinite.
         symbol: The symbols v of the measurement, shape (m, 1).
@@ -38,7 +38,7 @@ class ForceMeasurement:
 
         Args:
             system: The system (1)-(3).
-            layout: How its references and chains are stacked.
+            layout: The layout of its reference vectors and chains.
             gain: Gbar, a number or shape (m, m).
 
         Raises:

@@ -53,11 +53,11 @@ class TrackingLaw:
             measured forces; see `IntegralAction`. They have one more pole.
 
     Attributes:
-        layout: How references and chains are stacked.
+        layout: The layout of reference vectors and chains.
         reference_signals: Names and units of R.
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
-        measured_force: How the measurement enters; None without one.
+        measured_force: The measurement of v in the law; None without one.
         exogenous_degrees: The number of derivatives of each entry of w that the law needs.
         coordinates_function: (state, reference, integral, parameters) -> the error coordinates.
         integral: The integrated outputs; then `function` takes "integral" before the parameters,
@@ -205,9 +205,7 @@ class TrackingLaw:
         if not isinstance(designed, FeedbackGains):
             designed = result_of("gains", designed, names, degrees, error=GainError)
         if not isinstance(designed, FeedbackGains):
-            raise GainError(
-                f"gains must be a design such as poles(-4.0), got one of {brief(designed)}"
-            )
+            raise GainError(f"gains must be a design such as poles(-4.0), got {brief(designed)}")
         if (designed.names, designed.degrees) != (names, degrees):
             raise GainError(
                 f"the gains are for the outputs {', '.join(designed.names)} with degrees "
@@ -216,9 +214,7 @@ class TrackingLaw:
         return designed
 
     def all_parameters(
-        self,
-        parameters: ArrayLike | None = None,
-        gains: GainDesign | FeedbackGains | None = None,
+        self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None
     ) -> FloatArray:
         """Returns the parameters of `function`: those of the system, then the entries of K.
 

@@ -117,10 +117,9 @@ def _by_exponents(
         reason = f"from x = {show(motion.states[middle])}: {lost}"
         return StabilityAlong(verdict, reason, period)
     behavior = behavior_of(passage, *halves)
-    verdict = {
-        Behavior.SPREADS: Verdict.UNSTABLE,
-        Behavior.SETTLES: Verdict.STABLE,
-    }.get(behavior, Verdict.UNDECIDED)
+    verdict = {Behavior.SPREADS: Verdict.UNSTABLE, Behavior.SETTLES: Verdict.STABLE}.get(
+        behavior, Verdict.UNDECIDED
+    )
     sizes = np.linalg.svd(passage.transition, compute_uv=False)
     exponents = (np.log(np.maximum(sizes, 1e-300)) + passage.growth) / (end - begin)
     reason = (

@@ -47,7 +47,7 @@ class Equilibria:
 
     Attributes:
         pinned: Z(R).
-        sizes: How large the states are, shape (n,).
+        sizes: The sizes of the states, shape (n,).
     """
 
     def __init__(self, pinned: PinnedOutputs) -> None:

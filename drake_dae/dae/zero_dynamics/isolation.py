@@ -62,16 +62,13 @@ class Isolation:
 
 
 def isolation(
-    pinned: PinnedOutputs,
-    state: FloatArray,
-    reference: FloatArray,
-    parameters: FloatArray,
+    pinned: PinnedOutputs, state: FloatArray, reference: FloatArray, parameters: FloatArray
 ) -> Isolation | None:
     """Returns the accuracy of the equilibrium at which a search ends; None if it is none.
 
     Args:
         pinned: Z(R).
-        state: Where the search ends, shape (n,).
+        state: The state at which the search ends, shape (n,).
         reference: R.
         parameters: Values of all parameters.
     """

@@ -10,11 +10,7 @@ from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow, MotionLost
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.returns import PeriodicMotion, find_multiple, find_return
-from drake_dae.dae.zero_dynamics.stability import (
-    Stability,
-    Verdict,
-    judge,
-)
+from drake_dae.dae.zero_dynamics.stability import Stability, Verdict, judge
 from drake_dae.errors import InconsistentStateError
 
 FOLDINGS = 40.0
@@ -101,7 +97,7 @@ def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
 
     Args:
         passage: The interval.
-        halves: Its two halves.
+        halves: The two halves of the interval.
     """
     grows = passage.growth > 0.8 * sum(max(half.growth, 0.0) for half in halves)
     if passage.growth > PLAIN and grows:
@@ -199,7 +195,8 @@ def leave(
         state: A state of the unstable motion, shape (n,).
         time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.
-        fastest: Its fastest frequency in rad/s; motions of too many turns are not followed.
+        fastest: The highest frequency of disturbances in rad/s; motions of too many turns are not
+            followed.
         period: The period of the reference; None if it is constant.
 
     Returns:
@@ -248,11 +245,7 @@ def judge_at_rest(
 
 
 def judge_without_rest(
-    equilibria: Equilibria,
-    goal: FloatArray,
-    start: FloatArray,
-    parameters: FloatArray,
-    reason: str,
+    equilibria: Equilibria, goal: FloatArray, start: FloatArray, parameters: FloatArray, reason: str
 ) -> Stability:
     """Judges by the motion from a state if no equilibrium is found near it.
 

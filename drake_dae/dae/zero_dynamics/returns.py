@@ -42,7 +42,7 @@ class PeriodicMotion:
     """A periodic motion.
 
     Attributes:
-        state: Its start, shape (n,).
+        state: The state at its start, shape (n,).
         period: Its period, in s.
         multipliers: The eigenvalues of the transition matrix of disturbances over the period, the
             largest first; for autonomous motions without the one that is 1 along the motion.

@@ -70,7 +70,7 @@ def linearized_eigenvalues(
 
     Args:
         pinned: Z(R).
-        scale: How large the states are, shape (n,).
+        scale: The sizes of the states, shape (n,).
         state: An equilibrium, shape (n,).
         reference: R there.
         parameters: Values of all parameters.
@@ -163,7 +163,7 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
     """Judges an equilibrium by its eigenvalues.
 
     Args:
-        values, errors: What `linearized_eigenvalues` returns; at least one eigenvalue.
+        values, errors: The result of `linearized_eigenvalues`, at least one eigenvalue.
         state: The equilibrium, shape (n,).
         place: The equilibrium in words.
     """

@@ -98,8 +98,8 @@ class ZeroDynamics:
             times: Times in s, increasing, shape (k,).
             guess: A state near the first one; it decides which of several solutions is followed.
             parameters: Values of all parameters.
-            exogenous: How the exogenous signals move, as for `make_closed_loop`; without any they
-                stand still.
+            exogenous: The references of the exogenous signals, as for `make_closed_loop`; without
+                any they stand still.
 
         Raises:
             ReferenceSignalError: An exogenous signal is not smooth enough.
@@ -124,7 +124,7 @@ class ZeroDynamics:
 
         Args:
             outputs: z, shape (p,).
-            guess: Where to start.
+            guess: The initial guess.
             parameters: Values of all parameters.
 
         Returns:
@@ -187,7 +187,7 @@ class ZeroDynamics:
         """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
 
         Args:
-            state: Where to look for the equilibrium.
+            state: The initial guess of the equilibrium.
             parameters: Values of all parameters.
             outputs: z at the equilibrium, shape (p,). If None those of the state, where outputs
                 with mu_i = 0, which depend on the control, are as brings it nearest to rest.
@@ -256,9 +256,9 @@ class ZeroDynamics:
 
         Args:
             reference: The function t -> R(t).
-            motion: What `motion` returns for it.
+            motion: The result of `motion` for this reference.
             parameters: Values of all parameters.
-            exogenous: How the exogenous signals move, as for `motion`.
+            exogenous: The references of the exogenous signals, as for `motion`.
 
         Raises:
             ModelError: A shape is wrong, or a number is not finite.
@@ -269,7 +269,7 @@ class ZeroDynamics:
         p, n = self.system.parameter_vector(parameters), self.system.num_states
         if motion.states.shape != (motion.times.size, n):
             raise ModelError(
-                f"{self.system.name}: the motion is one of another system: its states have shape "
+                f"{self.system.name}: the motion belongs to another system: its states have shape "
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
         moving = self._moving(p, exogenous)

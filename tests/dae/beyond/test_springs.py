@@ -141,7 +141,7 @@ def test_gains_around_springs_leave_room_for_the_loop():
 
 
 def test_numbers_that_make_no_sense_are_refused():
-    with pytest.raises(ModelError, match="as many rows"):
+    with pytest.raises(ModelError, match="same number of rows"):
         spring_error_bound(
             TrackingLaw(link(), poles(-POLE)), [0.0, 1.0], [[0, 0]], [[0]], [K], [B],
             SpringLoop(50.0), 1e-3,

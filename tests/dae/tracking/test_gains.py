@@ -234,9 +234,9 @@ REFUSED = {
     "too many groups": (
         gain_matrices([1, 2], [3]),
         [2],
-        "so 1 groups of matrices are needed, got 2",
+        "for each degree: 1 are needed, got 2",
     ),
-    "a group too few": (gain_matrices(), [2], r"degrees \[2\], so 1 groups.* got 0"),
+    "a group too few": (gain_matrices(), [2], r"degrees \[2\].* 1 are needed, got 0"),
     "a matrix too few": (gain_matrices([1.0]), [2], "degree 2 take 2 matrices, got 1"),
     "a wrong matrix": (
         gain_matrices([np.eye(2), 1.0]),

@@ -202,8 +202,8 @@ def test_high_orders_do_not_cancel(order):
     ("make", "message"),
     [
         (lambda: PointToPointReference([1, 2, 3], [1, 2], 0, 1), "start has 3, end has 2"),
-        (lambda: PointToPointReference([1], [1, 2], 0, 1), "as many entries"),
-        (lambda: SinusoidReference(0.0, [1], [1, 2]), "as many entries"),
+        (lambda: PointToPointReference([1], [1, 2], 0, 1), "same number of entries"),
+        (lambda: SinusoidReference(0.0, [1], [1, 2]), "same number of entries"),
         (lambda: PointToPointReference(0, 1, 0, 1, order=600), "order must be from 0 to 30"),
         (lambda: SinusoidReference(0.0, "a", 1.0), "amplitudes must be finite real numbers"),
     ],

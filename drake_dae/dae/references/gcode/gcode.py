@@ -63,7 +63,7 @@ class GCodeReference(SplineReference):
     Attributes:
         file: The program, or the points as a .csv.
         limits: The largest speed, acceleration and jerk of the two outputs, in m and s.
-        origin: Where X0 Y0 is, shape (2,), in m.
+        origin: The position of X0 Y0, shape (2,), in m.
         along: The direction of X, shape (2,): the change of the outputs per m.
         up: The direction of Y, likewise.
         press: The force in G1, G2 and G3 and that in G0, in N, shape (2,); None without force.
@@ -241,7 +241,7 @@ def _distance(spline: TimeSpline, path: _Path, along: FloatArray) -> float:
     Args:
         spline: The spline.
         path: The path.
-        along: How far along the path the points are.
+        along: The distances of the points along the path.
     """
     powers = (np.arange(_SAMPLES)[:, None] / _SAMPLES) ** np.arange(spline.degree + 1)
     spans = sliding_window_view(spline.differences[0], spline.degree + 1, axis=0)

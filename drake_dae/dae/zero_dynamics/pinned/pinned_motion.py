@@ -31,7 +31,7 @@ class MotionEnd:
         time: The end time, in s.
         state: The last state, shape (n,); None if there is none.
         matrix: The matrix that loses its rank, "A" or "B"; empty if none does.
-        text: The same as a sentence.
+        text: A sentence on the end of the motion.
     """
 
     cause: EndCause

@@ -35,7 +35,7 @@ class PinnedOutputs:
         structure: The structure of the system.
 
     Attributes:
-        layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
+        layout: The layout of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...).
         residual_signals: The residuals of Z(R): the constraints, then the output errors, each with
             its derivatives.
     """
@@ -112,8 +112,8 @@ class PinnedOutputs:
             )
         raise InconsistentStateError(
             f"{name}: {outputs} are not reached near the given state: "
-            f"{self.residual_signals[worst].name} stays off by {residual[worst]:.3g}. Ask for "
-            "outputs that the system can have, or start nearer to the state that has them",
+            f"{self.residual_signals[worst].name} stays off by {residual[worst]:.3g}. Request "
+            "outputs within reach of the system, or start closer to a state with these outputs",
             residual,
         )
 
