@@ -87,11 +87,12 @@ def _made(path: Path, out: Path, settings: list[str]) -> str:
     """The card of a scenario, with its run and its bench."""
     options = [option for setting in settings for option in ("--set", setting)]
     told = _run(path, out / path.stem, options)
+    told["bench"] = SLOW if options else _bench(path, out / path.stem)
     return _card(path, out / path.stem, told)
 
 
 def _run(path: Path, folder: Path, options: list[str]) -> dict:
-    """What `simulate --json` tells of a run, and of its bench; made if there is none yet."""
+    """What `simulate --json` tells of a run; made if there is none of this scenario yet."""
     stamp = folder.with_suffix(".json")
     state = _digest(path, *sorted(Path(drake_dae.__file__).parent.rglob("*.py")))
     if stamp.exists() and (found := json.loads(stamp.read_text("utf-8")))["state"] == state:
@@ -100,13 +101,14 @@ def _run(path: Path, folder: Path, options: list[str]) -> dict:
     shutil.rmtree(folder, ignore_errors=True)
     told = json.loads(_printed("simulate", path, "--out", folder, "--json", *options))
     _printed("render", folder, "--out", folder / "strip.png")
-    told["bench"] = SLOW if options else _bench(path, folder)
     stamp.write_text(json.dumps({"state": state, "told": told}), "utf-8")
     return told
 
 
 def _bench(path: Path, folder: Path) -> str:
     """Writes the scenario as a page, where it can be steered; returns why it cannot, or nothing."""
+    if (folder / "bench.html").exists():
+        return ""
     bundle = folder.parent / "meshcat.js"
     error = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
