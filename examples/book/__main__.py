@@ -43,6 +43,7 @@ def main() -> int:
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         (source / name).write_text(text, "utf-8")
     shutil.copy(BOOK / "conf.py", source)
+    shutil.copy(BOOK / "search.js", source)
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
     _live_figures(texts.values(), library, out)

@@ -26,6 +26,7 @@ html_copy_source = False
 html_show_sphinx = False
 html_static_path = ["_static"]
 html_css_files = ["book.css"]
+html_search_scorer = "search.js"
 html_math_renderer = "mathml"
 napoleon_use_ivar = True
 add_module_names = False

@@ -112,6 +112,18 @@ def test_links_lead_to_pages_files_and_headings():
                 assert heading in slugs, f"{named(page)}: {target}"
 
 
+def test_pictures_and_live_figures_say_in_words_what_they_show():
+    found = 0
+    for page in [*pages(), BOOK.parents[1] / "README.md"]:
+        text = page.read_text("utf-8")
+        texts = re.findall(r"!\[([^\]]*)\]\(", text)
+        for frame in re.findall(r"<iframe[^>]*>", text):
+            texts += re.findall(r'title="([^"]*)"', frame) or [""]
+        assert all(len(one) > 20 for one in texts), (page, texts)
+        found += len(texts)
+    assert found > 25
+
+
 def test_pages_are_in_the_contents():
     listed = set()
     for page in pages():

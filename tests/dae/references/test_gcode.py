@@ -80,6 +80,12 @@ def test_arcs(text, center, sweep):
         assert move.direction(share) @ chord / np.linalg.norm(chord) > 0.999
 
 
+def test_head_of_a_cam_program_moves_nothing():
+    head = "%\nO1000 (POCKET)\nG21 G90 G94 G17 G40 G49 G80\nT1 M6\nG43 H1 Z5\nS12000 M3\n"
+    (move,) = moves(f"{head}G0 X1 Y0\nG1 Z-1 F200\nG1 X2\nM5\nM30\n%")
+    np.testing.assert_allclose([move.start, move.end], [[0.001, 0.0], [0.002, 0.0]], atol=1e-18)
+
+
 def test_inches_and_increments():
     inch, mm = moves("G20 G91 F60\nG0 X1 Y1\nG1 X1\nG21\nY25.4")
     np.testing.assert_allclose(inch.start, [0.0254, 0.0254], rtol=1e-15)
@@ -93,11 +99,11 @@ def test_inches_and_increments():
     [
         ("G1 X1", "line 1: G1 before any F"),
         ("F100\nX1", "line 2: coordinates before any G0, G1, G2 or G3"),
-        ("G43 H1", "line 1: H is not followed"),
-        ("G43", "line 1: G43 is not followed; lines and arcs"),
+        ("G41 D1", "line 1: D is not followed"),
+        ("G28", "line 1: G28 is not followed; lines and arcs"),
         ("G18", "G18 is not followed"),
         ("M98 P3", "P is not followed"),
-        ("M6", "M6 is not followed"),
+        ("M0", "M0 is not followed"),
         ("G1 X1 X2 F1", "X occurs twice"),
         ("G1 X#1 F1", "'X#1' is not understood"),
         ("G1 X1 F0", "F must be positive, got 0"),

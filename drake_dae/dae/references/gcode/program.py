@@ -11,12 +11,12 @@ from drake_dae.errors import ReferenceSignalError
 
 INCH, MILLIMETRE, MINUTE = 0.0254, 1e-3, 60.0
 
-WITHOUT_EFFECT = frozenset({17.0, 40.0, 49.0, 54.0, 80.0, 91.1, 94.0})
+WITHOUT_EFFECT = frozenset({17.0, 40.0, 43.0, 49.0, 54.0, 80.0, 91.1, 94.0})
 """The G codes that select what is the default here: the plane XY, no compensation, centers from the
-start of an arc, feeds per minute."""
+start of an arc, feeds per minute; and an offset of the tool's length, which is along Z."""
 
-NOT_FOLLOWED = frozenset({3.0, 4.0, 5.0, 7.0, 8.0, 9.0})
-"""The M codes that move nothing: spindle and coolant."""
+NOT_FOLLOWED = frozenset({3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0})
+"""The M codes that move nothing: spindle, tool change and coolant."""
 
 ENDS = frozenset({2.0, 30.0})
 """The M codes that end a program."""
@@ -155,7 +155,7 @@ def _follow(machine: _Machine, line: str, moves: list[GCodeMove]) -> bool:
             raise ReferenceSignalError(
                 f"G{code:g} is not followed; lines and arcs in the plane are: G0, G1, G2, G3"
             )
-    for letter in "ZST":
+    for letter in "HOSTZ":
         if letter in values:
             machine.ignored[letter] = None
     if "F" in values:
@@ -178,7 +178,7 @@ def _words(line: str) -> tuple[list[tuple[str, float]], dict[str, float]]:
         value = float(digits)
         if letter in "GM":
             codes.append((letter, value))
-        elif letter not in "XYZIJRFSTN":
+        elif letter not in "XYZIJRFSTNHO":
             raise ReferenceSignalError(f"{letter} is not followed: the path lies in X and Y")
         elif letter in values:
             raise ReferenceSignalError(f"{letter} occurs twice")
