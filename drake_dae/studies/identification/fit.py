@@ -113,16 +113,16 @@ class ParameterFit:
         strict: np.ndarray,
         noise: Sequence[FloatArray] | None = None,
     ) -> None:
-        self._pieces = [each.fine_enough(start) for each in pieces]
+        self._pieces = [record.fine_enough(start) for record in pieces]
         self._values, self._sizes, self._lowest = start.copy(), sizes, lowest
         self._strict = strict
-        self._states = [each.first_states.copy() for each in self._pieces]
-        self._spread = [each.spread for each in self._pieces]
+        self._states = [record.first_states.copy() for record in self._pieces]
+        self._spread = [record.spread for record in self._pieces]
         self._floor = FIRST_NOISE
         guess = [FIRST_NOISE * spread for spread in self._spread] if noise is None else noise
-        self._noise = [each.copy() for each in guess]
+        self._noise = [deviations.copy() for deviations in guess]
         self._parts = np.eye(start.size), np.zeros((start.size, 0))
-        self._before, self._least_left = (self._values, list(self._states)), np.inf
+        self._before, self._least_size = (self._values, list(self._states)), np.inf
         self._last = 0.0
 
     def run(self, couplings: Sequence[float] = COUPLINGS) -> FitResult:
@@ -143,7 +143,7 @@ class ParameterFit:
             is_last = coupling == COUPLINGS[-1]
             # Loosely coupled pieces fit the noise, too: their errors do not show it.
             self._floor = SMALLEST if is_last else FIRST_NOISE
-            before, self._least_left = np.inf, np.inf
+            before, self._least_size = np.inf, np.inf
             for _ in range(MOST):
                 slopes, chains = self._shortened(coupling, known)
                 step, length = self._step(chains)
@@ -152,9 +152,9 @@ class ParameterFit:
                     slopes, chains = self._chained(coupling, None)
                     step, length = self._step(chains)
                 expected = self._move(step, slopes, chains)
-                left = self._left([each.errors for each in slopes])
+                size = self._error_size([record.errors for record in slopes])
                 # Tighter coupling makes errors larger, as expected.
-                self._least_left = max(min(self._least_left, left), self._left(expected))
+                self._least_size = max(min(self._least_size, size), self._error_size(expected))
                 is_new, self._last = known is None, length * max(1.0, np.sqrt(step.size))
                 known = slopes if length < SHORTER * before else None
                 before = length
@@ -171,7 +171,7 @@ class ParameterFit:
                     raise ModelError(
                         f"the steps toward the best values have not come to an end after {MOST}: "
                         "the record does not fit this robot (look for a wrong unit or sign), or "
-                        "the values to begin with are far off; free fewer parameters first"
+                        "the initial guess is far off; free fewer parameters first"
                     )
         return self._fitted(*self._chained(couplings[-1], slopes))
 
@@ -204,15 +204,16 @@ class ParameterFit:
         for _ in range(HALVED):
             with suppress(ModelError):
                 slopes, chains = self._chained(coupling, known)
-                if self._left([each.errors for each in slopes]) <= WORSE * self._least_left:
+                size = self._error_size([record.errors for record in slopes])
+                if size <= WORSE * self._least_size:
                     return slopes, chains
             values, states = self._before
             self._values = (values + self._values) / 2.0
             pairs = zip(states, self._states, strict=True)
-            self._states = [(one + other) / 2.0 for one, other in pairs]
+            self._states = [(before + after) / 2.0 for before, after in pairs]
         return self._chained(coupling, known)
 
-    def _left(self, errors: Sequence[FloatArray]) -> float:
+    def _error_size(self, errors: Sequence[FloatArray]) -> float:
         """The root mean square of all errors, relative to the spread of their columns."""
         pairs = zip(errors, self._spread, strict=True)
         return max(float(np.sqrt(np.nanmean(np.square(e / spread)))) for e, spread in pairs)
@@ -233,7 +234,7 @@ class ParameterFit:
                 raise ModelError(
                     "the motion that is computed with these parameters leaves the recorded one: "
                     "a unit or a sign is wrong (rad, m, s, N m, N), the record is that of another "
-                    "robot or run, or the values to begin with are far off"
+                    "robot or run, or the initial guess is far off"
                 )
             slopes.append(computed)
             chains.append(self._chain(index, computed, coupling))

@@ -107,9 +107,10 @@ def _fitted(
     limits: tuple[FloatArray, FloatArray, np.ndarray],
 ) -> FitResult:
     """Fits the records; long records first with some of their rows, for a better initial guess."""
-    if all(each.data.times.size <= LONG for each in pieces):
+    if all(record.data.times.size <= LONG for record in pieces):
         return ParameterFit(pieces, start, *limits).run()
-    first = ParameterFit([each.first(BRIEF) for each in pieces], start, *limits).run(COUPLINGS[:-1])
+    shortened = [record.first(BRIEF) for record in pieces]
+    first = ParameterFit(shortened, start, *limits).run(COUPLINGS[:-1])
     with suppress(ModelError):  # A good initial guess needs no loose coupling.
         return ParameterFit(pieces, first.values, *limits, first.noise).run(COUPLINGS[-1:])
     return ParameterFit(pieces, first.values, *limits).run()
@@ -130,7 +131,7 @@ def pieces_of(record: Record, driven: DrivenPlant, unknowns: Unknowns, title: st
                 f"contacts of {title} open or close, or phases of its task end, and a delay is not "
                 "found across these; leave the delay out, or take a record between two of them"
             )
-    return RecordPieces(driven, data, biases, unknowns.num_sensed, delays=delays)
+    return RecordPieces(driven, data, biases, delays, unknowns.num_sensed)
 
 
 def _check_differ(records: Mapping[str, Record]) -> None:
@@ -142,7 +143,7 @@ def _check_differ(records: Mapping[str, Record]) -> None:
                 (record.time, other.time),
                 *((r.values, other[n]) for n, r in record.signals.items() if n in other.signals),
             ]
-            if all(np.array_equal(one, two) for one, two in pairs):
+            if all(np.array_equal(a, b) for a, b in pairs):
                 raise ModelError(f"{before} and {title} are the same run; name it once")
 
 
@@ -165,8 +166,9 @@ def _numbered(records: Sequence[Record]) -> dict[str, Record]:
 def _noise(loop: ClosedLoop, pieces: Sequence[RecordPieces], fitted: FitResult) -> dict[str, Noise]:
     """The errors of each group of measured columns, over all records."""
     groups = dict[tuple[str, str], list[tuple[Channel, FloatArray, float]]]()
-    for each, errors in zip(pieces, fitted.errors, strict=True):
-        for channel, column, spread in zip(each.data.channels, errors.T, each.spread, strict=True):
+    for record, errors in zip(pieces, fitted.errors, strict=True):
+        measured_columns = zip(record.data.channels, errors.T, record.spread, strict=True)
+        for channel, column, spread in measured_columns:
             finite = column[np.isfinite(column)]
             groups.setdefault(channel.group, []).append((channel, finite, float(spread)))
     noise, signals = {}, [signal for signal, _ in groups]

@@ -75,7 +75,7 @@ def identify_scenario(
 
 
 def _with_values(scenario: Scenario, identified: Identified) -> Scenario:
-    payloads = {f"{one.name}.mass": i for i, one in enumerate(scenario.plant_payloads)}
+    payloads = {f"{load.name}.mass": i for i, load in enumerate(scenario.plant_payloads)}
     changes = dict[str, Any]()
     values = dict[str, dict[int, float]]()
     for unknown, value, deviation in zip(

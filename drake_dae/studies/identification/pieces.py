@@ -59,15 +59,15 @@ class RecordPieces:
         biases: For each column the index of its bias among the unknowns of sensors; -1 for none.
         num_sensed: The number of unknowns of sensors. They follow those of the plant.
         parts: The number of integration steps of a continuous plant between two rows.
-        delays: For each column the index of its delay, as in `biases`; None without any delay.
+        delays: For each column the index of its delay, as in `biases`; -1 for none.
     """
 
     driven: DrivenPlant
     data: Measured
     biases: np.ndarray
+    delays: np.ndarray
     num_sensed: int
     parts: int = 1
-    delays: np.ndarray | None = None
 
     @cached_property
     def length(self) -> int:
@@ -204,8 +204,6 @@ class RecordPieces:
 
     def _shifts(self, sensed: FloatArray) -> tuple[np.ndarray, FloatArray]:
         """The delay of each column as a number of rows and a remainder in s."""
-        if self.delays is None:
-            return np.zeros(len(self.biases), dtype=int), np.zeros(len(self.biases))
         delays = np.append(sensed, 0.0)[self.delays]
         step = float(np.median(np.diff(self.data.times)))
         rows = np.round(delays / step)
@@ -225,7 +223,7 @@ class RecordPieces:
         """The computed columns, earlier by the remainders of delays, and derivatives by delays."""
         delayed, rates, (_, rests) = computed.copy(), np.zeros_like(computed), self._shifts(sensed)
         step = float(np.median(np.diff(self.data.times)))
-        for column in np.flatnonzero([] if self.delays is None else self.delays >= 0):
+        for column in np.flatnonzero(self.delays >= 0):
             rate = np.gradient(computed[:, :, column], step, axis=1, edge_order=2)
             second = np.gradient(rate, step, axis=1, edge_order=2)
             rest = rests[column]
@@ -239,7 +237,7 @@ class RecordPieces:
         for column, bias in enumerate(self.biases):
             if bias >= 0:
                 slopes[:, :, column, bias] = 1.0
-            if self.delays is not None and self.delays[column] >= 0:
+            if self.delays[column] >= 0:
                 slopes[:, :, column, self.delays[column]] = rates[:, :, column]
         return slopes
 

@@ -1,9 +1,9 @@
 """The unknown parameters of an identification, by name."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,17 @@ FORCE_DELAY, POSITION_DELAY = "force.delay", "position.delay"
 """The names of the delays of force sensor and encoders in s, equal for all their entries."""
 
 _ENTRY = re.compile(r"(.+)\[(\d+)\]")
+
+
+class NamedNumber(Protocol):
+    """A number with a name."""
+
+    @property
+    def name(self) -> str:
+        """The name, with the index of the entry if the parameter has several."""
+
+
+Number = TypeVar("Number", bound=NamedNumber)
 
 
 @checked(ModelError)
@@ -72,22 +83,10 @@ class Unknowns:
         """
         if isinstance(free, str) or not free:
             raise ModelError(f"free must be a list of names of parameters, got {free!r}")
-        available = {unknown.name: unknown for unknown in _all(loop)}
-        names = dict[str, list[Unknown]]()
-        for unknown in available.values():
-            names.setdefault(unknown.parameter, []).append(unknown)
-        chosen: list[Unknown] = []
-        for name in free:
-            entries = [available[name]] if name in available else names.get(name)
-            if entries is None:
-                match = _ENTRY.fullmatch(name)
-                if match and match[1] in names:
-                    raise ModelError(
-                        f"'{match[1]}' has {len(names[match[1]])} entries, counted from 0, and "
-                        f"no entry {match[2]}"
-                    )
-                raise ModelError(unknown_name("parameter to identify", name, names))
-            chosen += entries
+        available = dict[str, list[Unknown]]()
+        for unknown in _all(loop):
+            available.setdefault(unknown.parameter, []).append(unknown)
+        chosen = [u for n in free for u in named_entries(n, available, "parameter to identify")]
         if doubles := {u.name for u in chosen if chosen.count(u) > 1}:
             raise ModelError(f"'{min(doubles)}' is named twice in free")
         exogenous = loop.plant.exogenous_places
@@ -137,6 +136,37 @@ class Unknowns:
             if bias >= 0:
                 sensed[bias] = channel.bias
         return np.concatenate([nominal, sensed])
+
+
+def named_entries(
+    name: str, available: Mapping[str, Sequence[Number]], kind: str
+) -> Sequence[Number]:
+    """Returns all entries of a parameter, or the entry of a name such as "wall.position[0]".
+
+    Args:
+        name: The name.
+        available: Name of a parameter -> its entries.
+        kind: The kind of parameter, for messages.
+
+    Raises:
+        ModelError: There is no such parameter or entry.
+    """
+    if name in available:
+        return available[name]
+    match = _ENTRY.fullmatch(name)
+    if match is None or match[1] not in available:
+        raise ModelError(unknown_name(kind, name, available))
+    parameter, entry = match.groups()
+    entries = available[parameter]
+    if len(entries) == 1:
+        raise ModelError(f"'{parameter}' is one number: name it without [{entry}]")
+    # By its name and not by its place: the biases of positions leave out velocities.
+    chosen = [number for number in entries if number.name == name]
+    if not chosen:
+        raise ModelError(
+            f"'{parameter}' has {len(entries)} entries, counted from 0, and no entry {entry}"
+        )
+    return chosen
 
 
 def model_parameters(system: Any) -> Iterator[tuple[Parameter, int]]:

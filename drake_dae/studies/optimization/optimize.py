@@ -169,7 +169,7 @@ class _Search:
             names = np.repeat(self._objective.names, self._objective.sizes)
             labels = ["the cost", *(f"limit '{name}'" for name in names)]
             wrong = labels[int(np.argmin(np.isfinite(values)))]
-            raise ModelError(f"{wrong} is not finite with the values to begin with")
+            raise ModelError(f"{wrong} is not finite at the initial guess")
         return values
 
     def _checked_slopes(self, guess: FloatArray) -> tuple[FloatArray, list[int]]:
@@ -182,8 +182,8 @@ class _Search:
         slopes = self._slopes_from(guess, changes)
         if not np.isfinite(slopes).all():
             raise ModelError(
-                "cost or limits have no finite derivatives with the values to begin with, as of "
-                "the root of a number that is 0"
+                "cost or limits have no finite derivatives at the initial guess, for example a "
+                "square root at 0"
             )
         return slopes, [i for i, read in enumerate(reads) if not read]
 

@@ -1,7 +1,6 @@
 """The parameters and initial states of a diagram that an optimization may change, by name."""
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,11 +8,11 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import System
 
-from drake_dae.arrays import FloatArray, number, unknown_name
+from drake_dae.arrays import FloatArray, number
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.studies.identification.unknowns import model_parameters
+from drake_dae.studies.identification.unknowns import model_parameters, named_entries
 
 START, PLANT, LAW = "start.", "plant.", "law."
 """Prefixes of names: an entry of the initial state, a number only of the plant, or only of the
@@ -21,8 +20,6 @@ law."""
 
 Bounds = tuple[float | None, float | None]
 """(least, largest) value; None for no bound."""
-
-_ENTRY = re.compile(r"(.+)\[(\d+)\]")
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,7 @@ def chosen_variables(
     variables = [
         _bounded(entry, start, parameters, bounds)
         for name, bounds in free.items()
-        for entry in _entries(name, available)
+        for entry in named_entries(name, available, "number to optimize")
     ]
     taken: dict[tuple[bool, int], Variable] = {}
     for variable in variables:
@@ -135,23 +132,6 @@ def _bounded(
             f"{high:g}: give it another value in the context, or other bounds"
         )
     return replace(variable, start=value, low=low, high=high)
-
-
-def _entries(name: str, available: Mapping[str, Sequence[Variable]]) -> Sequence[Variable]:
-    """The entries of a parameter, or the single entry that is named."""
-    if name in available:
-        return available[name]
-    match = _ENTRY.fullmatch(name)
-    if match is None or match[1] not in available:
-        raise ModelError(unknown_name("number to optimize", name, available))
-    entries = available[match[1]]
-    if int(match[2]) >= len(entries) or len(entries) == 1:
-        raise ModelError(
-            f"'{match[1]}' has {len(entries)} entries, counted from 0, and no entry {match[2]}"
-            if len(entries) > 1
-            else f"'{match[1]}' is one number: name it without [{match[2]}]"
-        )
-    return [entries[int(match[2])]]
 
 
 def _by_name(compiled: CompiledDiagram) -> dict[str, list[Variable]]:

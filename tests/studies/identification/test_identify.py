@@ -80,7 +80,8 @@ def test_derivatives_are_those_of_differences(kind):
     driven = DrivenPlant(loop, context, measured_ports(loop), places)
     data = measured(record, driven, "record")
     biases = np.array([-1] * (len(data.channels) - 1) + [0])
-    pieces = RecordPieces(driven, data, biases, 1, parts).first(40)
+    delays = np.full(len(data.channels), -1)
+    pieces = RecordPieces(driven, data, biases, delays, 1, parts).first(40)
     x, theta = pieces.first_states, np.append(driven.nominal, 0.3)
     found = pieces.slopes(x, theta)
     n = x.shape[1]
