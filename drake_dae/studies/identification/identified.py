@@ -157,9 +157,9 @@ class Identified:
     def remarks(self) -> list[str]:
         """Sentences on convergence, fit, noise and undetermined parameters."""
         remarks = [
-            f"What is left of {name} is {noise.share:.2g} times as large as how much it varies: "
-            "the record does not fit this robot. Look for a wrong sign, a wrong unit, a column of "
-            "another joint, or something that the plant lacks."
+            f"The errors of {name} are {noise.share:.2g} times its spread: the record does not fit "
+            "this robot. Look for a wrong sign, a wrong unit, a column of another joint, or "
+            "something that the plant lacks."
             for name, noise in self.noise.items()
             if noise.share > LARGE and not noise.is_white
         ]
@@ -201,15 +201,15 @@ class Identified:
             ratio = noise.deviation / noise.stated if noise.stated else 1.0
             if not (1.0 / ALIKE < ratio < ALIKE or noise.is_least):
                 remarks.append(
-                    f"What is left of {name} is {ratio:.2g} times the noise that is stated: "
+                    f"The errors of {name} are {ratio:.2g} times the stated noise: "
                     + ("the model lacks something." if ratio > 1.0 else "the sensor is better.")
                 )
             kind = f"{'' if noise.is_white else 'not '}white"
-            kind += f" (correlation with the next one {noise.correlation:.2g})"
+            kind += f" (autocorrelation {noise.correlation:.2g})"
             if noise.is_least:
-                kind = "what computing leaves: there is no noise"
+                kind = "only numerical, without noise"
             remarks.append(
-                f"Left of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
+                f"Errors of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
                 + f"{stated}, {kind}."
             )
         if any(not (noise.is_white or noise.is_least) for noise in self.noise.values()):
