@@ -106,6 +106,8 @@ from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
+from .running.bench.inline import LiveBench as LiveBench
+from .running.bench.inline import inline_page as inline_page
 from .running.bench.live import live as live
 from .running.bench.page import write_page as write_page
 from .running.bench.run import Commands as Commands

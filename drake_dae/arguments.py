@@ -1,4 +1,4 @@
-"""Checks of the arguments of public names by their annotations, with uniform messages."""
+"""Checks the arguments of public functions and classes by their annotations."""
 
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -31,10 +31,10 @@ class _Rule(NamedTuple):
     """The condition that an annotation imposes on a value.
 
     Attributes:
-        words: As in "must be ...".
-        holds: Whether a value satisfies it, without its parts.
-        inside: (place, value, rule) of the parts of a value, for containers.
-        is_of_type: Whether the type of a value alone decides.
+        words: The condition in words, after "must be".
+        holds: Whether a value satisfies it, regardless of the parts of a container.
+        inside: (place, value, rule) of the parts of a container.
+        is_of_type: Whether the condition depends only on the type of the value.
     """
 
     words: str
@@ -44,15 +44,16 @@ class _Rule(NamedTuple):
 
 
 def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
-    """A function that refuses arguments which do not match their annotations.
+    """Decorates a function so that arguments which do not match their annotations raise an error.
 
-    For a class, its constructor and its public methods are checked. A number must be finite and not
-    a bool, arrays must consist of such numbers, text is not accepted as a list of letters, and the
-    entries of lists and mappings are checked, too; shapes and ranges are left to the function. None
-    is accepted if it is the argument's default.
+    Of a class, the constructor and the public methods are decorated. A number must be finite and
+    not a bool, arrays must consist of such numbers, text is no list of letters, and the entries of
+    lists and mappings are checked as well. Shapes and ranges are left to the function. The default
+    of an argument is always accepted.
 
     Args:
-        error: Makes the exception from a text "<function>: <argument> must be <what>, got <value>".
+        error: The exception, or a function that makes it of a text "<function>: <argument> must be
+            <condition>, got <value>".
     """
 
     def decorate(target: F) -> F:
@@ -88,7 +89,7 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
                 if parameter.kind is not parameter.KEYWORD_ONLY:
                     rules.append(entry)
 
-    valid: set[tuple[str, type]] = set()  # Arguments and types that were found to be valid.
+    valid: set[tuple[str, type]] = set()  # Arguments with types that are known to be valid.
 
     def check(entry: tuple[str, _Rule, Any], value: Any) -> None:
         name, rule, default = entry
@@ -118,7 +119,7 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
 
 
 def _wrong(what: str, value: Any, rule: _Rule) -> str:
-    """What is wrong with a value; empty if it is valid."""
+    """A text on what is wrong with a value; empty if it is valid."""
     if not rule.holds(value):
         return f"{what} must be {rule.words}, got {brief(value)}{_hint(value, rule)}"
     for place, part, inner in rule.inside(what, value) if rule.inside else ():
@@ -129,11 +130,11 @@ def _wrong(what: str, value: Any, rule: _Rule) -> str:
 
 
 def _hint(value: Any, rule: _Rule) -> str:
-    """A hint, if an attribute of the value would be valid."""
-    holders = ("dae", "system", "model", "diagram", "links")
+    """A hint if an attribute of the value would be valid; otherwise empty."""
+    names = ("dae", "system", "model", "diagram", "links")
     parts = vars(value) if hasattr(value, "__dict__") and not inspect.isclass(value) else {}
-    meant = [name for name in holders if name in parts and rule.holds(parts[name])]
-    return f"; pass its .{meant[0]}" if meant else ""
+    valid = [name for name in names if name in parts and rule.holds(parts[name])]
+    return f"; pass its .{valid[0]}" if valid else ""
 
 
 _ARRAY = set(get_args(ArrayLike)) or {ArrayLike}  # A union, or in newer NumPy an alias.
@@ -176,7 +177,7 @@ _CALLABLE = get_origin(Callable[[], None])
 
 
 def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
-    """The rule that one of several rules holds."""
+    """The rule of a Union: at least one of several rules holds."""
     rules = []
     if members >= _ARRAY:
         rules.append(_ARRAYS)

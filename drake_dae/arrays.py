@@ -21,7 +21,7 @@ MEANINGFUL = 1e12
 
 
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
-    """Real numbers as a new array; not necessarily finite. Text and masked entries are refused.
+    """Converts real numbers to a new array; refuses text and masked entries, accepts nan and inf.
 
     Args:
         what: Their name in messages.
@@ -50,7 +50,7 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
 
 
 def number_in(text: str) -> float | None:
-    """The finite number of a text, as in JSON or with a sign; None if it is not one.
+    """Returns the finite number that a text contains, as in JSON or with a sign; else None.
 
     Python's float also accepts "1_0", "nan" and digits of other alphabets.
     """
@@ -64,12 +64,12 @@ _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def can_be_written(text: str) -> bool:
-    """Whether a text can be written to a file: it must not contain a lone surrogate."""
+    """Returns whether a text can be written to a file: it must not contain a lone surrogate."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def check_writable(what: str, text: str) -> None:
-    """Refuses a text that cannot be written to a file.
+    """Checks that a text can be written to a file.
 
     Raises:
         ModelError: It contains a lone surrogate.
@@ -81,7 +81,7 @@ def check_writable(what: str, text: str) -> None:
 
 
 def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
-    """A finite real number.
+    """Converts a finite real number to a float.
 
     Raises:
         ModelError: It is none.
@@ -93,21 +93,21 @@ def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
 
 
 def positive(what: str, value: Any, error: type[Exception] = ModelError) -> float:
-    """A finite real number above 0.
+    """Converts a finite real number above 0 to a float.
 
     Raises:
         ModelError: It is none.
     """
-    found = number(what, value, error)
-    if found <= 0.0:
+    checked = number(what, value, error)
+    if checked <= 0.0:
         raise error(f"{what} must be positive, got {brief(value)}")
-    return found
+    return checked
 
 
 def vector(
     what: str, value: Any, size: int | None, error: type[Exception] = ModelError
 ) -> FloatArray:
-    """Finite real numbers as a new array of shape (size,), or of any length if size is None.
+    """Converts finite real numbers to a new array of shape (size,); of any length if size is None.
 
     Raises:
         ModelError: The numbers have another shape, or one of them is not finite.
@@ -121,7 +121,7 @@ def vector(
 
 
 def check_whole_number(what: str, value: Any, least: int) -> None:
-    """Refuses a value that is not a whole number of at least `least`.
+    """Checks that a value is a whole number of at least `least`.
 
     Raises:
         ModelError: The value is too small, or not a whole number.
@@ -131,7 +131,7 @@ def check_whole_number(what: str, value: Any, least: int) -> None:
 
 
 def check_axes(name: str, axes: str) -> None:
-    """Refuses a text that does not consist of distinct letters of "xyz".
+    """Checks that a text consists of distinct letters of "xyz".
 
     Raises:
         ModelError: A letter is another one, or occurs twice, or there is none.
@@ -141,7 +141,7 @@ def check_axes(name: str, axes: str) -> None:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """The text for an unknown name, with the known ones.
+    """Returns the text for an unknown name, with the known names.
 
     Args:
         kind: The kind of the name, for example "frame".
@@ -158,7 +158,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[str], most: int = 8) -> str:
-    """Names in a line of text, "[a, b]"; of many the first ones and the number of the others."""
+    """Formats names as "[a, b]"; a long list is cut, with the number of omitted names."""
     every = list(names)
     more = [f"... {len(every) - most} more"] if len(every) > most else []
     return f"[{', '.join([*every[:most], *more])}]"
@@ -170,7 +170,7 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
 
 
 def brief(value: Any) -> str:
-    """Any value in a message, in one short line."""
+    """Formats any value in one short line."""
     try:
         text = " ".join(_BRIEF.repr(value).split())
     except Exception:  # From a __repr__ of others.
@@ -181,19 +181,19 @@ def brief(value: Any) -> str:
 
 
 def show(array: ArrayLike) -> str:
-    """An array in a message: four digits, in one line."""
+    """Formats an array with four digits, in one line."""
     return np.array2string(
         np.asarray(array), precision=4, separator=", ", max_line_width=10**6, threshold=40
     )
 
 
 def show_state(state: ArrayLike) -> str:
-    """A state in a message: its numbers, or its size if it has diverged."""
+    """Formats a state: its numbers, or its largest magnitude if it has diverged."""
     values = np.asarray(state, dtype=float)
     largest = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
     return f"grown to {largest:.0e}" if largest > MEANINGFUL else show(values)
 
 
 def by_columns(values: FloatArray) -> FloatArray:
-    """The columns of a table as rows that lie together: NumPy adds these up many times as fast."""
+    """Returns the columns of a table as contiguous rows, which NumPy sums many times faster."""
     return np.ascontiguousarray(values.T)

@@ -26,8 +26,8 @@ from drake_dae.simulation.records.interruption import Interruption, end_at_once,
 YOUNG = 50_000
 """The number of new objects before a garbage collection.
 
-The objects that a command loads and builds are kept: collecting as often as Python does takes a
-sixth of a short run.
+Most objects that a command builds are needed until its end. Python's default takes a sixth of the
+time of a short run.
 """
 
 
@@ -35,25 +35,26 @@ _MODULES = {
     "schema": "keys",
     "print": "keys",
     "cache": "keys",
+    "explain": "keys",
     "page": "play",
     "live": "play",
     "render": "plot",
     "diagram": "plot",
     "excite": "identify",
 }
-"""The modules of commands that have none of their own."""
+"""Command -> its module, if the module has another name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 1 for an error, also if a run ends early; 2 for a problem found by `analyze`, with
-    `--check` for a run that missed its task, and for wrong usage; 128 + signal after Ctrl-C (130),
-    SIGTERM (143) or SIGHUP (129).
+    The code is 0; or 1 for an error, also if a run ends early; or 2 for a problem found by
+    `analyze`, with `--check` for a run that missed its task, and for wrong usage; or 128 + signal
+    after Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
 
     Args:
-        arguments: Those after the command's name; None for those of this process, which must then
-            run nothing else.
+        arguments: The arguments after the command's name; None for those of this process, which
+            must do nothing else then.
     """
     if arguments is not None:
         return _main(arguments)
@@ -74,41 +75,47 @@ def _main(arguments: Sequence[str] | None) -> int:
         if options.command == "list":
             return _list(as_json)
         run_command = _loaded(options.command)
-        # In the report already.
+        # The report of `analyze` contains it.
         ignored = [NonMinimumPhaseWarning] if options.command == "analyze" else []
         if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
-        # Drake logs the port of each Meshcat, also of one that only records.
+        # Drake logs the port of each Meshcat, also of a Meshcat that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)
-        # Unfinished files are removed when a signal ends it.
+        # A signal becomes an exception, so that unfinished files are removed.
         with _warnings(*ignored), ending_signals(end_at_once):
             return run_command(options)
     except DrakeDaeError as error:
+        from drake_dae.scenario.manual.remedies import code_of
+
         # A scenario's error has a line for each problem; other texts, as of Drake, become one line.
-        text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
-        print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
-        if as_json:
-            print(json.dumps({"error": text}))
-        return 1
+        is_listed = isinstance(error, ScenarioError)
+        text = str(error) if is_listed else " ".join(str(error).split())
+        kind = type(error)
+        return _fail(text, as_json, lambda line: f" [{code_of(line, kind)}]")
     except BrokenPipeError:
         # The reader of the output, such as head, has closed it; Python would report that on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        text = describe_os_error(error)
-        print(f"error: {text}", file=sys.stderr)
-        if as_json:
-            print(json.dumps({"error": text}))
-        return 1
+        return _fail(describe_os_error(error), as_json)
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
-    """The function of a command, imported when it is called: Drake alone takes a second.
+def _fail(text: str, as_json: bool, code: Callable[[str], str] = lambda _: "") -> int:
+    """Prints an error, each line with its code; returns the exit code."""
+    lines = [f"error: {line}{code(line)}" for line in text.splitlines()]
+    print(*lines, sep="\n", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": text}))
+    return 1
 
-    A signal waits meanwhile: Drake's modules would convert it to an ImportError.
+
+def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
+    """Imports the function of a command.
+
+    Signals are deferred meanwhile: Drake's modules would convert their exception to an ImportError.
     """
     with ending_signals(interruption := Interruption()):
         module = _MODULES.get(command, command)
@@ -133,7 +140,7 @@ def _list(as_json: bool) -> int:
 
 @contextmanager
 def _warnings(*ignored: type[Warning]) -> Iterator[None]:
-    """Prints warnings like errors, without the line of code; some are ignored."""
+    """Prints warnings like errors, without the line of code; ignores some categories."""
     with warnings.catch_warnings():
         for category in ignored:
             warnings.simplefilter("ignore", category)

@@ -23,31 +23,25 @@ _FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {
     ExpressionKind.Mul: lambda *factors: reduce(mul, factors),
     ExpressionKind.Div: truediv,
     ExpressionKind.Pow: pow,
-    ExpressionKind.Log: ca.log,
-    ExpressionKind.Exp: ca.exp,
-    ExpressionKind.Sqrt: ca.sqrt,
-    ExpressionKind.Sin: ca.sin,
-    ExpressionKind.Cos: ca.cos,
-    ExpressionKind.Tan: ca.tan,
-    ExpressionKind.Asin: ca.asin,
-    ExpressionKind.Acos: ca.acos,
-    ExpressionKind.Atan: ca.atan,
-    ExpressionKind.Atan2: ca.atan2,
-    ExpressionKind.Sinh: ca.sinh,
-    ExpressionKind.Cosh: ca.cosh,
-    ExpressionKind.Tanh: ca.tanh,
+    **{
+        getattr(ExpressionKind, name.title()): getattr(ca, name)
+        for name in (
+            *("log", "exp", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+            *("sinh", "cosh", "tanh"),
+        )
+    },
 }
 
-
-_DISCONTINUOUS: dict[ExpressionKind, Callable[..., ca.SX]] = {
-    ExpressionKind.Abs: ca.fabs,
-    ExpressionKind.Min: ca.fmin,
-    ExpressionKind.Max: ca.fmax,
-    ExpressionKind.Ceil: ca.ceil,
-    ExpressionKind.Floor: ca.floor,
-    ExpressionKind.IfThenElse: ca.if_else,
+_NOT_SMOOTH: dict[ExpressionKind, tuple[str, Callable[..., ca.SX]]] = {
+    ExpressionKind.Abs: ("abs", ca.fabs),
+    ExpressionKind.Min: ("min", ca.fmin),
+    ExpressionKind.Max: ("max", ca.fmax),
+    ExpressionKind.Ceil: ("ceil", ca.ceil),
+    ExpressionKind.Floor: ("floor", ca.floor),
+    ExpressionKind.IfThenElse: ("if_then_else", ca.if_else),
 }
-"""Functions without derivatives everywhere, which can be evaluated nevertheless."""
+"""Functions without derivatives everywhere, which can be evaluated nevertheless; with their
+names."""
 
 _RELATIONS: dict[FormulaKind, Callable[..., ca.SX]] = {
     FormulaKind.True_: lambda: ca.SX(1),
@@ -66,16 +60,6 @@ _RELATIONS: dict[FormulaKind, Callable[..., ca.SX]] = {
 _CONTINUOUS = Variable.Type.CONTINUOUS
 
 
-_NOT_SMOOTH = {
-    ExpressionKind.Abs: "abs",
-    ExpressionKind.Min: "min",
-    ExpressionKind.Max: "max",
-    ExpressionKind.Ceil: "ceil",
-    ExpressionKind.Floor: "floor",
-    ExpressionKind.IfThenElse: "if_then_else",
-}
-
-
 @checked(ModelError)
 def from_symbolic(
     state: Sequence[Variable],
@@ -89,7 +73,7 @@ def from_symbolic(
     parameters: Mapping[Variable, float] | None = None,
     **labels: Any,
 ) -> DaeSystem:
-    """A system (1)-(3) whose functions are expressions of `pydrake.symbolic`.
+    """Builds a system (1)-(3) from expressions of `pydrake.symbolic`.
 
     These share no subexpressions, so repeated subexpressions are translated repeatedly.
 
@@ -147,7 +131,7 @@ def from_symbolic(
 
 
 def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True) -> ca.SX:
-    """A scalar expression of `pydrake.symbolic`, or a number, as a CasADi expression.
+    """Converts a scalar expression of `pydrake.symbolic`, or a number, to CasADi.
 
     Args:
         expression: The expression, or a Formula in it.
@@ -171,13 +155,14 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True
             f"it is no expression of pydrake.symbolic, but {type(expression).__name__}"
         )
     kind = expression.get_kind()
-    if smooth and kind in _NOT_SMOOTH:
+    name, function = _NOT_SMOOTH.get(kind, ("", None))
+    if smooth and name:
         raise ModelError(
-            f"{_NOT_SMOOTH[kind]} has no derivatives everywhere, and the theory differentiates; "
-            "use a smooth function instead"
+            f"{name} has no derivatives everywhere, and the theory differentiates; use a smooth "
+            "function instead"
         )
-    known = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _DISCONTINUOUS
-    if kind not in known:
+    function = function or (_RELATIONS if isinstance(expression, Formula) else _FUNCTIONS).get(kind)
+    if function is None:
         raise ModelError(f"nothing is known of the function {expression}")
     _, parts = expression.Unapply()
-    return known[kind](*[to_casadi(part, symbols, smooth) for part in parts])
+    return function(*[to_casadi(part, symbols, smooth) for part in parts])

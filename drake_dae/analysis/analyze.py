@@ -46,7 +46,7 @@ STATEMENTS = (
     "u acts on z_i first in derivative mu_i",
     "B(x) has rank p, so u can control all outputs",
 )
-"""What Assumptions (1) to (5) ask for, in a line each."""
+"""Assumptions (1) to (5), in a line each."""
 
 
 @checked(ModelError)
@@ -62,7 +62,7 @@ def analyze(
     count: int = 50,
     seed: int = 0,
 ) -> Analysis:
-    """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, and the way along a reference.
+    """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
     Numbers are decided at consistent states with the default parameters: at those given, or at
     random ones in a region or around `system.nominal_state`. Degrees must be the same for all
@@ -80,7 +80,7 @@ def analyze(
         system: The system (1)-(3).
         region: State name -> (lowest, highest); other states are drawn around the nominal one.
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
-            few others close to the first: what is zero at one state alone is not zero.
+            few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
             the motion that it commands, and the zero dynamics judged at its first outputs and
             along the motion.
@@ -119,13 +119,13 @@ def analyze(
         if states is None
         else ExaminedStates.given(system, states, random)
     )
-    given = chosen.guesses[: chosen.num_given]
+    given_states = chosen.guesses[: chosen.num_given]
     try:
         check_system(system)
         constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
     except AssumptionError as error:
         where = chosen.describe(len(chosen.guesses), "state")
-        tried = given if states is not None else chosen.guesses
+        tried = given_states if states is not None else chosen.guesses
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
     except InconsistentStateError as error:
         if region is None:
@@ -138,8 +138,8 @@ def analyze(
     samples = around
     if states is not None:
         # Degrees are decided also at states around them, margins only at them.
-        samples = Samples(around.manifold, given)
-        check_consistent(samples.manifold, given, samples.states)
+        samples = Samples(around.manifold, given_states)
+        check_consistent(samples.manifold, given_states, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
     analysis = _examine(constrained, around, samples, where, search=states is None)
     analysis = replace(analysis, region=chosen.region)
@@ -188,23 +188,23 @@ def _equilibria(
     states: FloatArray,
     outputs: FloatArray | None,
 ) -> tuple[Stability, ...]:
-    """All equilibria with the outputs of the one that was judged, that one first."""
+    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
     if not dynamics.dimension:
         return ()
     if stability.state is not None:
         states = np.vstack([stability.state, states])
-    found = dynamics.equilibria(states, outputs=outputs)
-    known = () if stability.state is None else (stability,)
-    others = found[len(known) :]
-    return (*known, *(dynamics.stability(state, outputs=outputs) for state in others))
+    equilibria = dynamics.equilibria(states, outputs=outputs)
+    first = () if stability.state is None else (stability,)
+    others = equilibria[len(first) :]
+    return (*first, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _examine(
     constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
 ) -> Analysis:
-    """All but the zero dynamics and the reference: degrees at some samples, margins at others."""
+    """Examines degrees at some samples and margins at others, without zero dynamics."""
     system, elimination = samples.system, constrained.elimination
-    known: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
+    results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, RankMargin] = {}
     violations: list[Violation] = []
     satisfied, regular = {1, 2, 3}, True
@@ -222,10 +222,10 @@ def _examine(
         judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
-        known["constraint_structure"] = constrained
+        results["constraint_structure"] = constrained
         if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
-            known["contact_margin"] = margins_of_contacts.over(samples, search)
+            results["contact_margin"] = margins_of_contacts.over(samples, search)
     without_law = why_no_law(system)
     if regular and not without_law:
         try:
@@ -238,14 +238,14 @@ def _examine(
             margin = find_margin(samples, matrix, structure.round_off, search)
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
-            known |= {
+            results |= {
                 "output_degrees": structure.output_degrees,
                 "independence": _independence(structure, samples),
             }
             if is_regular(samples, matrix, structure.round_off):
-                known["structure"] = structure
+                results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
-    return Analysis(system, where, samples.states, assumptions, **known)
+    return Analysis(system, where, samples.states, assumptions, **results)
 
 
 def _assumptions(
@@ -254,7 +254,7 @@ def _assumptions(
     margins: Mapping[int, RankMargin] | None = None,
     not_examined: str = "",
 ) -> tuple[Assumption, ...]:
-    """Assumptions (1)-(5); one that is neither satisfied nor violated was not examined."""
+    """Returns Assumptions (1)-(5); those neither satisfied nor violated were not examined."""
     violated = {violation.assumption: violation for violation in violations}
     before = f"Assumption ({violations[0].assumption}) is violated" if violations else not_examined
     result = []
@@ -266,13 +266,13 @@ def _assumptions(
         else:
             finding, reason = Finding.NOT_EXAMINED, before
         margin = (margins or {}).get(number)
-        found = violated.get(number)
-        result.append(Assumption(number, statement, finding, margin, reason, found))
+        violation = violated.get(number)
+        result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
 
 
 def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
-    """The margin of the row vectors of Theorem 2.1."""
+    """Returns the margin of the row vectors of Theorem 2.1."""
     functions = ca.vertcat(structure.manifold.residual_expression, structure.chain)
     if not functions.numel():
         return None

@@ -11,7 +11,7 @@ from drake_dae.dae.states.contact_margin import ContactMargin
 
 
 def contact_margin_in_words(findings: Findings, where: str, margin: ContactMargin) -> str:
-    """The share of A(x) that remains with friction, and the critical coefficients."""
+    """Returns a sentence on the fraction of A(x) left by friction, and critical coefficients."""
     critical = ", ".join(f"{name} {value:.4g}" for name, value in margin.critical_friction.items())
     if not np.all(np.isfinite([*margin.critical_friction.values()])):
         return f"Friction: {where} no coefficient leads to the Painleve paradox."
@@ -29,7 +29,7 @@ def contact_margin_in_words(findings: Findings, where: str, margin: ContactMargi
 
 
 def contact_margin_as_dict(margin: ContactMargin | None) -> dict[str, Any] | None:
-    """The margin as plain numbers; a coefficient without a critical value is None."""
+    """Returns the margin as plain numbers; a coefficient without a critical value is None."""
     if margin is None:
         return None
     return {

@@ -27,8 +27,8 @@ class ExaminedStates:
     Attributes:
         guesses: States near which consistent ones are sought, shape (count, n).
         num_given: How many of them, the first ones, were given as they are; 0 if they were drawn.
-        bounds: The region that was asked for; empty if none was.
-        region: The same region as a box; None if none was asked for.
+        bounds: The requested region; empty if there is none.
+        region: The same region as a box; None without one.
     """
 
     guesses: FloatArray
@@ -40,7 +40,7 @@ class ExaminedStates:
     def drawn(
         cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
     ) -> "ExaminedStates":
-        """The nominal state first, then random ones, in a region or around the nominal one.
+        """Draws random states in a region or around the nominal state, which comes first.
 
         Raises:
             ModelError: A name is not that of a state, or an interval is not two finite ordered
@@ -61,54 +61,54 @@ class ExaminedStates:
     def given(
         cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
     ) -> "ExaminedStates":
-        """The given states, and a few close to the first: what is zero at one alone is not zero.
+        """Returns the states of the user and a few close to the first one.
 
         Raises:
             ModelError: The states are not finite numbers of shape (k, n).
         """
-        given = numbers(f"{system.name}: states", states)
-        shape = (len(given) if given.ndim else 0, system.num_states)
-        if given.shape != shape or not given.size or not np.all(np.isfinite(given)):
+        rows = numbers(f"{system.name}: states", states)
+        shape = (len(rows) if rows.ndim else 0, system.num_states)
+        if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
             raise ModelError(
                 f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
                 f"got {states!r}"
             )
-        around = system.usual_spread(given[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
-        return cls(np.vstack([given, given[0] + 0.1 * around]), len(given), {}, None)
+        around = system.usual_spread(rows[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
+        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
 
-    def describe(self, kept: int, noun: str) -> str:
-        """Which states were examined, in words.
+    def describe(self, count: int, noun: str) -> str:
+        """Returns a text that says which states were examined.
 
         Args:
-            kept: How many of the drawn ones were inside the domain and on N*.
+            count: How many of the drawn ones were inside the domain and on N*.
             noun: What they are called.
         """
         if self.num_given:
             return f"{count_of(self.num_given, noun)} as given"
-        place = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
-        left_out = len(self.guesses) - kept
+        region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
+        left_out = len(self.guesses) - count
         missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
-        return f"{count_of(kept, noun)} {place}{missing}"
+        return f"{count_of(count, noun)} {region}{missing}"
 
     def describe_region(self) -> str:
-        """The bounds as "x in [0, 1], ..."."""
+        """Returns the bounds as "x in [0, 1], ..."."""
         return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
 
 
-def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -> None:
-    """Refuses given states that are not consistent, or that are outside the domain.
+def check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
+    """Checks that the user's states are consistent and inside the domain of the system.
 
     Args:
         manifold: N*.
-        given: The given states, shape (k, n).
-        taken: Those of them that are consistent and inside the domain, shape (l, n).
+        states: The given states, shape (k, n).
+        projected: Those of them that are consistent and inside the domain, shape (l, n).
 
     Raises:
         InconsistentStateError: A state is not consistent; the message says which, and why.
         ModelError: A state is outside the domain.
     """
     name = manifold.system.name
-    for number, state in enumerate(given):
+    for number, state in enumerate(states):
         if not manifold.is_consistent(state):
             residual = manifold.residual(state)
             worst = int(np.argmax(np.abs(residual)))
@@ -118,8 +118,8 @@ def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -
                 "example with `find_structure(system).manifold.project`",
                 residual,
             )
-        near = 1e-4 * np.maximum(np.abs(state), np.abs(taken).max(axis=0))
-        if not np.any(np.all(np.abs(taken - state) <= near, axis=1)):
+        near = 1e-4 * np.maximum(np.abs(state), np.abs(projected).max(axis=0))
+        if not np.any(np.all(np.abs(projected - state) <= near, axis=1)):
             raise ModelError(
                 f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
                 "finite there"

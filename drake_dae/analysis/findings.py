@@ -19,7 +19,7 @@ from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
 
 class Finding(StrEnum):
-    """The verdict on an assumption."""
+    """The verdicts on an assumption."""
 
     SATISFIED = "satisfied"
     VIOLATED = "violated"
@@ -30,11 +30,11 @@ class Finding(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """One of Assumptions (1)-(5) and the verdict on it.
+    """One of Assumptions (1)-(5), with the verdict on it.
 
     Attributes:
         number: Its number in the paper.
-        statement: What it asks for.
+        statement: What it requires.
         finding: Whether it holds at the examined states and between them.
         margin: The margin of A(x) for (2), and of B(x) for (5); for (1) and (4) where a row of
             these vanishes; else None.
@@ -56,19 +56,19 @@ OF_VERDICT = {
     Verdict.UNSTABLE: Finding.VIOLATED,
     Verdict.UNDECIDED: Finding.UNDECIDED,
 }
-"""The verdict on Assumption 2.2, which asks for bounded states, from that on the zero dynamics."""
+"""The verdict on Assumption 2.2, which requires bounded states, from that on the zero dynamics."""
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the theory says about one system, as values.
+    """The statements of the theory on one system, as values.
 
     Values that are not known, since an assumption is violated, are None.
 
     Attributes:
         system: The system.
         where: Which states were examined, in words.
-        region: The region that was asked for; None if none was.
+        region: The requested region; None if there is none.
         states: The states, consistent where the constraints have degrees, shape (samples, n).
         assumptions: Assumptions (1), ..., (5), in this order.
         constraint_degrees: r_1, ..., r_m.
@@ -135,12 +135,12 @@ class Findings:
     @property
     def zero_dynamics_dimension(self) -> int | None:
         """The dimension of xi in (22), n - sum r_i - sum mu_i."""
-        known, degrees = self.manifold_dimension, self.output_degrees
-        return None if known is None or degrees is None else known - sum(degrees)
+        dimension, degrees = self.manifold_dimension, self.output_degrees
+        return None if dimension is None or degrees is None else dimension - sum(degrees)
 
     @property
     def decisive(self) -> Stability | StabilityAlong | None:
-        """What decides Assumption 2.2: the verdict along the reference, otherwise that at rest.
+        """The verdict that decides Assumption 2.2: along the reference, otherwise at rest.
 
         If the reference is not periodic, an unstable equilibrium decides as well, since the
         reference ends.
@@ -154,33 +154,33 @@ class Findings:
 
     @property
     def unstable_inside(self) -> tuple[Stability, ...]:
-        """Further unstable equilibria inside the given region."""
+        """Other unstable equilibria inside the requested region."""
         if self.region is None:
             return ()
         return tuple(
-            one
-            for one in self.equilibria
-            if one.verdict is Verdict.UNSTABLE
-            and one is not self.decisive
-            and one.state is not None
-            and self.region.holds(one.state)
+            equilibrium
+            for equilibrium in self.equilibria
+            if equilibrium.verdict is Verdict.UNSTABLE
+            and equilibrium is not self.decisive
+            and equilibrium.state is not None
+            and self.region.holds(equilibrium.state)
         )
 
     @property
     def zero_dynamics_finding(self) -> Finding:
-        """The verdict on Assumption 2.2: the decisive one, or a violation inside the region."""
+        """The verdict on Assumption 2.2; violated if an equilibrium in the region is unstable."""
         if self.unstable_inside:
             return Finding.VIOLATED
         return Finding.NOT_EXAMINED if self.decisive is None else OF_VERDICT[self.decisive.verdict]
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The violations, one text each; empty if there are none."""
-        found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
+        """One text for each violation; empty if there are none."""
+        sentences = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
         # Where an assumption is violated, the theorem adds nothing.
-        if not found and self.independence is not None and self.independence.is_singular:
+        if not sentences and self.independence is not None and self.independence.is_singular:
             place = named_values(self.system.state_signals, self.independence.state)
-            found.append(
+            sentences.append(
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {place}"
             )
@@ -189,7 +189,7 @@ class Findings:
         if contact is not None and contact.is_paradoxical:
             when = "" if contact.time is None else f"t = {contact.time:.6g} s, "
             critical = ", ".join(f"{k} = {v:.4g}" for k, v in contact.critical_friction.items())
-            found.append(
+            sentences.append(
                 "Friction: the Painleve paradox occurs at "
                 f"{when}{named_values(self.system.state_signals, contact.state)}: a principal "
                 f"minor of A(x) is {contact.reserve:.3g} of what it is without friction, and "
@@ -199,11 +199,13 @@ class Findings:
         decisive = self.decisive
         if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
             place = "along the reference " if decisive is self.zero_dynamics_along else ""
-            found.append(f"Assumption 2.2: {place}{decisive.reason}")
-        for one in self.unstable_inside:
-            if one.state is not None:
-                place = named_values(self.system.state_signals, one.state)
-                found.append(f"Assumption 2.2: inside the region, at rest at {place}: {one.reason}")
+            sentences.append(f"Assumption 2.2: {place}{decisive.reason}")
+        for equilibrium in self.unstable_inside:
+            if equilibrium.state is not None:
+                place = named_values(self.system.state_signals, equilibrium.state)
+                sentences.append(
+                    f"Assumption 2.2: inside the region, at rest at {place}: {equilibrium.reason}"
+                )
         if self.motion is not None and self.motion.ending is not None:
-            found.append(str(self.motion.ending))
-        return tuple(found)
+            sentences.append(str(self.motion.ending))
+        return tuple(sentences)

@@ -11,14 +11,14 @@ from drake_dae.analysis.findings import Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.structure.structure import why_no_law
+from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
+from drake_dae.dae.zero_dynamics.stability import ComplexArray, Stability, Verdict
 
 
 def as_dict(findings: Findings) -> dict[str, Any]:
-    """The printed results as plain numbers, lists and texts, with the states of the margins."""
+    """Returns the findings as plain numbers, lists and texts."""
     system = findings.system
     zero, motion = findings.zero_dynamics, findings.motion
     along = findings.zero_dynamics_along
@@ -57,22 +57,8 @@ def as_dict(findings: Findings) -> dict[str, Any]:
             for a in findings.assumptions
         ],
         "independence": _margin(findings.independence),
-        "zero_dynamics": None
-        if zero is None
-        else {
-            "verdict": str(zero.verdict),
-            "eigenvalues": _pairs(zero.eigenvalues),
-            "state": None if zero.state is None else zero.state.tolist(),
-            "reason": zero.reason,
-        },
-        "equilibria": [
-            {
-                "verdict": str(one.verdict),
-                "eigenvalues": _pairs(one.eigenvalues),
-                "state": None if one.state is None else one.state.tolist(),
-            }
-            for one in findings.equilibria
-        ],
+        "zero_dynamics": None if zero is None else {**_stability(zero), "reason": zero.reason},
+        "equilibria": [_stability(equilibrium) for equilibrium in findings.equilibria],
         "zero_dynamics_along": None
         if along is None
         else {
@@ -90,7 +76,7 @@ def as_dict(findings: Findings) -> dict[str, Any]:
 
 
 def parts_of(findings: Findings) -> list[Part]:
-    """The paragraphs and tables of the findings, without the problems."""
+    """Returns the paragraphs and tables of the report, without the problems."""
     system = findings.system
     counts = (
         count_of(system.num_states, "state"),
@@ -127,7 +113,7 @@ def parts_of(findings: Findings) -> list[Part]:
     dimensions = f"index {index}, N* of dimension {manifold}"
     parts.append([f"{dimensions}, zero dynamics of dimension {zero}" if rows else dimensions])
     if system.sharing is not None:
-        parts.append([_shared(system)])
+        parts.append([_shared(system.sharing)])
     parts.append(_findings(findings))
     margins = [a.margin for a in findings.assumptions if a.margin] + [findings.independence]
     if any(margins):
@@ -143,11 +129,8 @@ def parts_of(findings: Findings) -> list[Part]:
     return parts
 
 
-def _shared(system: DaeSystem) -> str:
+def _shared(sharing: ForceSharing) -> str:
     """Which redundant constraints were left out, and which forces are not determined."""
-    sharing = system.sharing
-    if sharing is None:
-        return ""
     gone = ", ".join(f"'{signal.name}'" for signal in sharing.left_out_signals)
     forces = ", ".join(sharing.undetermined)
     return (
@@ -218,10 +201,11 @@ def _places(findings: Findings) -> list[Part]:
     if zero is not None and findings.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:
         lines.append(f"Zero dynamics {zero.verdict}: {zero.reason}.")
     if len(findings.equilibria) > 1:
+        signals = findings.system.state_signals
         lines += [
-            f"At rest at {named_values(findings.system.state_signals, one.state)}: {one.verdict}."
-            for one in findings.equilibria
-            if one.state is not None
+            f"At rest at {named_values(signals, equilibrium.state)}: {equilibrium.verdict}."
+            for equilibrium in findings.equilibria
+            if equilibrium.state is not None
         ]
     along = findings.zero_dynamics_along
     if along is not None:
@@ -273,12 +257,12 @@ def _along(motion: PinnedMotion) -> Table:
 
 def _worst(motion: PinnedMotion) -> dict[str, tuple[float, float]]:
     """The smallest margins of A(x) and B(x), and when."""
-    found = {}
+    margins_and_times = {}
     for letter, margins in (("A", motion.constraint_margins), ("B", motion.control_margins)):
         if margins.size and np.all(np.isfinite(margins)):
             worst = int(np.argmin(margins))
-            found[f"{letter}(x)"] = (float(margins[worst]), float(motion.times[worst]))
-    return found
+            margins_and_times[f"{letter}(x)"] = (float(margins[worst]), float(motion.times[worst]))
+    return margins_and_times
 
 
 def _complex(values: ComplexArray) -> str:
@@ -292,6 +276,14 @@ def _complex(values: ComplexArray) -> str:
         elif value.imag == 0.0:
             texts.append(f"{real:.4g}")
     return ", ".join(texts)
+
+
+def _stability(stability: Stability) -> dict[str, Any]:
+    return {
+        "verdict": str(stability.verdict),
+        "eigenvalues": _pairs(stability.eigenvalues),
+        "state": None if stability.state is None else stability.state.tolist(),
+    }
 
 
 def _pairs(values: ComplexArray) -> list[list[float]]:

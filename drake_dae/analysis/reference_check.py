@@ -17,7 +17,7 @@ def check_reference(
     reference: Callable[[float], FloatArray],
     times: ArrayLike,
 ) -> None:
-    """Refuses a reference whose derivatives are not those of its values.
+    """Checks that each entry of a reference is the derivative of the entry before it.
 
     They are compared with central differences of two step sizes. Where these disagree, as at a kink
     of the highest derivative, nothing is checked.
@@ -34,15 +34,15 @@ def check_reference(
     grid = numbers(f"{system.name}: times", times).reshape(-1)
 
     def value(time: float) -> FloatArray:
-        given = reference(time)
-        found = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
-        if found is None or found.size != layout.reference_size:
+        result = reference(time)
+        values = None if result is None else numbers(f"{system.name}: reference({time:g})", result)
+        if values is None or values.size != layout.reference_size:
             raise ModelError(
                 f"{system.name}: the reference must have size {layout.reference_size} (each output "
                 f"and its derivatives up to its degree {layout.degrees}), got "
-                f"{'None' if found is None else found.size}"
+                f"{'None' if values is None else values.size}"
             )
-        return found.reshape(-1)
+        return values.reshape(-1)
 
     if not grid.size or not np.all(np.isfinite(grid)):
         return
@@ -59,16 +59,16 @@ def check_reference(
     )
     signals = layout.reference_signals(system.output_signals)
     for i in map(int, layout.chained):
-        stated, found = values[:, i + 1], slopes[:, i]
-        scale = max(np.abs(stated).max(), np.abs(found).max())
+        stated, numeric = values[:, i + 1], slopes[:, i]
+        scale = max(np.abs(stated).max(), np.abs(numeric).max())
         round_off = 1e-13 * np.abs(values[:, i]).max() / step
-        unsure = 4.0 * np.abs(found - coarse[:, i])
-        excess = np.abs(stated - found) - 1e-3 * scale - round_off - unsure
+        unsure = 4.0 * np.abs(numeric - coarse[:, i])
+        excess = np.abs(stated - numeric) - 1e-3 * scale - round_off - unsure
         worst = int(np.argmax(excess))
         if excess[worst] > 0.0:
             raise ModelError(
                 f"{system.name}: the reference contradicts itself: its {signals[i + 1].name} = "
                 f"{stated[worst]:.4g} at t = {tried[worst]:.4g} s, but {signals[i].name} "
-                f"changes by {found[worst]:.4g} per second. Give the derivatives of r, output by "
+                f"changes by {numeric[worst]:.4g} per second. Give the derivatives of r, output by "
                 "output: r_1, r_1', ..., r_2, ..."
             )

@@ -13,27 +13,27 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Analysis(Findings):
-    """What the theory says about one system; made by `analyze`, printed by `print`."""
+    """The report of `analyze` on one system; `print` shows it as text."""
 
     def __repr__(self) -> str:
-        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
-        return f"Analysis('{self.system.name}': {found})"
+        problems = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Analysis('{self.system.name}': {problems})"
 
     def __str__(self) -> str:
         return to_text([*self.parts(), *([problem] for problem in self.problems)])
 
     def to_markdown(self) -> str:
-        """The report with Markdown tables."""
+        """Returns the report with Markdown tables."""
         return to_markdown([*self.parts(), *([problem] for problem in self.problems)])
 
     def _repr_markdown_(self) -> str:
-        """The display in notebooks."""
+        """Returns the text that notebooks display."""
         return self.to_markdown()
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as plain numbers, lists and texts, with the states of the margins."""
+        """Returns the report as plain numbers, lists and texts."""
         return as_dict(self)
 
     def parts(self) -> list[Part]:
-        """The report's paragraphs and tables, without the problems."""
+        """Returns the paragraphs and tables of the report, without the problems."""
         return parts_of(self)

@@ -13,7 +13,7 @@ _WIDTH = 100
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of text, the first `left` ones and those without a head left-aligned.
+    """A table of texts. The first `left` columns and those without a head are left-aligned.
 
     Attributes:
         head: A title per column.
@@ -29,7 +29,7 @@ class Table:
         return column < self.left or not self.head[column]
 
     def lines(self) -> list[str]:
-        """The lines of the table, with columns as wide as they must be."""
+        """Returns the lines of the table; columns are as wide as necessary."""
         rows = [self.head, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
         return [
@@ -44,14 +44,14 @@ class Table:
         return "\n".join(self.lines())
 
     def to_markdown(self) -> str:
-        """The table in Markdown, for notebooks and GitHub."""
+        """Returns the table in Markdown, for notebooks and GitHub."""
         marks = [":--" if self._is_left(i) else "--:" for i in range(len(self.head))]
         rows = [self.head, marks, *self.rows]
         return "\n".join("| " + " | ".join(t.replace("|", "\\|") for t in r) + " |" for r in rows)
 
 
 def digits(value: float) -> str:
-    """A number with four digits; round-off is 0."""
+    """Formats a number with four digits; round-off is 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
 
 
@@ -60,7 +60,7 @@ Part = Table | Sequence[str]
 
 
 def to_text(parts: Sequence[Part]) -> str:
-    """The parts below each other as plain text; long lines of paragraphs are wrapped."""
+    """Joins parts to plain text; long lines of paragraphs are wrapped."""
 
     def text(part: Part) -> str:
         if isinstance(part, Table):
@@ -73,21 +73,21 @@ def to_text(parts: Sequence[Part]) -> str:
 
 
 def to_markdown(parts: Sequence[Part]) -> str:
-    """The parts below each other in Markdown."""
+    """Joins parts to Markdown."""
     return "\n\n".join(
         part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
     )
 
 
 def count_of(number: int, noun: str) -> str:
-    """A number with its noun, as in "1 state" and "2 states"."""
+    """Formats a number with its noun, as in "1 state" and "2 states"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def named_values(
     signals: Sequence[Signal], values: FloatArray, chosen: Sequence[bool] | None = None
 ) -> str:
-    """Values, all or chosen ones, as "name=value unit, ..."."""
+    """Formats values, all or selected ones, as "name=value unit, ..."."""
     return ", ".join(
         f"{signal.name}={digits(value)} {signal.unit}".rstrip()
         for i, (signal, value) in enumerate(zip(signals, values, strict=True))

@@ -11,9 +11,9 @@ from drake_dae.scenario.shipped import find_scenario
 def run_command(options: argparse.Namespace) -> int:
     """Prints the report on the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
-    found = find_feasibility(load_scenario(path, options.settings))
+    report = find_feasibility(load_scenario(path, options.settings))
     if options.json:
-        print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
+        print(json.dumps({"scenario": path.stem, **report.to_dict()}, indent=2))
     else:
-        print(f"{path.stem}\n\n{found}")
-    return 2 if found.problems else 0
+        print(f"{path.stem}\n\n{report}")
+    return 2 if report.problems else 0

@@ -71,7 +71,7 @@ def _write_fmu(
 
 
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
-    """The parts of the scenario that are not in the exported functions; none if the loop is."""
+    """The parts of the scenario that the exported functions lack; none if the loop is exported."""
     if parts_of(loop).compiled is not None:
         return []
     closed = "the functions have the plant with all contacts closed"
@@ -84,4 +84,4 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
 
 
 WRITERS = {"c": _write_c, "wasm": _write_wasm, "fmu": _write_fmu}
-"""Format -> what writes it."""
+"""Format -> the function that writes it."""

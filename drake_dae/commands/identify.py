@@ -27,7 +27,7 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _identify(options: argparse.Namespace) -> int:
-    """Identifies parameters."""
+    """Identifies parameters from records; returns the exit code."""
     # SciPy's splines take a fifth of a second to load.
     from drake_dae.studies.identification.of_scenario import identify_scenario, recorded_scenario
 
@@ -41,18 +41,18 @@ def _identify(options: argparse.Namespace) -> int:
         scenario = recorded_scenario(records)
     else:
         scenario = load_scenario(find_scenario(options.scenario), options.settings)
-    found, identified = identify_scenario(scenario, records, _listed(options.free))
-    _tell(found, identified, options)
+    result, identified = identify_scenario(scenario, records, _listed(options.free))
+    _report(result, identified, options)
     return 0
 
 
 def _excite(options: argparse.Namespace) -> int:
-    """Finds a motion and a force; returns the exit code, after a signal that of this."""
+    """Finds the best motion and force; returns the exit code."""
     # It loads SciPy's optimizers.
     from drake_dae.studies.excitation.excite import excite
 
     scenario = load_scenario(find_scenario(options.scenario), options.settings)
-    found = excite(
+    result = excite(
         scenario,
         parse_ranges(options.vary, scenario),
         _listed(options.free),
@@ -62,12 +62,12 @@ def _excite(options: argparse.Namespace) -> int:
         seed=options.seed,
         progress=True,
     )
-    _tell(found, found.scenario, options)
-    return 0 if found.interrupted is None else 128 + found.interrupted
+    _report(result, result.scenario, options)
+    return 0 if result.interrupted is None else 128 + result.interrupted
 
 
-def _tell(
-    found: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
+def _report(
+    result: "Identified | Excitation", scenario: Scenario, options: argparse.Namespace
 ) -> None:
     """Writes the scenario and prints the result."""
     path: Path | None = options.out
@@ -75,36 +75,36 @@ def _tell(
         with stage(path.parent, path.name) as place:
             save_scenario(scenario, place / path.name, MARK)
     if options.json:
-        print(json.dumps(found.to_dict(), indent=2))
+        print(json.dumps(result.to_dict(), indent=2))
         return
-    print(found.text())
+    print(result.text())
     if path is not None:
         print(f"the scenario with these values is written to {path}")
 
 
 def _listed(texts: list[str]) -> list[str]:
-    """Names that commas separate."""
+    """Splits texts at commas."""
     return [name for text in texts for name in text.split(",") if name]
 
 
 def _noise(texts: list[str]) -> dict[str, float]:
-    """The deviations of sensors.
+    """Kind of sensor -> the deviation of its noise, from options such as "position=1e-5".
 
     Raises:
         ModelError: An option is no name with a number.
     """
-    found = dict[str, float]()
+    deviations = dict[str, float]()
     for text in _listed(texts):
         name, _, number = text.partition("=")
         value = number_in(number)
         if value is None:
             raise ModelError(f"--noise takes position=1e-5,force=0.3, got '{text}'")
-        found[name] = value
-    return found
+        deviations[name] = value
+    return deviations
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:
-    """The record of a run, or a log in CSV or MCAP."""
+    """Reads the record of a run, or a log in CSV or MCAP."""
     if path.suffix == ".csv":
         return Record.from_csv(path, columns)
     if path.suffix == ".mcap":
@@ -115,17 +115,17 @@ def _load(path: Path, columns: dict[str, str] | None) -> Record:
 
 
 def _columns(path: Path) -> dict[str, str]:
-    """The names of columns from a YAML file.
+    """Reads the names of columns from a YAML file.
 
     Raises:
         ModelError: The file cannot be read, or is no mapping of names to names.
     """
     try:
-        found = load_yaml(read_text(path, 10**6), str(path))
+        data = load_yaml(read_text(path, 10**6), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ModelError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
-    if not isinstance(found, dict) or not all(isinstance(v, str) for v in found.values()):
+    if not isinstance(data, dict) or not all(isinstance(v, str) for v in data.values()):
         raise ModelError(
             f"{path} must name columns line by line, such as 'tau1: control.joint1_motor'"
         )
-    return {str(name): meant for name, meant in found.items()}
+    return {str(name): target for name, target in data.items()}

@@ -1,9 +1,11 @@
-"""`drake-dae print`, `keys`, `schema` and `cache`: a scenario, the keys of all, machine code."""
+"""`drake-dae print`, `keys`, `schema`, `explain`, `cache`: scenarios, errors, machine code."""
 
 import argparse
 import json
 
+from drake_dae.arrays import unknown_name
 from drake_dae.errors import MachineCodeError, ScenarioError
+from drake_dae.scenario.manual.remedies import remedies, remedy_section
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiler import find_compiler
@@ -17,6 +19,9 @@ def run_command(options: argparse.Namespace) -> int:
     if options.command == "cache":
         _cache(options.clear)
         return 0
+    if options.command == "explain":
+        print(_explained(options.code))
+        return 0
     # The keys take most of a second to load.
     from drake_dae.scenario.manual.page import keys_page
     from drake_dae.scenario.manual.schema import editor_schema
@@ -26,7 +31,7 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _scenario(options: argparse.Namespace) -> str:
-    """The file of the scenario that the options name, or its path.
+    """The text of the scenario that the options name, or its path.
 
     Raises:
         ScenarioError: The file cannot be read.
@@ -40,8 +45,21 @@ def _scenario(options: argparse.Namespace) -> str:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
 
 
+def _explained(code: str) -> str:
+    """What to do about the errors of a code; all codes with their titles if it is empty.
+
+    Raises:
+        ScenarioError: There is no such code.
+    """
+    if not code:
+        return "\n".join(f"{code}  {remedy.title}" for code, remedy in remedies().items())
+    if code.upper() not in remedies():
+        raise ScenarioError(("", unknown_name("code", code, remedies())))
+    return remedy_section(code.upper())
+
+
 def _cache(is_cleared: bool) -> None:
-    """Shows the machine code in the cache and the compiler, or removes the former."""
+    """Prints the size of the cache of machine code, and the compiler; or empties the cache."""
     files = contents()
     size = sum(path.stat().st_size for path in files if path.is_file())
     what = f"{len(files)} files, {size / 1e6:.1f} MB"

@@ -13,13 +13,12 @@ from drake_dae.scenario.new.new_scenario import new_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Writes the scenario that the options ask for; returns the exit code."""
+    """Writes a scenario for the robot that the options name; returns the exit code."""
     robot = Path(options.robot)
     out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
     if out.exists():
-        raise ScenarioError(
-            ("--out", (f"'{out}' exists, and is not overwritten; choose another name"))
-        )
+        text = f"'{out}' exists, and is not overwritten; choose another name"
+        raise ScenarioError(("--out", text))
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -32,17 +31,17 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _tip(text: str) -> tuple[str, Vector]:
-    """The frame and the point of "LINK" or "LINK:x,y,z".
+    """The frame and the point in a text "LINK" or "LINK:x,y,z".
 
     Raises:
         ScenarioError: The point is not three numbers.
     """
-    found = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
-    if found is None:
+    match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
+    if match is None:
         return text, (0.0, 0.0, 0.0)
-    numbers = [number_in(word) for word in found[2].split(",")]
+    numbers = [number_in(word) for word in match[2].split(",")]
     x, y, z = numbers if len(numbers) == 3 else (None, None, None)
     if x is None or y is None or z is None:
-        wanted = "LINK or LINK:x,y,z with three numbers in m"
-        raise ScenarioError(("--tip", f"expected {wanted}, got '{text}'"))
-    return found[1], (x, y, z)
+        form = "LINK or LINK:x,y,z with three numbers in m"
+        raise ScenarioError(("--tip", f"expected {form}, got '{text}'"))
+    return match[1], (x, y, z)

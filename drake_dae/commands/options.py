@@ -7,18 +7,17 @@ from typing import Any
 
 import drake_dae
 from drake_dae.commands.options_of_studies import (
+    CommandParser,
     add_excite,
     add_identify,
-    add_json,
     add_sweep,
-    path_option,
     whole_option,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command and its options.
+    """Parses the command and its options.
 
     Args:
         arguments: Those after the command's name; those of this process if None.
@@ -26,99 +25,103 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     Raises:
         SystemExit: They are invalid, or ask for help or the version.
     """
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="drake-dae",
         description="Robots in contact: position and force tracking on Drake's systems framework.",
     )
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
-    listed = commands.add_parser("list", help="list the shipped scenarios")
-    add_json(listed, "print names and descriptions as JSON")
-    shown = commands.add_parser(
-        "print", help=("print a shipped scenario, as the beginning of your own")
-    )
-    shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
-    shown.add_argument("--path", action="store_true", help="print where its file is instead")
-    commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
-    commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
-    named = argparse.ArgumentParser(add_help=False)
-    named.add_argument(
+    scenario = CommandParser(add_help=False)
+    scenario.add_argument(
         "scenario",
         nargs="?",
         default=DEFAULT_SCENARIO,
         help=f"a shipped scenario or a YAML file (default: {DEFAULT_SCENARIO})",
     )
-    named.add_argument(
-        "--set",
-        dest="settings",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
-    )
-    named.add_argument(
+    scenario.settings('change the scenario, for example "integrator.accuracy=1e-8"')
+    scenario.add_argument(
         "--compiled",
         choices=["true", "false", "auto"],
         help="whether functions become machine code, as the scenario's key `compiled`",
     )
+    _add_texts(commands)
+    _add_simulate(commands, scenario)
+    _add_play(commands)
+    _add_analyze(commands, scenario)
+    add_sweep(commands, scenario)
+    add_identify(commands)
+    add_excite(commands, scenario)
+    _add_new(commands)
+    _add_export(commands, scenario)
+    _add_page(commands, scenario)
+    _add_live(commands, scenario)
+    _add_pictures(commands, scenario)
+    cache = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
+    cache.flag("--clear", "remove it all")
+    options = parser.parse_args(arguments)
+    if options.command == "simulate" and options.rollout and options.meshcat:
+        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
+    return options
+
+
+def _add_texts(commands: Any) -> None:
+    shipped = commands.add_parser("list", help="list the shipped scenarios")
+    shipped.json("print names and descriptions as JSON")
+    shown = commands.add_parser(
+        "print", help="print a shipped scenario, as the beginning of your own"
+    )
+    shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
+    shown.flag("--path", "print where its file is instead")
+    commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
+    commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
+    explain = commands.add_parser("explain", help="print what to do about an error, by its code")
+    explain.add_argument("code", nargs="?", default="", help="as E12 (default: all codes)")
+
+
+def _add_simulate(commands: Any, scenario: CommandParser) -> None:
     run = commands.add_parser(
         "simulate",
-        parents=[named],
+        parents=[scenario],
         help="run a scenario",
-        epilog=(
-            "exit code: 0 if the run came to its end, 1 for an error, also where it ended "
-            "early; with --check 2 if it missed its task (the first line begins with BAD): an "
-            "output is not at its reference, a contact is lost or would have to pull, a link is "
-            "behind a surface, a drive or a joint exceeds its limit; or if errors are not as "
-            "predicted without a reason"
-        ),
+        epilog="exit code: 0 if the run came to its end, 1 for an error, also where it ended "
+        "early; with --check 2 if it missed its task (the first line begins with BAD): an output "
+        "is not at its reference, a contact is lost or would have to pull, a link is behind a "
+        "surface, a drive or a joint exceeds its limit; or if errors are not as predicted without "
+        "a reason",
     )
-    run.add_argument(
-        "--out", type=path_option, help="folder for the results (default: runs/<scenario>-<time>)"
-    )
-    run.add_argument(
-        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
-    )
-    run.add_argument(
+    run.path("--out", "folder for the results (default: runs/<scenario>-<time>)")
+    run.flag("--meshcat", "show the robot while it runs, in a browser")
+    run.flag(
         "--time-optimal",
-        action="store_true",
-        help="follow the references as paths, in the shortest time that the limits of drives and "
-        "joints allow; as the scenario's key `time_optimal`",
+        "follow the references as paths, in the shortest time that the limits of drives and joints "
+        "allow; as the scenario's key `time_optimal`",
     )
-    run.add_argument(
-        "--open", action="store_true", help="open the animation in a browser at the end"
-    )
-    run.add_argument(
+    run.flag("--open", "open the animation in a browser at the end")
+    run.flag(
         "--rollout",
-        action="store_true",
-        help=(
-            "run the whole loop as one function, without Drake's Simulator; faster for many "
-            "runs (see sweep), not for one; the record has every fixed step, or 1000 rows under "
-            "error control, and is written at the end alone"
-        ),
+        "run the whole loop as one function, without Drake's Simulator; faster for many runs (see "
+        "sweep), not for one; the record has every fixed step, or 1000 rows under error control, "
+        "and is written at the end alone",
     )
-    run.add_argument(
-        "--check", action="store_true", help="exit code 2 for a run that missed its task"
-    )
-    add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
-    shown = commands.add_parser(
+    run.flag("--check", "exit code 2 for a run that missed its task")
+    run.json("print the verdict and where the files are as JSON, and all else on stderr")
+
+
+def _add_play(commands: Any) -> None:
+    play = commands.add_parser(
         "play",
         help="play the animation of a run in the browser, or of several beside each other",
         description="Opens the animation of a run in the browser. Of several runs it writes a page "
         "that shows their animations beside each other, at the same time after their starts.",
     )
-    shown.add_argument(
-        "runs", nargs="+", type=path_option, metavar="RUN", help="the folder of a run"
-    )
-    shown.add_argument(
-        "--out",
-        type=path_option,
-        metavar="FILE",
-        help="the page of several runs (default: compare.html)",
-    )
-    examine = commands.add_parser(
+    play.path("runs", "the folder of a run", metavar="RUN", nargs="+")
+    play.path("--out", "the page of several runs (default: compare.html)", metavar="FILE")
+
+
+def _add_analyze(commands: Any, scenario: CommandParser) -> None:
+    analyze = commands.add_parser(
         "analyze",
-        parents=[named],
+        parents=[scenario],
         help="examine a scenario without running it",
         description="Examines the robot of a scenario (relative degrees, index, Assumptions "
         "(1)-(5), zero dynamics) and what its reference takes: the nearest singularity, control "
@@ -127,14 +130,38 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
         "error",
     )
-    add_json(examine, "print JSON")
-    add_sweep(commands, named)
-    add_identify(commands)
-    add_excite(commands, named)
-    _add_new(commands)
-    written = commands.add_parser(
+    analyze.json("print JSON")
+
+
+def _add_new(commands: Any) -> None:
+    new = commands.add_parser(
+        "new",
+        help="write a scenario for a robot of your own",
+        description="Writes a scenario for a robot of which only the file is known: it finds base, "
+        "chain and tip, locks grippers and wheels, places a surface within good reach of the tip, "
+        "and makes the tip circle and press there within the limits. Comments give the reasons.",
+    )
+    new.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
+    new.add_argument(
+        "--surface",
+        choices=["plane", "cylinder", "sphere"],
+        default="plane",
+        help="the surface (default: plane)",
+    )
+    new.add_argument(
+        "--tip",
+        default="",
+        metavar="LINK[:x,y,z]",
+        help="the link or frame in contact, and the contact point in it in m (default: the end of "
+        "the longest chain)",
+    )
+    new.path("--out", "the file (default: <robot>_<surface>.yaml)", metavar="FILE")
+
+
+def _add_export(commands: Any, scenario: CommandParser) -> None:
+    export = commands.add_parser(
         "export",
-        parents=[named],
+        parents=[scenario],
         help="write controller, plant and loop as C99, FMUs or WebAssembly",
         description="c: writes the law, the plant and the projection of a scenario as plain C99 "
         "without dependencies, with sizes, names and units; and of a sampled law the whole "
@@ -144,153 +171,90 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "machine. wasm: writes controller, plant and loop in fixed steps as one WebAssembly "
         "module, and a module of JavaScript that loads it in a page; it needs drake_dae[compiler].",
     )
-    written.add_argument("--format", choices=("c", "fmu", "wasm"), default="c", help="(default: c)")
-    written.add_argument(
-        "--out",
-        type=path_option,
-        help="folder for the files (default: <scenario>_<format>, _c99 for c)",
-    )
-    add_json(written, "print the names of the files as JSON")
-    _add_benches(commands, named)
-    film = commands.add_parser(
-        "render",
-        help="render a run into a GIF, an MP4 or a strip of pictures",
-        description=(
-            "Renders the run in a folder, with the paths and the forces of its contacts. "
-            "It needs no screen and no browser."
-        ),
-    )
-    film.add_argument(
-        "folder", type=path_option, help="the folder of a run, as runs/seven_joint_wall"
-    )
-    film.add_argument(
-        "--out",
-        type=path_option,
-        help="a .gif or .mp4 (by ffmpeg), or a .png for four moments side by side (default: "
-        "film.gif in the folder)",
-    )
-    blocks = commands.add_parser(
-        "diagram",
-        parents=[named],
-        help="draw the blocks of a scenario's loop and their wires",
-        description="Draws the Drake diagram of a scenario: its blocks, and the wires with the "
-        "names of their ports. Graphviz's program `dot` draws it; a .dot is written without it.",
-    )
-    blocks.add_argument(
-        "--out",
-        type=path_option,
-        metavar="FILE",
-        help="a .svg, .png, .pdf or .dot (default: <scenario>.svg)",
-    )
-    drawn = commands.add_parser(
-        "plot",
-        help="draw signals of runs over each other",
-        description="Draws outputs of runs with their references, or other signals by name, with "
-        "the errors as predicted beside those measured, into one picture.",
-    )
-    drawn.add_argument(
-        "runs",
-        nargs="+",
-        type=path_option,
-        metavar="RUN",
-        help="a folder of a run, or a record.npz",
-    )
-    drawn.add_argument(
-        "--signals",
-        action="append",
-        default=[],
-        metavar="NAMES",
-        help="what to draw, as wall.force,control or state/joint1; may be repeated (default: all "
-        "outputs)",
-    )
-    drawn.add_argument(
-        "--errors", action="store_true", help="|z - r| of outputs, over the predicted one"
-    )
-    drawn.add_argument(
-        "--out",
-        type=path_option,
-        default=Path("plot.png"),
-        metavar="FILE",
-        help="a .png, .pdf or .svg (default: plot.png)",
-    )
-    kept = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
-    kept.add_argument("--clear", action="store_true", help="remove it all")
-    options = parser.parse_args(arguments)
-    if options.command == "simulate" and options.rollout and options.meshcat:
-        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
-    return options
+    export.add_argument("--format", choices=("c", "fmu", "wasm"), default="c", help="(default: c)")
+    export.path("--out", "folder for the files (default: <scenario>_<format>, _c99 for c)")
+    export.json("print the names of the files as JSON")
 
 
-def _add_benches(commands: Any, named: argparse.ArgumentParser) -> None:
-    """The commands whose robot is dragged, pushed and steered."""
+def _add_page(commands: Any, scenario: CommandParser) -> None:
     page = commands.add_parser(
         "page",
-        parents=[named],
+        parents=[scenario],
         help="write a scenario as one HTML file in which it runs",
         description="Writes plant, law and references as WebAssembly into one HTML file that needs "
         "neither server nor network: sliders, a target and surfaces that are dragged, links that "
         "are pushed, plots of force and error with the prediction. It needs drake_dae[compiler].",
     )
-    page.add_argument("--out", type=path_option, metavar="FILE", help="(default: <scenario>.html)")
-    page.add_argument(
+    page.path("--out", "(default: <scenario>.html)", metavar="FILE")
+    page.path(
         "--shared-bundle",
-        type=path_option,
+        "where to write the bundle that draws, 2.2 MB, for several pages; without, it is in the "
+        "page",
         metavar="FILE",
-        help="where to write the bundle that draws, 2.2 MB, for several pages; without, it is in "
-        "the page",
     )
-    page.add_argument("--open", action="store_true", help="open the page in a browser")
-    add_json(page, "print the files with their sizes as JSON")
-    bench = commands.add_parser(
+    page.flag("--open", "open the page in a browser")
+    page.json("print the files with their sizes as JSON")
+
+
+def _add_live(commands: Any, scenario: CommandParser) -> None:
+    live = commands.add_parser(
         "live",
-        parents=[named],
+        parents=[scenario],
         help="run a scenario in real time, and change it in a browser meanwhile",
         description="The bench of `page`, run here by Drake's Simulator, for every scenario, also "
         "with Drake's own contact, contacts that open, and tasks. Only this machine reaches it. "
         "Its button save writes the record, the scenario and what was commanded.",
     )
-    bench.add_argument(
+    live.add_argument(
         "--port", type=whole_option, default=0, help="(default: any port that is free)"
     )
-    bench.add_argument("--no-browser", action="store_true", help="print the address alone")
-    bench.add_argument(
+    live.flag("--no-browser", "print the address alone")
+    live.path(
         "--replay",
-        type=path_option,
+        "run what was commanded in a bench again, commands.json, and write its record",
         metavar="FILE",
-        help="run what was commanded in a bench again, commands.json, and write its record",
     )
-    bench.add_argument(
-        "--out", type=path_option, help="folder for what is saved (default: live/<scenario>-<time>)"
-    )
+    live.path("--out", "folder for what is saved (default: live/<scenario>-<time>)")
 
 
-def _add_new(commands: Any) -> None:
-    begin = commands.add_parser(
-        "new",
-        help="write a scenario for a robot of your own",
-        description=(
-            "Writes a scenario for a robot of which only the file is known: it finds "
-            "base, chain and tip, locks grippers and wheels, places a surface within "
-            "good reach of the tip, and makes the tip circle and press there within the "
-            "limits. Comments give the reasons."
-        ),
+def _add_pictures(commands: Any, scenario: CommandParser) -> None:
+    film = commands.add_parser(
+        "render",
+        help="render a run into a GIF, an MP4 or a strip of pictures",
+        description="Renders the run in a folder, with the paths and the forces of its contacts. "
+        "It needs no screen and no browser.",
     )
-    begin.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
-    begin.add_argument(
-        "--surface",
-        choices=["plane", "cylinder", "sphere"],
-        default="plane",
-        help="the surface (default: plane)",
+    film.path("folder", "the folder of a run, as runs/seven_joint_wall")
+    film.path(
+        "--out",
+        "a .gif or .mp4 (by ffmpeg), or a .png for four moments side by side (default: film.gif in "
+        "the folder)",
     )
-    begin.add_argument(
-        "--tip",
-        default="",
-        metavar="LINK[:x,y,z]",
-        help=(
-            "the link or frame in contact, and the contact point in it in m (default: the end "
-            "of the longest chain)"
-        ),
+    blocks = commands.add_parser(
+        "diagram",
+        parents=[scenario],
+        help="draw the blocks of a scenario's loop and their wires",
+        description="Draws the Drake diagram of a scenario: its blocks, and the wires with the "
+        "names of their ports. Graphviz's program `dot` draws it; a .dot is written without it.",
     )
-    begin.add_argument(
-        "--out", type=path_option, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
+    blocks.path("--out", "a .svg, .png, .pdf or .dot (default: <scenario>.svg)", metavar="FILE")
+    plot = commands.add_parser(
+        "plot",
+        help="draw signals of runs over each other",
+        description="Draws outputs of runs with their references, or other signals by name, with "
+        "the errors as predicted beside those measured, into one picture.",
+    )
+    plot.path("runs", "a folder of a run, or a record.npz", metavar="RUN", nargs="+")
+    plot.repeatable(
+        "--signals",
+        "NAMES",
+        "what to draw, as wall.force,control or state/joint1; may be repeated (default: all "
+        "outputs)",
+    )
+    plot.flag("--errors", "|z - r| of outputs, over the predicted one")
+    plot.path(
+        "--out",
+        "a .png, .pdf or .svg (default: plot.png)",
+        metavar="FILE",
+        default=Path("plot.png"),
     )

@@ -1,4 +1,4 @@
-"""The options of studies and identification, and the values of options."""
+"""The kinds of options of commands, and the options of studies and identification."""
 
 import argparse
 import re
@@ -11,39 +11,60 @@ TIME_LIMIT = 3600.0
 """The default time limit of a run of a sweep, in s."""
 
 
-def add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
-    """`drake-dae sweep`."""
+class CommandParser(argparse.ArgumentParser):
+    """A parser with the kinds of options that several commands have."""
+
+    def flag(self, name: str, text: str) -> None:
+        """Adds an option without a value."""
+        self.add_argument(name, action="store_true", help=text)
+
+    def path(self, name: str, text: str, **more: Any) -> None:
+        """Adds a file or a folder."""
+        self.add_argument(name, type=path_option, help=text, **more)
+
+    def repeatable(self, name: str, metavar: str, text: str, **more: Any) -> None:
+        """Adds an option that may be repeated; its values are a list."""
+        self.add_argument(
+            name, action="append", **{"default": [], "metavar": metavar, "help": text, **more}
+        )
+
+    def settings(self, text: str) -> None:
+        """Adds `--set`."""
+        self.repeatable("--set", "KEY=VALUE", f"{text}; may be repeated", dest="settings")
+
+    def json(self, text: str) -> None:
+        """Adds `--json`."""
+        self.flag("--json", f'{text}; for an error, its text under "error"')
+
+
+def add_sweep(commands: Any, scenario: CommandParser) -> None:
+    """Adds the command `sweep`."""
     study = commands.add_parser(
         "sweep",
-        parents=[named],
+        parents=[scenario],
         help="run a scenario many times with other values",
-        description=(
-            "Runs a scenario once for every combination of the values of some keys, on "
-            "all cores, and writes a table with figures of each run, a summary and "
-            "plots. If it is killed, the same command continues it."
-        ),
+        description="Runs a scenario once for every combination of the values of some keys, on all "
+        "cores, and writes a table with figures of each run, a summary and plots. If it is killed, "
+        "the same command continues it.",
         epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
         "slow: the same command tries that run again; with --check 2 if a run did not finish",
     )
-    study.add_argument(
+    study.repeatable(
         "--vary",
-        action="append",
-        required=True,
-        metavar="KEY=VALUES",
-        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
+        "KEY=VALUES",
+        'what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
         '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
         '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
         '"force_feedback.seed=1..20:20"; may be repeated',
+        required=True,
     )
     chosen = study.add_mutually_exclusive_group()
     chosen.add_argument(
         "--random",
         type=whole_option,
         metavar="COUNT",
-        help=(
-            "number of runs with random values, uniformly distributed in their ranges, instead "
-            "of a grid"
-        ),
+        help="number of runs with random values, uniformly distributed in their ranges, instead "
+        "of a grid",
     )
     chosen.add_argument(
         "--together",
@@ -53,11 +74,10 @@ def add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
     study.add_argument(
         "--seed", type=whole_option, default=0, help="of the random values (default: 0)"
     )
-    study.add_argument(
+    study.flag(
         "--rollout",
-        action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function, as `simulate "
-        "--rollout` does: many times as fast",
+        "run without Drake's Simulator, the whole loop as one function, as `simulate --rollout` "
+        "does: many times as fast",
     )
     study.add_argument(
         "--workers",
@@ -76,16 +96,14 @@ def add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         help="how long a run may take by the clock, building included, until its process is ended "
         f"and it counts as timed out (default: {TIME_LIMIT:g}; on a cluster there is none)",
     )
-    study.add_argument("--check", action="store_true", help="exit code 2 if a run did not finish")
-    add_json(study, "print outcomes and figures as JSON, and all else on stderr")
-    study.add_argument(
-        "--out", type=path_option, help="folder for the results (default: runs/<scenario>-sweep)"
-    )
+    study.flag("--check", "exit code 2 if a run did not finish")
+    study.json("print outcomes and figures as JSON, and all else on stderr")
+    study.path("--out", "folder for the results (default: runs/<scenario>-sweep)")
 
 
 def add_identify(commands: Any) -> None:
-    """`drake-dae identify`."""
-    found = commands.add_parser(
+    """Adds the command `identify`."""
+    identify = commands.add_parser(
         "identify",
         help="find masses, friction, stiffness, places and biases from records",
         description="Finds parameters of the plant of a scenario from records of it, with 95 % "
@@ -93,89 +111,68 @@ def add_identify(commands: Any) -> None:
         "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
         "closes or is struck are left out.",
     )
-    found.add_argument(
-        "records",
-        nargs="+",
-        type=path_option,
-        metavar="RECORD",
-        help="a run's folder, .npz, .csv or .mcap",
-    )
-    found.add_argument(
+    identify.path("records", "a run's folder, .npz, .csv or .mcap", metavar="RECORD", nargs="+")
+    identify.repeatable(
         "--free",
-        action="append",
-        required=True,
-        metavar="NAMES",
-        help="parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
+        "NAMES",
+        "parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
         "position.bias, force.delay and position.delay of sensors; may be repeated",
+        required=True,
     )
-    found.add_argument(
+    identify.add_argument(
         "--scenario", help="that of the plant (default: the one in the first record)"
     )
-    found.add_argument(
-        "--set",
-        dest="settings",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="change the scenario that --scenario names; may be repeated",
-    )
-    found.add_argument(
+    identify.settings("change the scenario that --scenario names")
+    identify.path(
         "--columns",
-        type=path_option,
-        metavar="FILE",
-        help='of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
+        'of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
         '"/topic.field: control.joint1_motor"',
+        metavar="FILE",
     )
-    found.add_argument(
-        "--out", type=path_option, metavar="FILE", help="a scenario with these values"
-    )
-    add_json(found, "print the values as JSON")
+    identify.path("--out", "a scenario with these values", metavar="FILE")
+    identify.json("print the values as JSON")
 
 
-def add_excite(commands: Any, named: argparse.ArgumentParser) -> None:
-    """`drake-dae excite`."""
-    found = commands.add_parser(
+def add_excite(commands: Any, scenario: CommandParser) -> None:
+    """Adds the command `excite`."""
+    excite = commands.add_parser(
         "excite",
-        parents=[named],
+        parents=[scenario],
         help="find the motion and the force that determine parameters best",
         description="Looks for values of some keys of a scenario with which its record determines "
         "parameters of the plant best, within all limits, and prints the 95 % intervals that "
         "`identify` will find from it, before and after. Ctrl-C gives the best so far.",
     )
-    found.add_argument(
+    excite.repeatable(
         "--free",
-        action="append",
+        "NAMES",
+        "parameters of the plant, as tool.mass,link3.mass; may be repeated",
         required=True,
-        metavar="NAMES",
-        help="parameters of the plant, as tool.mass,link3.mass; may be repeated",
     )
-    found.add_argument(
+    excite.repeatable(
         "--vary",
-        action="append",
+        "KEY=LOW..HIGH",
+        'what may be chosen, as "references.wall.force.amplitudes.0=0..15"; may be repeated',
         required=True,
-        metavar="KEY=LOW..HIGH",
-        help='what may be chosen, as "references.wall.force.amplitudes.0=0..15"; may be repeated',
     )
-    found.add_argument(
+    excite.repeatable(
         "--noise",
-        action="append",
-        default=[],
-        metavar="KIND=DEVIATION",
-        help="of sensors, where the scenario states none: position=1e-5,force=0.3 (rad or m; N)",
+        "KIND=DEVIATION",
+        "of sensors, where the scenario states none: position=1e-5,force=0.3 (rad or m; N)",
     )
-    found.add_argument(
+    excite.add_argument(
         "--criterion",
         choices=("D", "A"),
         default="D",
         help="D: the volume of the ellipsoid of the relative errors; A: the sum of their squares "
         "(default: D)",
     )
-    found.add_argument(
+    excite.add_argument(
         "--runs", type=whole_option, default=100, help="how many runs are made (default: 100)"
     )
-    found.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
-    found.add_argument("--out", type=path_option, metavar="FILE", help="a scenario with the choice")
-    add_json(found, "print the choice and the intervals as JSON")
+    excite.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
+    excite.path("--out", "a scenario with the choice", metavar="FILE")
+    excite.json("print the choice and the intervals as JSON")
 
 
 def path_option(text: str) -> Path:
@@ -198,10 +195,3 @@ def seconds_option(text: str) -> float:
     if value is None or value <= 0.0:
         raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
     return value
-
-
-def add_json(command: argparse.ArgumentParser, what: str) -> None:
-    """Adds the option `--json`."""
-    command.add_argument(
-        "--json", action="store_true", help=f'{what}; for an error, its text under "error"'
-    )

@@ -1,4 +1,4 @@
-"""What a browser shows: `drake-dae play` an animation, `page` and `live` a loop that runs."""
+"""`drake-dae play`, `page` and `live`: animations, and loops that run in a browser."""
 
 import argparse
 import json
@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drake_dae.commands.run_folder import ANIMATION, load_run, run_label, stage
+from drake_dae.commands.run_folder import ANIMATION, load_run, runs_by_name, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.side_by_side import side_by_side
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Shows what the options name; returns the exit code."""
+    """Runs the command that the options name; returns the exit code."""
     return {"play": _play, "page": _page, "live": _live}[options.command](options)
 
 
@@ -31,11 +31,9 @@ def _play(options: argparse.Namespace) -> int:
     page = options.out or Path("compare.html")
     if page.suffix != ".html":
         raise ModelError(f"a page is an .html, got '{page}'")
-    if len(set(options.runs)) < len(options.runs):
-        raise ModelError("a run is named twice; name each run once")
-    pages = {run_label(run, options.runs): _animation(run) for run in options.runs}
+    pages = {name: _animation(run) for name, run in runs_by_name(options.runs).items()}
     times = [load_run(run).time for run in options.runs]
-    duration = max(float(each[-1] - each[0]) for each in times)
+    duration = max(float(time[-1] - time[0]) for time in times)
     with stage(page.parent, page.name) as place:
         text = side_by_side(pages, duration, page.parent)
         (place / page.name).write_text(text, encoding="utf-8")
@@ -51,7 +49,7 @@ def _animation(folder: Path) -> Path:
 
 
 def show(folder: Path) -> None:
-    """Opens the animation of a run in the browser, and says which file that is.
+    """Opens the animation of a run in the browser, and prints its file.
 
     Raises:
         ModelError: There is none, or no browser.
@@ -76,24 +74,25 @@ def _open(page: Path) -> None:
 
 
 def _page(options: argparse.Namespace) -> int:
-    """Writes a page."""
+    """Writes a scenario as a page."""
     from drake_dae.running.bench.page import write_page
 
     name, scenario, built = _built(options)
-    file = options.out or Path(f"{name}.html")
+    file, bundle = options.out or Path(f"{name}.html"), options.shared_bundle
     title = scenario.description or name
-    given = built.loop, built.context, file, None, title, built.left_out
     try:
-        files = write_page(*given, shared_bundle=options.shared_bundle)
+        files = write_page(
+            built.loop, built.context, file, None, title, built.left_out, shared_bundle=bundle
+        )
     except ModelError as error:
         raise ModelError(
             f"{name} cannot be a page ({error}); `drake-dae live {options.scenario}` runs it"
         ) from error
-    sizes = {str(each): each.stat().st_size for each in files}
+    sizes = {str(path): path.stat().st_size for path in files}
     if options.json:
         print(json.dumps({"files": sizes, "left_out": list(built.left_out)}, indent=2))
         return 0
-    print(f"written: {', '.join(f'{each} ({size / 1e6:.2f} MB)' for each, size in sizes.items())}")
+    print(f"written: {', '.join(f'{path} ({size / 1e6:.2f} MB)' for path, size in sizes.items())}")
     for note in built.left_out:
         print(f"not in it: {note}")
     if options.open:
@@ -102,13 +101,12 @@ def _page(options: argparse.Namespace) -> int:
 
 
 def _live(options: argparse.Namespace) -> int:
-    """Runs a live bench, or what was commanded in one."""
+    """Runs a live bench, or repeats the commands of an earlier one."""
     from drake_dae.running.bench.live import live
     from drake_dae.running.bench.run import Commands, replay
     from drake_dae.simulation.real_time import attainable_rate
 
     name, scenario, built = _built(options)
-    made = built.loop, built.context, scenario.integrator
     folder = options.out or Path("live") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     if options.replay is not None:
         commands = Commands.load(options.replay)
@@ -125,10 +123,11 @@ def _live(options: argparse.Namespace) -> int:
             f"this machine runs it at {rate:.2g} of real time, and so the bench will; "
             "--compiled true may help"
         )
-    title = scenario.description or name
     live(
-        *made,
-        title=title,
+        built.loop,
+        built.context,
+        scenario.integrator,
+        title=scenario.description or name,
         notes=built.left_out,
         port=options.port,
         opens=not options.no_browser,
@@ -138,7 +137,7 @@ def _live(options: argparse.Namespace) -> int:
 
 
 def _saver(scenario: "Scenario", folder: Path) -> Callable[["HandRun"], str]:
-    """What saves a run of a live bench."""
+    """A function that saves a run of a live bench and returns the folder."""
     from drake_dae.scenario.files import save_scenario
 
     def save(run: "HandRun") -> str:
@@ -154,7 +153,7 @@ def _saver(scenario: "Scenario", folder: Path) -> Callable[["HandRun"], str]:
 
 
 def _built(options: argparse.Namespace) -> "tuple[str, Scenario, Commanded]":
-    """Name, scenario and commanded loop that the options name."""
+    """Builds the commanded loop of the scenario that the options name, and returns all three."""
     from drake_dae.scenario.commanded import build_commanded
     from drake_dae.scenario.files import load_scenario
     from drake_dae.scenario.shipped import find_scenario

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, run_label, stage
+from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, runs_by_name, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.diagram import save_diagram
 from drake_dae.pictures.film import save_film
@@ -51,9 +51,7 @@ def _plot(options: argparse.Namespace) -> Path:
     path: Path = options.out
     if path.suffix not in SUFFIXES:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
-    if len(set(options.runs)) < len(options.runs):
-        raise ModelError("a run is named twice; name each run once")
-    records = {run_label(run, options.runs): load_run(run) for run in options.runs}
+    records = {name: load_run(run) for name, run in runs_by_name(options.runs).items()}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)
     with stage(path.parent, path.name) as place:

@@ -5,8 +5,10 @@ import fcntl
 import os
 import shutil
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -20,7 +22,7 @@ from drake_dae.simulation.records.record import Record
 SCENARIO = "scenario.yaml"
 RECORD = "record.npz"
 PART = "record.part"
-"""The record during the run, and after a run that was killed."""
+"""The record during a run; it remains if the run is killed."""
 
 ANIMATION = "animation.html"
 
@@ -28,7 +30,7 @@ FILES = (SCENARIO, "summary.txt", RECORD, *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
 FILM = "film.gif"
-"""The files of `drake-dae render`."""
+"""The file of `drake-dae render`."""
 
 MARK = "# Scenario as run by drake-dae"
 """The first line of the scenario in a run's folder: only such a folder is reused."""
@@ -40,9 +42,9 @@ _STAGE = ".unfinished-"
 def run_folder(folder: Path) -> Iterator[Path | None]:
     """Makes the folder of a run, and locks it against other runs for the duration of the block.
 
-    The files of an earlier run are moved to a folder "<folder>-1", "<folder>-2", ...; others
-    remain. The scenario file is created empty and carries the lock; no file is written through a
-    symbolic link.
+    The files of an earlier run are moved to a folder "<folder>-1", "<folder>-2", ...; other files
+    remain. The scenario's file is created empty, and is the file that is locked. No file is
+    written through a symbolic link.
 
     Yields:
         The folder to which the earlier run was moved; None if there was none.
@@ -58,7 +60,7 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise ModelError(f"'{folder}' is a file; name a folder")
-        lock, kept = _prepare(folder)
+        lock, moved_to = _prepare(folder)
     except ModelError:
         raise
     except (OSError, ValueError) as error:  # The latter for text of another encoding.
@@ -66,19 +68,19 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
         where = f" ({path})" if path and Path(path) != folder else ""
         raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None
     try:
-        yield kept
+        yield moved_to
     finally:
         os.close(lock)
 
 
 def load_run(path: Path) -> Record:
-    """The record of a run.
+    """Reads the record of a run.
 
     Args:
-        path: Its folder, or the file of the record.
+        path: The folder of the run, or the file of the record.
 
     Raises:
-        ModelError: There is none.
+        ModelError: There is no record.
     """
     if not path.is_dir():
         return Record.load(path)
@@ -88,21 +90,27 @@ def load_run(path: Path) -> Record:
     raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
 
 
-def run_label(path: Path, paths: Sequence[Path]) -> str:
-    """The name of a run among others: that of its folder if no other one is named alike."""
-    alike = [other for other in paths if other.name == path.name]
-    return path.name if len(alike) == 1 and path.name else str(path)
+def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:
+    """Name -> path of several runs; the whole path is the name where the last part is ambiguous.
+
+    Raises:
+        ModelError: A run is named twice.
+    """
+    if len(set(paths)) < len(paths):
+        raise ModelError("a run is named twice; name each run once")
+    names = Counter(path.name for path in paths)
+    return {path.name if path.name and names[path.name] == 1 else str(path): path for path in paths}
 
 
 def _prepare(folder: Path) -> tuple[int, Path | None]:
-    """The open file with the lock, and the folder to which an earlier run was moved."""
+    """Locks a folder; returns the locked file, and the folder to which an earlier run was moved."""
     folder.mkdir(parents=True, exist_ok=True)
     _check(folder, None)
     lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
         _lock(lock, folder)
         _check(folder, (folder / SCENARIO).read_text("utf-8"))
-        kept = _keep(folder, _present(folder)[1:])
+        moved_to = _move_beside(folder, _present(folder)[1:])
         for stale in folder.glob(f"{_STAGE}*"):
             if stale.is_dir() and not stale.is_symlink():
                 shutil.rmtree(stale)
@@ -110,29 +118,32 @@ def _prepare(folder: Path) -> tuple[int, Path | None]:
     except BaseException:
         os.close(lock)
         raise
-    return lock, kept
+    return lock, moved_to
 
 
-def _keep(folder: Path, files: Sequence[Path]) -> Path | None:
+def _move_beside(folder: Path, files: Sequence[Path]) -> Path | None:
     """Moves the files of an earlier run beside its folder, with a copy of its scenario."""
     if not files:
         return None
     for file in files:
         if file.is_dir() and not file.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
-    here, number = folder.absolute(), 1
-    while True:
-        kept = here.with_name(f"{here.name}-{number}")
-        try:
-            kept.mkdir()
-            break
-        except FileExistsError:
-            number += 1
+    here = folder.absolute()
+    target = new_folder(here.with_name(f"{here.name}-{number}") for number in count(1))
     # The copy first: it identifies a folder of a run.
-    shutil.copyfile(folder / SCENARIO, kept / SCENARIO)
+    shutil.copyfile(folder / SCENARIO, target / SCENARIO)
     for file in files:
-        file.rename(kept / file.name)
-    return folder.with_name(kept.name) if folder.name else kept
+        file.rename(target / file.name)
+    return folder.with_name(target.name) if folder.name else target
+
+
+def new_folder(paths: Iterator[Path]) -> Path:
+    """Makes and returns the first of some folders that does not exist."""
+    while True:
+        with suppress(FileExistsError):
+            path = next(paths)
+            path.mkdir()
+            return path
 
 
 def _present(folder: Path) -> list[Path]:
@@ -142,14 +153,14 @@ def _present(folder: Path) -> list[Path]:
 
 
 def _check(folder: Path, text: str | None) -> None:
-    """Refuses a folder with other files; the text is that of the scenario, None if not yet read."""
+    """Checks that a folder has no other files; text is its scenario, None if it is not read yet."""
     present, scenario = _present(folder), folder / SCENARIO
     # Empty: new, or from a run that was killed at once.
-    own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
-    if present and (present[0] != scenario or scenario.is_symlink() or not own):
-        found = ", ".join(file.name for file in present)
+    is_of_run = text is None or text.startswith(MARK) or (not text and len(present) == 1)
+    if present and (present[0] != scenario or scenario.is_symlink() or not is_of_run):
+        names = ", ".join(file.name for file in present)
         raise ModelError(
-            f"'{folder}' holds {found}, not from an earlier run; choose another folder"
+            f"'{folder}' holds {names}, not from an earlier run; choose another folder"
         )
 
 
@@ -169,11 +180,11 @@ def _lock(file: int, folder: Path) -> None:
 
 @contextmanager
 def stage(folder: Path, *names: str) -> Iterator[Path]:
-    """A temporary folder for files, which are moved to the folder when they are complete.
+    """Makes a temporary folder for files, and moves these to the folder when they are complete.
 
     Raises:
-        OSError: Some file cannot be written; with the path of the first of the names if the error
-            has none.
+        OSError: A file cannot be written; the error has the path of the first of the names if it
+            has no other path.
     """
     place = None
     try:
@@ -190,7 +201,7 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
 
 @contextmanager
 def _workplace(folder: Path) -> Iterator[str]:
-    """A temporary folder inside another one, removed at the end also after a signal.
+    """Makes a temporary folder inside another one, and removes it at the end, also after a signal.
 
     Signals are deferred while the folder is made and while it is removed.
     """

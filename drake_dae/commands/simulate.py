@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 from textwrap import fill
 from typing import Any, TextIO
@@ -26,6 +27,7 @@ from drake_dae.commands.run_folder import (
     PART,
     RECORD,
     SCENARIO,
+    new_folder,
     run_folder,
     stage,
 )
@@ -103,9 +105,9 @@ def _simulate(
     for note in (*completed.notes, *filter(None, [remark])):
         print(note, flush=True)
     folder = options.out or _unused(f"{name}-{datetime.now():%Y%m%d-%H%M%S}")
-    with ending_signals(end_at_once), run_folder(folder) as kept:
-        if kept is not None:
-            print(f"the earlier run in {folder}/ is kept in {kept}/", flush=True)
+    with ending_signals(end_at_once), run_folder(folder) as moved_to:
+        if moved_to is not None:
+            print(f"the earlier run in {folder}/ is kept in {moved_to}/", flush=True)
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
@@ -120,20 +122,14 @@ def _simulate(
 
 def _unused(name: str) -> Path:
     """A new folder below runs/."""
-    runs, number = Path("runs"), 1
+    runs = Path("runs")
     runs.mkdir(exist_ok=True)
-    while True:
-        folder = runs / (name if number == 1 else f"{name}-{number}")
-        try:
-            folder.mkdir()
-            return folder
-        except FileExistsError:
-            number += 1
+    return new_folder(runs / (name if i == 1 else f"{name}-{i}") for i in count(1))
 
 
 @dataclass
 class _CommandRun:
-    """A run: its scenario, its folder, and its outcome."""
+    """A run of the command: its loop and scenario, its folder, and its results."""
 
     loop: ClosedLoop
     context: Context
@@ -148,6 +144,11 @@ class _CommandRun:
     record: Record | None = None
     recorded: RecordAfter | None = None
     results: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether a signal ended the run early."""
+        return self.statistics is not None and self.statistics.interrupted is not None
 
 
 def _step(run: _CommandRun) -> RunStatistics:
@@ -165,15 +166,15 @@ def _step(run: _CommandRun) -> RunStatistics:
 
 
 def _warn_of_rate(run: _CommandRun) -> None:
-    """Warns before a run in real time that is too slow for it."""
+    """Warns if this machine is too slow for a run in real time."""
     scenario, config = run.scenario, run.scenario.integrator
-    wanted = config.target_realtime_rate
-    if not wanted:
+    target = config.target_realtime_rate
+    if not target:
         return
     rate = attainable_rate(run.loop.diagram, run.context, scenario.duration, config)
-    if rate is not None and rate < wanted:
+    if rate is not None and rate < target:
         print(
-            f"runs at about {rate:.2g} times real time here, not at {wanted:g}: the view is slow "
+            f"runs at about {rate:.2g} times real time here, not at {target:g}: the view is slow "
             "motion. Machine code (--compiled true, with a C compiler) and larger steps are faster",
             flush=True,
         )
@@ -196,14 +197,14 @@ def _roll(run: _CommandRun) -> RunStatistics:
         return ending.signal is not None
 
     with ending_signals(ending := Interruption()):
-        found = roll_scenario(run.scenario, run.loop, run.context, look=look)
-    run.record, run.recorded = found.record, found.record.after
-    run.context = found.context or run.context
-    if found.failure is not None:
-        raise found.failure
+        rollout = roll_scenario(run.scenario, run.loop, run.context, look=look)
+    run.record, run.recorded = rollout.record, rollout.record.after
+    run.context = rollout.context or run.context
+    if rollout.failure is not None:
+        raise rollout.failure
     times, wall = run.record.time, time.perf_counter() - began
     simulated = float(times[-1] - times[0]) if times.size else 0.0
-    return RunStatistics(simulated, wall, found.steps, ending.signal)
+    return RunStatistics(simulated, wall, rollout.steps, ending.signal)
 
 
 def _run(
@@ -214,7 +215,7 @@ def _run(
     simulate_by: Callable[[_CommandRun], RunStatistics],
     title: str,
 ) -> tuple[int, dict[str, Any]]:
-    """Runs and writes; the record is kept also when the run fails or is interrupted."""
+    """Runs, and writes the files, also if the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
 
     def recorded(context: Context, after: float | None) -> Record:
@@ -238,7 +239,7 @@ def _run(
 
 
 def _write(run: _CommandRun) -> bool:
-    """Writes the files, prints the summary, and says whether all files are complete."""
+    """Writes the files, prints the summary, and returns whether all files are complete."""
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
     # A signal from here on takes effect after the record is written and before the pictures.
@@ -257,14 +258,13 @@ def _write(run: _CommandRun) -> bool:
         near = nearness(loop, record, run.context)
         bound = None
         if loop.generator is not None:
-            reference, state = loop.generator.reference, record["state"][0]
-            bound = loop.controller.error_bound(reference, record.time, state)
-        text = summary(
-            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, bound
-        )
+            goal, state = loop.generator.reference, record["state"][0]
+            bound = loop.controller.error_bound(goal, record.time, state)
+        outcome = run.statistics, run.failure
+        lines = [summary(record, predicted, limits, *outcome, accuracy, reasons, bound)]
         changes = loop.changes(run.context)
         stopped = stop_remarks(run.statistics, run.scenario.duration) if changes else []
-        interrupted = run.statistics is not None and run.statistics.interrupted is not None
+        failed = bool(run.failure or (stopped and changes[-1].failed))
         job = judge_job(
             record,
             predicted,
@@ -272,7 +272,7 @@ def _write(run: _CommandRun) -> bool:
             [*shortfalls(record, limits), *map(str, behind)],
             limits.pushing,
             changes,
-            is_cut_short=bool(run.failure or (stopped and changes[-1].failed)) or interrupted,
+            is_cut_short=failed or run.is_interrupted,
             notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
@@ -284,17 +284,18 @@ def _write(run: _CommandRun) -> bool:
             **asdict(near),
             **_as_data(run, verdict, reasons),
         }
-        if model is not None:
-            material = run.scenario.plant.material
-            rolling = ball_remarks(None if material is None else material.radius)
-            text = "\n".join([text, *surface_remarks(model, record), *rolling])
-        text = "\n".join([text, *map(str, (*near.distances, *near.speeds))])
-        text = "\n".join([text, *departure_remarks(record, limits.control)])
         scenario = run.scenario
+        if model is not None:
+            material = scenario.plant.material
+            lines += surface_remarks(model, record)
+            lines += ball_remarks(None if material is None else material.radius)
+        lines += map(str, (*near.distances, *near.speeds))
+        lines += departure_remarks(record, limits.control)
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
-        text = "\n".join([text, *reference_remarks(followed)])
+        lines += reference_remarks(followed)
         if changes:
-            text = "\n".join([text, "", *map(str, changes), *stopped])
+            lines += ["", *map(str, changes), *stopped]
+        text = "\n".join(lines)
         if write.record:
             signals = record.signals["tracking_error"].signals
             more = {**record.signals, "predicted_error": Recorded(predicted, signals)}
@@ -317,10 +318,10 @@ def _write(run: _CommandRun) -> bool:
             plots = [name for name in PLOTS if paths or name != PATHS]
             with _collected(problems), stage(folder, *plots) as place, _frozen():
                 save_plots(record, predicted, limits.control, place, paths, accuracy, moments)
-            for one in loop.generator.references if loop.generator is not None else ():
-                if isinstance(one, TimeOptimalReference):
+            for reference in loop.generator.references if loop.generator is not None else ():
+                if isinstance(reference, TimeOptimalReference):
                     with _collected(problems), stage(folder, PROFILE) as place:
-                        save_profile(one.profile, place)
+                        save_profile(reference.profile, place)
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as place:
                 spans = phase_spans(record)
@@ -355,22 +356,18 @@ def _colored(job: JobVerdict) -> str:
 
 def _as_data(run: _CommandRun, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
     """The results of a run for JSON."""
-    found = run.statistics
+    names = ("simulated_time", "steps", "wall_time")
     return {
         **as_data(verdict, reasons),
-        "interrupted": found is not None and found.interrupted is not None,
-        "simulated_time": None if found is None else found.simulated_time,
-        "steps": None if found is None else found.steps,
-        "wall_time": None if found is None else found.wall_time,
+        "interrupted": run.is_interrupted,
+        **{name: getattr(run.statistics, name, None) for name in names},
     }
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
     """Reasons for deviations from the prediction for an ideal run."""
     reasons = {
-        "the drives were saturated": record["excess"].any()
-        if "excess" in record.signals
-        else False,
+        "the drives were saturated": "excess" in record and bool(record["excess"].any()),
         "parameters of the plant differ from those of the law (plant_parameters)": bool(
             scenario.plant_parameters
         ),
@@ -379,7 +376,7 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             scenario.plant_disturbances
         ),
         "the contact is compliant": not loop.plant.is_ideal,
-        "a contact was open": "mode" in record.signals and not record["mode"].all(),
+        "a contact was open": "mode" in record and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
@@ -397,8 +394,8 @@ def _write_record(record: Record, run: _CommandRun) -> None:
         with suppress(OSError):
             writer.finish(run.context)  # The rows written so far are kept.
         with suppress(OSError, ModelError, IndexError):
-            kept = Record.load(writer.path).time[-1]
-            error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
+            end = Record.load(writer.path).time[-1]
+            error.strerror = f"{error.strerror or error}; {PART} has the record up to {end:.6g} s"
         raise
     writer.path.unlink(missing_ok=True)
 
@@ -414,9 +411,9 @@ def _print(text: str, file: TextIO) -> None:
 
 @contextmanager
 def _frozen() -> Iterator[None]:
-    """Excludes the objects made so far from garbage collection.
+    """Excludes the present objects from garbage collection in the block.
 
-    A figure creates so many objects that collecting would take as long as drawing it.
+    A figure creates so many objects that their collection would take as long as drawing.
     """
     gc.freeze()
     try:
@@ -427,7 +424,7 @@ def _frozen() -> Iterator[None]:
 
 @contextmanager
 def _collected(problems: list[str]) -> Iterator[None]:
-    """Collects an error of a file for later: the other files are written, and the summary."""
+    """Collects an error of a file, so that the other files and the summary are written."""
     try:
         yield
     except OSError as error:

@@ -2,10 +2,8 @@
 
 import argparse
 import json
-import shlex
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.results import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
-from drake_dae.studies.variations import Variation, parse_variations, setting
+from drake_dae.studies.variations import parse_variations, rerun_commands
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -28,24 +26,6 @@ def run_command(options: argparse.Namespace) -> int:
         code, report = _sweep(options)
     print(json.dumps(report, indent=2))
     return code
-
-
-def _again(options: argparse.Namespace, folder: Path, variations: Sequence[Variation]) -> list[str]:
-    """For each run the command that makes its record, plots and animation."""
-    first = ["drake-dae", "simulate", str(options.scenario)]
-    first += ["--rollout"] if options.rollout else []
-    given = [part for text in options.settings for part in ("--set", text)]
-    return [
-        shlex.join(
-            [
-                *first,
-                *given,
-                *(part for item in changes.items() for part in ("--set", setting(*item))),
-                *("--out", str(folder / f"run{number}")),
-            ]
-        )
-        for number, changes in enumerate(variations)
-    ]
 
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -77,7 +57,10 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
         raise
     title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
-    again = _again(options, folder, variations)
+    made = ["drake-dae", "simulate", str(options.scenario)]
+    made += ["--rollout"] if options.rollout else []
+    made += [part for text in options.settings for part in ("--set", text)]
+    again = rerun_commands(made, variations, folder)
     files = study.save(folder, title, again, scenario.duration)
     names = ", ".join([file.name, *(written.name for written in files)])
     print(f"{study}\nwritten to {folder}/: {names}", flush=True)
@@ -88,14 +71,15 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         "runs": len(study.results),
         "outcomes": Counter(str(result.outcome) for result in study.results),
         "not_finished": [
-            {"run": one.run, "outcome": str(one.outcome), "reason": one.reason}
-            for one in unfinished
+            {"run": result.run, "outcome": str(result.outcome), "reason": result.reason}
+            for result in unfinished
         ],
         "figures": study.extent(),
         "files": names.split(", "),
     }
-    if again := [str(one.run) for one in unfinished if not one.outcome.is_final]:
-        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
-        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
+    if repeated := [str(result.run) for result in unfinished if not result.outcome.is_final]:
+        count = count_of(len(repeated), "run")
+        text = f"{count} died or took too long; the same command tries again"
+        print(f"error: {text}: {', '.join(repeated[:10])}", file=sys.stderr)
         return 1, report
     return 2 if unfinished and options.check else 0, report

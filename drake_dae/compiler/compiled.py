@@ -1,4 +1,4 @@
-"""What a compiled diagram holds: its columns, its functions, and how values stand in them."""
+"""A compiled diagram: its CasADi functions and the layout of their arguments."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,27 +14,31 @@ from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import HELD, Block
+from drake_dae.systems.blocks.traced import HELD, Block, Update
 
 ARGUMENTS = ("time", "state", "held", "parameters")
-"""What the functions of a diagram take; an update takes new random numbers, "noise", as well."""
+"""The arguments of a compiled diagram's functions; updates have a fifth one, "noise"."""
 
 
 @dataclass(frozen=True, eq=False)
 class CompiledDiagram:
-    """A diagram as functions of the time, its state, what it holds, and its parameters.
+    """A diagram as functions of time, continuous state, discrete state (`held`) and parameters.
+
+    Each function also returns a validity: a number that is finite if its other results are valid.
 
     Attributes:
-        wires: The diagram and its wires.
-        context: A context in which inputs without a wire have values.
-        outputs: The names of the output ports of the diagram that are computed.
-        states, held, parameters, noise: Where the columns of each block stand.
-        fixed: The input ports without a wire whose values are parameters: (system, name, part).
-        inputs: The inputs of a part of a diagram, among the parameters: (name, part).
-        rates: The updates, one function for each period and offset.
-        blocks: The blocks by their systems, in the order of Drake's states.
-        guards: Where the margins of each block stand that changes at moments which a run finds.
-        watched: The same of blocks that look at their guards in samples.
+        wires: The leaf systems and their connections.
+        context: A context in which unconnected input ports have values.
+        outputs: The names of the output ports that are computed.
+        states, held, parameters, noise: The slice of each block in these columns.
+        fixed: The unconnected input ports, whose values are parameters: (system, name, slice).
+        inputs: The inputs of a part of a diagram, also parameters: (name, slice).
+        rates: The updates, one function for each period, offset and kind.
+        blocks: System -> block, in the order of Drake's states.
+        guards: For blocks that react at event times which a run locates: the slice of each block
+            among the margins of `guard`.
+        watched: For blocks that check their guards only at samples: the slice of each block among
+            the margins of `watch`.
     """
 
     wires: Wires
@@ -52,7 +56,7 @@ class CompiledDiagram:
     watched: tuple[ColumnPlace, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
-    _asked: Mapping[str, Sequence[ca.SX]] = field(repr=False)
+    _values: Mapping[str, Sequence[ca.SX]] = field(repr=False)
 
     @property
     def diagram(self) -> Diagram:
@@ -61,95 +65,97 @@ class CompiledDiagram:
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """How many entries each argument of the functions has."""
+        """The number of entries of each argument."""
         return {name: int(column.numel()) for name, column in self._columns.items()}
 
     @cached_property
     def rate(self) -> ca.Function:
-        """(time, state, held, parameters) -> the derivative of the state, shape (n,), and validity.
-
-        The second value is a number that is finite if the first is of use.
-        """
-        return self._function("rate", self._asked["rate"])
+        """(time, state, held, parameters) -> the derivative of the state, shape (n,), validity."""
+        return self._function("rate", self._values["rate"])
 
     @cached_property
     def row(self) -> ca.Function:
-        """(time, state, held, parameters) -> all outputs below each other, and validity."""
-        return self._function("row", self._asked["row"])
+        """(time, state, held, parameters) -> all outputs stacked, validity."""
+        return self._function("row", self._values["row"])
 
     @cached_property
     def guard(self) -> ca.Function:
-        """(time, state, held, parameters) -> margins, gaps, their rates, and validity.
+        """(time, state, held, parameters) -> margins, gaps, gap rates of `guards`, validity.
 
-        See `Guard`; those of all blocks stand below each other. Only where there are guards.
+        The values of all blocks are stacked; see `Guard`. Requires that `guards` is not empty.
         """
-        return self._function("guard", self._asked["guard"])
+        return self._function("guard", self._values["guard"])
 
     @cached_property
     def watch(self) -> ca.Function:
-        """The same of the guards that are looked at in samples. Only where there are such."""
-        return self._function("watch", self._asked["watch"])
+        """(time, state, held, parameters) -> margins, gaps, gap rates of `watched`, validity.
+
+        Requires that `watched` is not empty.
+        """
+        return self._function("watch", self._values["watch"])
 
     @property
     def watched_rates(self) -> int:
-        """The rates at whose samples blocks look at their guards, as bits."""
-        found = 0
+        """A bit mask of the `rates` at whose samples the guards of `watched` are checked."""
+        mask = 0
         for system, _ in self.watched:
             for update in self.blocks[system].updates:
-                key = update.period, update.offset, update.is_unrestricted
-                keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in self.rates]
-                found |= 1 << keys.index(key)
-        return found
+                mask |= 1 << self.rate_index(update)
+        return mask
+
+    def rate_index(self, update: Update) -> int:
+        """The index in `rates` of the function that computes an update."""
+        keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in self.rates]
+        return keys.index((update.period, update.offset, update.is_unrestricted))
 
     @property
     def changes(self) -> bool:
-        """Whether blocks change at moments that a run has to find, by guards."""
+        """Whether a block has a guard, so that it reacts to events such as impacts."""
         return bool(self.guards or self.watched)
 
     @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
-        """Name -> function, for who computes what the time alone determines once for each time.
+        """Name -> function, with all that depends only on time and parameters precomputed.
 
-        "given" is (time, parameters) -> a column; "rate", "row", "newton", "update_0", ...,
-        "guard" and "watch" are as the functions of the same names, and take this column after the
-        parameters.
+        "given" is (time, parameters) -> the precomputed column. "rate", "row", "newton",
+        "update_0", ..., "guard" and "watch" are the functions of these names, with this column as
+        an additional argument after the parameters.
         """
-        functions = {**self._asked, "newton": self._newton(1)}
-        column, values, meant = self._expressions.given_column()
-        given = [self._columns["time"], self._columns["parameters"]]
-        found = {"given": dense_function("given", given, [values])}
-        for name, asked in functions.items():
+        column, values, substituted = self._expressions.given_column()
+        arguments = [self._columns["time"], self._columns["parameters"]]
+        functions = {"given": dense_function("given", arguments, [values])}
+        for name, results in {**self._values, "newton": self._newton(1)}.items():
             arguments = [*(self._columns[each] for each in ARGUMENTS), column]
             if name.startswith("update"):
                 arguments.append(self._columns["noise"])
-            found[name] = dense_function(name, arguments, meant(asked))
-        return found
+            functions[name] = dense_function(name, arguments, substituted(results))
+        return functions
 
     @cached_property
     def scale(self) -> FloatArray:
-        """The sizes of the states, shape (n,)."""
-        found = np.ones(self.sizes["state"])
+        """The scale of each continuous state, for error norms, shape (n,)."""
+        scales = np.ones(self.sizes["state"])
         for system, part in self.states:
-            scale = self.blocks[system].scale
-            if scale is not None:
-                found[part] = scale
-        return found
+            if (scale := self.blocks[system].scale) is not None:
+                scales[part] = scale
+        return scales
 
     def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
-        """The state and what is held in a context of the diagram, shapes (n,) and (k,)."""
+        """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,)."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
             own = system.GetMyContextFromRoot(context)
             state[part] = own.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
             own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
-            values = [own.get_discrete_state(i).value() for i in range(_groups(own))]
             if stepped is not None:
-                values = [stepped.held(own)]
-            held[part] = np.concatenate(values)
+                held[part] = stepped.held(own)
+            else:
+                groups = range(own.num_discrete_state_groups())
+                held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
         return state, held
 
-    def put(
+    def set_context(
         self,
         context: Context,
         time: float,
@@ -157,120 +163,121 @@ class CompiledDiagram:
         held: FloatArray,
         parameters: FloatArray,
     ) -> None:
-        """Puts into a context of the diagram what its functions take."""
+        """Sets time, state, discrete state and parameters in a context of the diagram."""
         context.SetTime(time)
         for system, part in self.states:
             system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
         for system, part in self.held:
-            own, first = system.GetMyMutableContextFromRoot(context), part.start
-            for i in range(own.num_discrete_state_groups()):
-                last = first + own.get_discrete_state(i).size()
-                own.SetDiscreteState(i, held[first:last])
-                first = last
+            own = system.GetMyMutableContextFromRoot(context)
+            groups = range(own.num_discrete_state_groups())
+            stops = np.cumsum([own.get_discrete_state(i).size() for i in groups])
+            for i, values in enumerate(np.split(held[part], stops[:-1])):
+                own.SetDiscreteState(i, values)
         for system, part in self.parameters:
-            own, first = system.GetMyMutableContextFromRoot(context), part.start
-            for i in range(own.num_numeric_parameter_groups()):
-                last = first + own.get_numeric_parameter(i).size()
-                own.get_mutable_numeric_parameter(i).SetFromVector(parameters[first:last])
-                first = last
+            own = system.GetMyMutableContextFromRoot(context)
+            groups = range(own.num_numeric_parameter_groups())
+            stops = np.cumsum([own.get_numeric_parameter(i).size() for i in groups])
+            for i, values in enumerate(np.split(parameters[part], stops[:-1])):
+                own.get_mutable_numeric_parameter(i).SetFromVector(values)
         for system, name, part in self.fixed:
             own = system.GetMyMutableContextFromRoot(context)
             system.GetInputPort(name).FixValue(own, parameters[part])
 
-    def begun(
+    def initialized(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """What is held when a run begins: what is not a number yet, as its block says."""
-        found = held.copy()
+        """The discrete state at the start of a run: NaN entries are replaced by `Block.initial`."""
+        start = held.copy()
         for part, initial in self._initial:
-            if np.isnan(found[part]).any():
-                found[part] = initial(time, state, held, parameters).full()[:, 0]
-        return found
+            if np.isnan(held[part]).any():
+                start[part] = initial(time, state, held, parameters).full()[:, 0]
+        return start
 
     @cached_property
     def _initial(self) -> list[tuple[slice, ca.Function]]:
-        """What blocks hold when a run begins, where that is not a number."""
-        found = []
-        for system, part in self.held:
-            initial = self.blocks[system].initial
-            if initial is not None:
-                call = self._expressions.call(self.blocks[system], initial)
-                value = call.results[initial.outputs.index(HELD)]
-                found.append((part, self._function("initial", [value])))
-        return found
+        """The slice and the initial value of each block whose discrete state starts as NaN."""
+        return [
+            (part, self._function("initial", [self._initial_held(system)]))
+            for system, part in self.held
+            if self.blocks[system].initial is not None
+        ]
 
-    def begin(self, held: FloatArray) -> ca.Function | None:
-        """(time, state, held, parameters) -> what is held when a run begins; None if `held` is.
+    def _initial_held(self, system: System) -> ca.SX:
+        initial = self.blocks[system].initial
+        assert initial is not None
+        call = self._expressions.call(self.blocks[system], initial)
+        return call.results[initial.outputs.index(HELD)]
+
+    def initialization(self, held: FloatArray) -> ca.Function | None:
+        """(time, state, held, parameters) -> the discrete state at the start of a run.
 
         Args:
-            held: What is held before, not a number where a block says what it is.
+            held: The discrete state in the context. The function replaces the slices of blocks
+                that have NaN there. Returns None if all entries are finite.
         """
-        columns = [self._columns["held"][part] for _, part in self.held]
-        for number, (system, part) in enumerate(self.held):
-            initial = self.blocks[system].initial
-            if initial is not None and np.isnan(held[part]).any():
-                call = self._expressions.call(self.blocks[system], initial)
-                columns[number] = call.results[initial.outputs.index(HELD)]
         if all(np.isfinite(held)):
             return None
+        columns = [self._columns["held"][part] for _, part in self.held]
+        for number, (system, part) in enumerate(self.held):
+            if self.blocks[system].initial is not None and np.isnan(held[part]).any():
+                columns[number] = self._initial_held(system)
         return self._function("begin", [ca.vertcat(*columns)])
 
     def values(self, context: Context) -> FloatArray:
         """The parameters in a context of the diagram, shape (m,).
 
         Raises:
-            ModelError: An input port without a wire has no value in this context.
+            ModelError: An unconnected input port has no value in this context.
         """
-        found = np.zeros(self.sizes["parameters"])
+        values = np.zeros(self.sizes["parameters"])
         for system, part in self.parameters:
             own = system.GetMyContextFromRoot(context)
             groups = range(own.num_numeric_parameter_groups())
-            found[part] = np.concatenate([own.get_numeric_parameter(i).value() for i in groups])
+            values[part] = np.concatenate([own.get_numeric_parameter(i).value() for i in groups])
         for system, name, part in self.fixed:
             own, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
             if not port.HasValue(own):
                 raise ModelError(
                     f"the input port '{name}' of '{system.get_name()}' has no value in this context"
                 )
-            found[part] = port.Eval(own)
+            values[part] = port.Eval(own)
         for name, part in self.inputs:
             system, index = self.wires.inputs[name]
-            found[part] = system.get_output_port(index).Eval(system.GetMyContextFromRoot(context))
-        return found
+            values[part] = system.get_output_port(index).Eval(system.GetMyContextFromRoot(context))
+        return values
 
     @cached_property
     def twins(self) -> Mapping[System, System]:
         """Plant -> the controller whose law has the plant's system as its model."""
-        laws = {
+        controllers = {
             id(block.model): system
             for system, block in self.blocks.items()
             if block.under is not None
         }
         return {
-            system: laws[id(block.model)]
+            system: controllers[id(block.model)]
             for system, block in self.blocks.items()
-            if block.under is None and block.model is not None and id(block.model) in laws
+            if block.under is None and block.model is not None and id(block.model) in controllers
         }
 
     def have_twins(self, parameters: FloatArray) -> np.ndarray:
-        """In which rows plants and laws that have one model have the same numbers, too, shape (k,).
+        """Whether the parameters of all `twins` equal those of their controllers, shape (k,).
 
         Args:
-            parameters: As `values` returns them, a row for each run, shape (k, m).
+            parameters: A row for each run, in the order of `values`, shape (k, m).
         """
         parts = dict(self.parameters)
-        found = np.full(len(parameters), bool(self.twins))
+        are_equal = np.full(len(parameters), bool(self.twins))
         for plant, controller in self.twins.items():
-            own, of_law = parts.get(plant, slice(0, 0)), parts[controller]
-            size = own.stop - own.start
-            same = parameters[:, own] == parameters[:, of_law][:, :size]
-            same[:, list(self.blocks[plant].moving)] = True
-            found &= same.all(axis=1)
-        return found
+            of_plant = parameters[:, parts.get(plant, slice(0, 0))]
+            equal = of_plant == parameters[:, parts[controller]][:, : of_plant.shape[1]]
+            equal[:, list(self.blocks[plant].moving)] = True
+            are_equal &= equal.all(axis=1)
+        return are_equal
 
     @cached_property
     def moved_parameters(self) -> Mapping[System, ca.Function]:
-        """Plant with moving parameters -> (time, state, held, parameters) -> all of its own."""
+        """Plant with time-varying parameters -> a function that returns all its parameters."""
         return {
             system: self._function("parameters", [self._expressions.parameters(block)])
             for system, block in self.blocks.items()
@@ -278,73 +285,65 @@ class CompiledDiagram:
         }
 
     def newton(self, count: int) -> ca.Function:
-        """(time, state, held, parameters) -> the state after Newton steps to its manifolds.
+        """(time, state, held, parameters) -> the state after `count` Newton steps to its manifolds.
 
-        With the length of the last step, in states over their scale. Gradients of all are those at
-        the start.
-
-        Args:
-            count: How many steps.
+        The second result is the length of the last step, in states divided by their scale. All
+        steps use the constraint gradients at the start.
         """
         return self._function("newton", self._newton(count))
 
     def _newton(self, count: int) -> list[ca.SX]:
         state = ca.SX(self._columns["state"])
-        left = ca.SX(0.0)
+        length = ca.SX(0.0)
         for system, part in self.states:
-            projection = self.blocks[system].projection
-            if projection is None:
-                continue
             block = self.blocks[system]
-            given = self._expressions.parameters(block), self._expressions.source(block, HELD)
+            if block.projection is None:
+                continue
+            arguments = self._expressions.parameters(block), self._expressions.source(block, HELD)
             x = start = self._columns["state"][part]
             for _ in range(count):
-                change = projection.newton(x, start, *given)
-                x, left_here = x + ca.DM(projection.scale) * change, ca.norm_2(change)
-            state[part], left = x, ca.fmax(left, left_here) if left.nnz() else left_here
-        return [state, left]
+                change = block.projection.newton(x, start, *arguments)
+                x = x + ca.DM(block.projection.scale) * change
+            state[part], length = x, ca.fmax(length, ca.norm_2(change))
+        return [state, length]
 
     @property
     def signals(self) -> dict[str, tuple[Signal, ...]]:
-        """Name of an output -> names and units of its entries, as far as its block tells them."""
-        found = {}
+        """Name of an output -> names and units of its entries; numbered if its block names none."""
+        signals = {}
         for name in self.outputs:
             system, index = self.wires.outputs[name]
             port = system.get_output_port(index)
-            known = self.blocks[system].ports.get(port.get_name())
-            found[name] = known or tuple(Signal(f"{name}[{i}]") for i in range(port.size()))
-        return found
+            named = self.blocks[system].ports.get(port.get_name())
+            signals[name] = named or tuple(Signal(f"{name}[{i}]") for i in range(port.size()))
+        return signals
 
     @property
     def has_stepped(self) -> bool:
-        """Whether Drake steps one of the blocks, which is not traced."""
+        """Whether Drake steps one of the blocks, because it cannot be traced."""
         return bool(self.rates) and self.rates[-1].stepped is not None
 
     @property
     def stepped(self) -> tuple[UpdateRate, Block]:
-        """The steps of the block that Drake runs, and this block; only where there is one."""
+        """The update and the block that Drake steps; requires `has_stepped`."""
         rate = self.rates[-1]
         assert rate.stepped is not None
         return rate, rate.stepped
 
     @property
     def projects(self) -> bool:
-        """Whether a block has a manifold that its state is brought to."""
+        """Whether the state of a block is projected onto a manifold."""
         return any(block.projection is not None for block in self.blocks.values())
 
     @property
     def calls(self) -> Sequence[TracedCall]:
-        """All that is computed, each after what it needs."""
+        """All computations, each after those that it depends on."""
         return self._expressions.calls
 
     def arguments_of(self, call: TracedCall) -> ca.Function:
-        """(time, state, held, parameters) -> the arguments of a computation."""
+        """(time, state, held, parameters) -> the arguments of one computation."""
         return self._function("arguments", list(call.arguments))
 
     def _function(self, name: str, values: Sequence[ca.SX]) -> ca.Function:
         values = self._expressions.expanded(values)
         return dense_function(name, [self._columns[each] for each in ARGUMENTS], values)
-
-
-def _groups(context: Context) -> int:
-    return int(context.num_discrete_state_groups())

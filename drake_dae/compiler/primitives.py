@@ -28,13 +28,14 @@ from drake_dae.systems.blocks.traced import (
 
 
 def primitive(system: System) -> Block:
-    """What a system of Drake's, or any that converts to symbolic expressions, computes.
+    """Traces a system of Drake, or a user's LeafSystem, by converting it to symbolic expressions.
 
     Args:
         system: A leaf system.
 
     Raises:
-        ModelError: It does not convert, or has what no expression has.
+        ModelError: The system does not convert, has abstract state, or computes something that
+            symbolic expressions cannot represent.
     """
     if isinstance(system, RandomSource):
         return _random_source(system)
@@ -46,30 +47,30 @@ def primitive(system: System) -> Block:
     except RuntimeError:
         raise ModelError(
             f"{name} cannot be traced: it has no traced functions and does not convert to "
-            "symbolic expressions, so that it runs in Drake's Simulator alone"
+            "symbolic expressions, so that it only runs in Drake's Simulator"
         ) from None
     try:
         return _Converted(system, converted, name).block()
-    except RuntimeError as error:  # What Drake cannot compute with expressions.
+    except RuntimeError as error:  # Drake cannot compute it with expressions.
         reason = str(error).splitlines()[0]
         raise ModelError(
-            f"{name} cannot be traced, so that it runs in Drake's Simulator alone: {reason}"
+            f"{name} cannot be traced, so that it only runs in Drake's Simulator: {reason}"
         ) from None
 
 
 def _random_source(source: RandomSource) -> Block:
-    """Random numbers that are held: new ones at each multiple of its period."""
+    """A block that draws new random numbers at each multiple of its period and holds them."""
     size = source.get_output_port().size()
     held, noise = ca.SX.sym("held", size), ca.SX.sym("noise", size)
-    shown = Computation(
-        ca.Function("shown", [held], [held]), (HELD,), (source.get_output_port().get_name(),)
+    output = Computation(
+        ca.Function("output", [held], [held]), (HELD,), (source.get_output_port().get_name(),)
     )
     draw = Computation(ca.Function("draw", [noise], [noise]), (NOISE,), (HELD,))
-    return Block(source, (shown,), (Update(draw, _period(source), 0.0, True),), draws=True)
+    return Block(source, (output,), (Update(draw, _period(source), 0.0, True),), draws=True)
 
 
 def _period(source: RandomSource) -> float:
-    """The time between two draws, in s: where a Simulator stops for the first one after t = 0."""
+    """The time between two draws in s, which is the time of the first event after t = 0."""
     simulator, times = Simulator(source), list[float]()
 
     def stop(context: Context) -> EventStatus:
@@ -84,12 +85,12 @@ def _period(source: RandomSource) -> float:
 
 
 class _Converted:
-    """A system on symbolic expressions, with variables for all that it reads.
+    """A system converted to symbolic expressions, in a context whose values are variables.
 
     Args:
         system: The system.
-        converted: The same on Expressions.
-        name: What messages call it.
+        converted: The system with the scalar type Expression.
+        name: The name of the system in messages.
     """
 
     def __init__(self, system: System, converted: System, name: str) -> None:
@@ -98,8 +99,8 @@ class _Converted:
         own = system.CreateDefaultContext()
         if own.num_abstract_states() or own.num_abstract_parameters():
             raise ModelError(
-                f"{name} cannot be traced: it has an abstract state or parameter, so that it runs "
-                "in Drake's Simulator alone"
+                f"{name} cannot be traced: it has an abstract state or parameter, so that it "
+                "only runs in Drake's Simulator"
             )
         self._symbols: dict[int, ca.SX] = {}
         self._columns: dict[str, ca.SX] = {}
@@ -107,7 +108,9 @@ class _Converted:
         context.SetTime(time[0])
         sizes = {
             STATE: [own.num_continuous_states()],
-            HELD: [own.get_discrete_state(i).size() for i in range(_groups(own))],
+            HELD: [
+                own.get_discrete_state(i).size() for i in range(own.num_discrete_state_groups())
+            ],
             PARAMETERS: [
                 own.get_numeric_parameter(i).size()
                 for i in range(own.num_numeric_parameter_groups())
@@ -126,12 +129,12 @@ class _Converted:
         for index in range(system.num_input_ports()):
             port = system.get_input_port(index)
             if port.get_data_type() == PortDataType.kVectorValued:
-                given = self._variables(port.get_name(), port.size())
-                converted.get_input_port(index).FixValue(context, given)
+                variables = self._variables(port.get_name(), port.size())
+                converted.get_input_port(index).FixValue(context, variables)
         self._has_state, self._has_held = bool(sizes[STATE][0]), bool(sum(sizes[HELD]))
 
     def block(self) -> Block:
-        """What the system computes."""
+        """The system as a traced block."""
         system, converted, context = self._system, self._converted, self._context
         computations = []
         for index in range(system.num_output_ports()):
@@ -148,18 +151,18 @@ class _Converted:
             if event is None:
                 raise ModelError(
                     f"{self._name} cannot be traced: its discrete state has no update of one "
-                    "period, so that it runs in Drake's Simulator alone"
+                    "period, so that it only runs in Drake's Simulator"
                 )
-            found = converted.EvalUniquePeriodicDiscreteUpdate(context)
-            following = np.concatenate(
-                [np.atleast_1d(found.value(i)) for i in range(found.num_groups())]
+            values = converted.EvalUniquePeriodicDiscreteUpdate(context)
+            next_held = np.concatenate(
+                [np.atleast_1d(values.value(i)) for i in range(values.num_groups())]
             )
-            update = self._computation(HELD, following)
+            update = self._computation(HELD, next_held)
             updates.append(Update(update, event.period_sec(), event.offset_sec()))
         return Block(system, tuple(computations), tuple(updates))
 
     def _variables(self, source: str, size: int) -> np.ndarray:
-        """Variables for a column, of which an expression of CasADi's has the same entries."""
+        """New Drake variables for a column, each with a CasADi symbol of its own."""
         column = ca.SX.sym(source.strip("$"), size)
         variables = [Variable(f"{source}_{i}") for i in range(size)]
         self._symbols |= {v.get_id(): column[i] for i, v in enumerate(variables)}
@@ -172,12 +175,7 @@ class _Converted:
         except ModelError as error:
             raise ModelError(f"{self._name} cannot be traced: {error}") from None
         value = ca.densify(ca.vertcat(ca.SX(0, 1), *rows))
-        # Of the columns those that it depends on: so no feedthrough is made up.
+        # Only the columns that it depends on, so that no false feedthrough is reported.
         names = [n for n, column in self._columns.items() if ca.depends_on(value, column)]
         function = ca.Function("computation", [self._columns[name] for name in names], [value])
         return Computation(function, tuple(names), (output,))
-
-
-def _groups(context: Context) -> int:
-    found: int = context.num_discrete_state_groups()
-    return found

@@ -1,4 +1,4 @@
-"""Where the columns of blocks stand among those of a diagram, and updates of one instant."""
+"""The updates of a diagram, and the slices of its columns that belong to each block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from drake_dae.systems.blocks.traced import Block
 
 
 class ColumnPlace(NamedTuple):
-    """Where a column of a block stands among those of the diagram."""
+    """The slice of a diagram's column, such as its state, that belongs to one block."""
 
     system: System
     part: slice
@@ -23,11 +23,13 @@ class UpdateRate:
 
     Attributes:
         period, offset: In s.
-        is_unrestricted: As of an `Update`.
-        function: (time, state, held, parameters, noise) -> new values of some held entries, and a
-            number that is finite if they are of use.
-        places: Which entries these are.
-        stepped: The block that Drake steps then; the function gives what its input port reads.
+        is_unrestricted: Whether these are unrestricted updates, which Drake makes before the
+            discrete ones.
+        function: (time, state, held, parameters, noise) -> the new values of the entries `places`
+            of the discrete state, and a number that is finite if these values are valid. With
+            `stepped`, the first result is the input of the block that Drake steps.
+        places: The entries of the discrete state that change.
+        stepped: The block that Drake steps at these times, if any.
     """
 
     period: float
@@ -38,7 +40,13 @@ class UpdateRate:
     stepped: Block | None = None
 
 
-def dense_function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
-    """Expressions as a function with dense outputs and without what is common twice."""
+def appended(column: ca.SX, values: ca.SX) -> tuple[ca.SX, slice]:
+    """A column with values appended, and the slice of these values."""
+    first = column.numel()
+    return ca.vertcat(column, values), slice(first, first + values.numel())
+
+
+def dense_function(name: str, arguments: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
+    """A function with dense outputs that computes common subexpressions once."""
     dense = [ca.densify(value) for value in values]
-    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})
+    return ca.Function(name, list(arguments), ca.cse(dense), {"cse": False})

@@ -1,4 +1,4 @@
-"""The wires of a diagram, those of the diagrams inside it included."""
+"""The leaf systems of a diagram and their connections, with nested diagrams flattened."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -14,19 +14,21 @@ from pydrake.systems.framework import (
 from drake_dae.systems.blocks.traced import Traced
 
 Port = tuple[System, int]
-"""A leaf system, or a diagram that is one block, and the index of one of its ports."""
+"""A system and the index of one of its ports; a diagram only if it is one block (`Traced`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wires:
-    """The leaf systems of a diagram and what connects them.
+    """The leaf systems of a diagram and the connections between their ports.
 
     Attributes:
         diagram: The diagram.
         systems: The leaf systems, in the order of Drake's states and parameters.
-        sources: Input port -> the output port that feeds it; an input without a wire is not there.
-        outputs: Name of an output port of the diagram -> the leaf's port.
-        inputs: Name -> an output port of a leaf at which wires are cut: what it shows is an input.
+        sources: Input port -> the output port that it is connected to. Unconnected input ports are
+            not among the keys.
+        outputs: Name of an output port of the diagram -> the port of a leaf.
+        inputs: Name -> the output port of a leaf where the connection is cut; its value is an
+            external input.
     """
 
     diagram: Diagram
@@ -36,19 +38,19 @@ class Wires:
     inputs: Mapping[str, Port] = field(default_factory=dict)
 
     def part(self, inputs: Mapping[str, Port], outputs: Mapping[str, Port]) -> "Wires":
-        """The part of the diagram from some output ports of leaves to others."""
+        """The part of the diagram between some output ports of leaves and others."""
         return replace(self, inputs=dict(inputs), outputs=dict(outputs))
 
     @classmethod
     def of(cls, diagram: Diagram) -> "Wires":
-        """The wires of a diagram."""
+        """Collects the leaf systems of a diagram and their connections."""
         systems: list[System] = []
         sources: dict[Port, Port] = {}
         _collect(diagram, systems, sources)
-        outputs = {}
-        for index in range(diagram.num_output_ports()):
-            name = diagram.get_output_port(index).get_name()
-            outputs[name] = _output(diagram, index)
+        outputs = {
+            diagram.get_output_port(index).get_name(): _output(diagram, index)
+            for index in range(diagram.num_output_ports())
+        }
         return cls(diagram, tuple(systems), sources, outputs)
 
 
@@ -58,30 +60,28 @@ def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port])
             _collect(system, systems, sources)
         else:
             systems.append(system)
-    for (taker, taken), (giver, given) in diagram.connection_map().items():
-        source = _output(giver, int(given))
-        for port in _inputs(taker, int(taken)):
+    for (reader, read), (writer, written) in diagram.connection_map().items():
+        source = _output(writer, int(written))
+        for port in leaf_inputs(reader, int(read)):
             sources[port] = source
 
 
 def leaf_port(port: OutputPort) -> Port:
-    """The leaf's port that an output port of any system shows."""
+    """The output port of a leaf whose value an output port of any system has."""
     return _output(port.get_system(), int(port.get_index()))
 
 
 def _output(system: System, index: int) -> Port:
-    """The leaf's port behind an output port."""
+    """The output port of a leaf that a diagram exports as this output port."""
     while isinstance(system, Diagram) and not isinstance(system, Traced):
         system, inner = system.get_output_port_locator(OutputPortIndex(index))
         index = int(inner)
     return system, index
 
 
-def _inputs(system: System, index: int) -> list[Port]:
-    """The leaves' ports behind an input port."""
+def leaf_inputs(system: System, index: int) -> list[Port]:
+    """The input ports of leaves that a diagram exports as this input port."""
     if not isinstance(system, Diagram) or isinstance(system, Traced):
         return [(system, index)]
-    found = []
-    for inner, port in system.GetInputPortLocators(InputPortIndex(index)):
-        found += _inputs(inner, int(port))
-    return found
+    locators = system.GetInputPortLocators(InputPortIndex(index))
+    return [leaf for inner, port in locators for leaf in leaf_inputs(inner, int(port))]

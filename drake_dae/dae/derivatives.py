@@ -29,7 +29,7 @@ from drake_dae.trace.factorization import (
 
 
 class Derivatives:
-    """The motion of a system on N* and its time derivatives, the control held constant.
+    """The motion of a system on N* and its time derivatives, for a constant control.
 
     Args:
         system: The system (1)-(3).
@@ -99,7 +99,7 @@ class Derivatives:
         return self._rates[0]
 
     def derivative(self, expression: ca.SX) -> ca.SX:
-        """The time derivative of an expression along the motion.
+        """Returns the time derivative of an expression along the motion.
 
         Args:
             expression: Of the state and of the unknowns, shape (k, 1).
@@ -112,11 +112,11 @@ class Derivatives:
         return self._total_derivative(expression)
 
     def expand(self, expression: ca.SX) -> ca.SX:
-        """An expression in terms of state, control and parameters alone."""
+        """Returns an expression in terms of only state, control and parameters."""
         return self._inline(expression, len(self._values))
 
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """a(x) and B(x) of an expression a(x) + B(x) u of the motion, as (9)-(14) and (16) read.
+        """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion.
 
         B is formed by the chain rule over the unknowns, which takes far fewer operations than
         differentiating the expanded expression.
@@ -160,22 +160,22 @@ class Derivatives:
         return slope
 
     def has_unknowns(self, expression: ca.SX) -> bool:
-        """Whether an expression holds unknowns, so that A(x) must be regular for it."""
+        """Returns whether an expression contains unknowns, so that A(x) must be regular."""
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
     def inverse(
-        self, expression: ca.SX, wanted: ca.SX, shown: ca.SX | None = None
+        self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """The control for which an expression of the motion takes wanted values.
+        """Returns the control for which an expression of the motion has desired values.
 
-        The equations of the motion and `expression = wanted` are solved together for the control
+        The equations of the motion and `expression = desired` are solved together for the control
         and for the unknowns that it moves, block by block along their structure (Dulmage and
         Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
         it is inverse dynamics.
 
         Args:
             expression: Of the state and of the unknowns, shape (p, 1).
-            wanted: The wanted values, shape (p, 1).
+            desired: The desired values, shape (p, 1).
             shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
 
         Returns:
@@ -188,9 +188,9 @@ class Derivatives:
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
-        still = [i for i, moves in enumerate(moved) if not moves]
+        unmoved = [i for i, moves in enumerate(moved) if not moves]
         unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
-        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - wanted)
+        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - desired)
         involved = ca.which_depends(equations, unknowns, 1, True)
         used_rows = [i for i, involves in enumerate(involved) if involves]
         equations = equations[used_rows]
@@ -205,11 +205,11 @@ class Derivatives:
             ahead = unknowns[waiting]
             # An unknown that is solved for later may appear here with a slope that cancels.
             every = equations[[row for rows, _ in stage for row in rows]]
-            known = ca.vertsplit(
+            right_sides = ca.vertsplit(
                 ca.substitute(every, ahead, ca.SX.zeros(ahead.numel())),
                 np.cumsum([0, *[len(rows) for rows, _ in stage]]).tolist(),
             )
-            for (rows, columns), right in zip(stage, known, strict=True):
+            for (rows, columns), right in zip(stage, right_sides, strict=True):
                 factors = Factorization(ca.densify(matrix[rows, columns]))
                 blocks.append((columns, factors.solve(-right), factors.pivot))
             solved = {column for _, columns in stage for column in columns}
@@ -219,20 +219,20 @@ class Derivatives:
         uses = nonzeros(ca.jacobian_sparsity(ca.vertcat(ca.SX(0, 1), *solutions), unknowns))
         needed, pivot, last = [self.control, shown], ca.SX(1), len(uses)
         is_needed = np.any(nonzeros(ca.jacobian_sparsity(ca.vertcat(*needed), unknowns)), axis=0)
-        for columns, solution, own_pivot in reversed(blocks):
+        for columns, solution, block_pivot in reversed(blocks):
             last -= len(columns)
             if is_needed[columns].any():
                 is_needed |= uses[last : last + len(columns)].any(axis=0)
                 needed.append(solution)
-                pivot = ca.fmin(pivot, own_pivot)
-        if still and ca.depends_on(ca.vertcat(*needed), symbols[still]):
+                pivot = ca.fmin(pivot, block_pivot)
+        if unmoved and ca.depends_on(ca.vertcat(*needed), symbols[unmoved]):
             pivot = ca.fmin(pivot, self.pivot)
-        _, found = ca.substitute_inplace(
-            [symbols[still], *(unknowns[columns] for columns, _, _ in blocks)],
-            [values[still], *solutions],
+        _, results = ca.substitute_inplace(
+            [symbols[unmoved], *(unknowns[columns] for columns, _, _ in blocks)],
+            [values[unmoved], *solutions],
             [self.control, pivot, shown],
         )
-        return found[0], found[1], found[2]
+        return results[0], results[1], results[2]
 
     def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
         """The derivatives of equations of some orders, and of an expression, by what moves."""
@@ -298,26 +298,21 @@ class Derivatives:
         if damping is not None:
             rate = rate + damping
         self._equations.append(ca.vertcat(self._balance, rate))
-        known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
+        remainder = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
         count = len(self._rows)
-        solution = self._unknowns(known[:count, :], known[count:, :])
+        solution = self._unknowns(remainder[:count, :], remainder[count:, :])
         self._values.append(ca.densify(self._inline(solution, len(self._values))))
 
     def _inline(self, expression: ca.SX, orders: int) -> ca.SX:
         """An expression with the values of the first `orders` unknowns put in."""
-        return (
-            ca.substitute(
-                expression,
-                ca.vertcat(*self._symbols[1 : orders + 1]),
-                ca.vertcat(*self._values[:orders]),
-            )
-            if orders
-            else expression
-        )
+        if not orders:
+            return expression
+        symbols = ca.vertcat(*self._symbols[1 : orders + 1])
+        return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
 
 
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-    """Whether two expressions have the same values at random states around the nominal one.
+    """Returns whether two expressions agree at random states around the nominal state.
 
     The parameters are varied as well: expressions that agree at their defaults alone are different.
     """
@@ -330,12 +325,12 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
         x = system.nominal_state + deviation * random.standard_normal(system.num_states)
         numbers = [random.standard_normal(u.numel()) for u in unknowns]
         changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
-        one, other = (v.full() for v in function(x, *numbers, changed))
-        if not (np.all(np.isfinite(one)) and np.all(np.isfinite(other))):
+        a, b = (v.full() for v in function(x, *numbers, changed))
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
             continue  # Out of the domain of one of the functions.
         finite += 1
         # By columns: constraints may have very different units.
-        size = np.abs(one).max(axis=0, initial=0.0) + np.abs(other).max(axis=0, initial=0.0)
-        if not np.all(np.abs(one - other) <= 1e-9 * np.abs(other) + 1e-11 * size):
+        size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
+        if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
             return False
     return finite > 0

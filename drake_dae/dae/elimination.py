@@ -43,7 +43,7 @@ class Elimination:
 
 
 def eliminate(derivatives: Derivatives) -> Elimination:
-    """Reads (9)-(14) off the derivatives on N*, which are affine in the control."""
+    """Derives (9)-(14) from the derivatives on N*, which are affine in the control."""
     system = derivatives.system
     alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14)
     f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
@@ -67,7 +67,7 @@ def eliminate_numbers(
     scale: FloatArray,
     negligible: float,
 ) -> tuple[Sized, Sized]:
-    """h* (10) and n* (12) at one state; entries that are only round-off are set to zero.
+    """Returns h* (10) and n* (12) at one state, without round-off.
 
     The expressions of `eliminate` do not show how large their cancelled terms were; the factors of
     beta (14) do.

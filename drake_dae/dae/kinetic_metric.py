@@ -3,7 +3,7 @@
 A mechanical system E x' = f + g v has constraint forces along the gradients of its constraints.
 Their impulses change velocities by dv = M^-1 J^T mu, the change of least kinetic energy. Positions
 change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So heavy bodies move little in any
-units, and coordinates that no constraint force acts on stay unchanged.
+units, and coordinates on which no constraint force acts do not change.
 """
 
 import casadi as ca
@@ -19,7 +19,7 @@ ALONG = 1e-6
 
 
 class KineticMetric:
-    """Directions in which states move onto N* with least kinetic energy.
+    """The directions in which states move onto N* with least kinetic energy.
 
     Args:
         system: The system (1)-(3).
@@ -31,14 +31,14 @@ class KineticMetric:
         orders, degrees = layout.orders, np.array(layout.degrees, dtype=int)
         owners = np.repeat(np.arange(degrees.size), degrees)
         # The number of further derivatives of a row until the constraint inputs act.
-        left = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
+        further = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
         groups = _groups(system, int(max(degrees, default=0)))
         self.levels: list[tuple[Indices, Indices, int]] = [
-            (np.flatnonzero(left == depth), groups[depth], depth)
+            (np.flatnonzero(further == depth), groups[depth], depth)
             for depth in reversed(range(len(groups)))
-            if np.any(left == depth)
+            if np.any(further == depth)
         ]
-        self._last = np.flatnonzero(left == 0)
+        self._last = np.flatnonzero(further == 0)
         self.is_known = len(groups) == int(max(degrees, default=0)) and bool(groups)
         if not self.is_known:
             return
@@ -57,7 +57,7 @@ class KineticMetric:
     def does_no_work(
         self, state: FloatArray, parameters: FloatArray, gradients: FloatArray
     ) -> bool:
-        """Whether all forces of constraints are along their gradients at a state.
+        """Returns whether all constraint forces are along their gradients at a state.
 
         Args:
             state: x, shape (n,).
@@ -69,16 +69,16 @@ class KineticMetric:
         forces = self._values(state, parameters)[1]
         across = gradients[np.ix_(self._last, self._groups[0])].T
         lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
-        if not all(np.all(np.isfinite(one)) and np.all(one > 0.0) for one in lengths):
+        if not all(np.all(np.isfinite(length)) and np.all(length > 0.0) for length in lengths):
             return False
         basis, unit = across / lengths[0], forces / lengths[1]
-        left = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
-        return bool(np.max(np.abs(left)) <= ALONG)
+        residual = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
+        return bool(np.max(np.abs(residual)) <= ALONG)
 
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int
     ) -> FloatArray:
-        """W^-1 C^T of some rows of C, where W is the metric of the states of a level.
+        """Returns W^-1 C^T of some rows of C, where W is the metric of the states of a level.
 
         Args:
             state: x, shape (n,).
@@ -104,14 +104,14 @@ class KineticMetric:
 
 
 def _groups(system: DaeSystem, count: int) -> list[Indices]:
-    """The states whose rates hold constraint inputs, those whose rates hold these, and so on."""
+    """Returns the states whose rates contain constraint inputs, then those that depend on these."""
     mass = nonzeros(system.mass_matrix.sparsity())
-    own = nonzeros(system.g.sparsity()).any(axis=1)
+    moved = nonzeros(system.g.sparsity()).any(axis=1)
     while True:
-        both = own | mass[:, own].any(axis=1)
-        if np.array_equal(both, own):
+        both = moved | mass[:, moved].any(axis=1)
+        if np.array_equal(both, moved):
             break
-        own = both
+        moved = both
     plain = np.array(
         [
             mass[i].sum() == 1 and bool(system.mass_matrix[i, i].is_one())
@@ -119,11 +119,11 @@ def _groups(system: DaeSystem, count: int) -> list[Indices]:
         ]
     )
     uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
-    groups, taken = [np.flatnonzero(own)], own.copy()
+    groups, taken = [np.flatnonzero(moved)], moved.copy()
     while len(groups) < count:
         following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
         if not following.any():
             break
         groups.append(np.flatnonzero(following))
         taken |= following
-    return groups if own.any() else []
+    return groups if moved.any() else []

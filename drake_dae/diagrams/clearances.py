@@ -1,4 +1,4 @@
-"""Links of a closed loop's robot along a recorded motion: in the way, how near, how fast."""
+"""Clearances and speeds of a robot's links along a recorded motion."""
 
 from dataclasses import dataclass
 
@@ -20,10 +20,10 @@ from drake_dae.simulation.records.record import Record
 
 @dataclass(frozen=True)
 class Nearness:
-    """How near the links of a robot came to anything in a run, and how fast its contacts went.
+    """The least distances of a robot's links in a run, and the largest speeds of its contacts.
 
     Attributes:
-        distances: The least distance from each surface, and of links from each other.
+        distances: The least distance of links from each surface, and of links from each other.
         speeds: The largest speed of each contact point.
     """
 
@@ -34,7 +34,7 @@ class Nearness:
 def links_in_the_way(
     loop: ClosedLoop, record: Record, context: Context
 ) -> tuple[LinkBehind | Collision, ...]:
-    """The links that went behind a surface in a run, and those that collided.
+    """Finds the links that were behind a surface in a run, and links that collided.
 
     Args:
         loop: The closed loop.
@@ -44,13 +44,13 @@ def links_in_the_way(
     if (model := loop.plant.model) is None:
         return ()
     shapes, states = LinkShapes(model, loop.scene_graph), record["state"]
-    own = _parameters(loop, record, context)
-    behind = links_behind(model, record.time, states, own, shapes)
+    parameters = _parameters(loop, record, context)
+    behind = links_behind(model, record.time, states, parameters, shapes)
     return *behind, *collisions(shapes, record.time, states)
 
 
 def nearness(loop: ClosedLoop, record: Record, context: Context) -> Nearness:
-    """How near and how fast the links of a robot were in a run; nothing of another plant.
+    """Computes the least distances and largest speeds of a run; none for a plant without a robot.
 
     Args:
         loop: The closed loop.
@@ -71,7 +71,7 @@ def nearness(loop: ClosedLoop, record: Record, context: Context) -> Nearness:
 def _parameters(loop: ClosedLoop, record: Record, context: Context) -> FloatArray:
     """The parameters of the plant at the times of a record, one row each."""
     plant = loop.plant
-    own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
-    if "exogenous" in record.signals:
-        own[:, plant.exogenous_places] = record["exogenous"]
-    return own
+    values = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+    if "exogenous" in record:
+        values[:, plant.exogenous_places] = record["exogenous"]
+    return values

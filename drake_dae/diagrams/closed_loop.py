@@ -13,8 +13,8 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.diagrams.force_feedback import seed_noise
 from drake_dae.diagrams.observing import Observer
+from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.pictures.diagram import diagram_svg
@@ -39,17 +39,17 @@ class ClosedLoop:
             `tracking_error`, and `link_state` of a robot.
         plant, controller: The systems in it.
         generator: The generator of references; None for a controller that plans them itself.
-        loggers: Port name -> (sink, names and units), one sample per step, for signals with memory.
+        loggers: Port name -> (sink, names and units) of the logged signals, one sample per step.
             `record` computes the other signals from these.
         signals: Names and units of each signal that is logged or computed.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
-        plant_exogenous: That for the plant, or None.
+        plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
-        observer: The observer that feeds the law instead, or None.
-        memory: The data that `rollout` reuses.
+        observer: The observer of the disturbance or the state, or None.
+        memory: A cache for rollouts and starts.
     """
 
     diagram: Diagram
@@ -96,7 +96,7 @@ class ClosedLoop:
         return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Chooses the noise of the sensor; without a call it is the same in every run.
+        """Sets the seed of the force sensor's noise; the default is the same in every run.
 
         Args:
             context: The diagram's context.
@@ -105,11 +105,11 @@ class ClosedLoop:
         seed_noise(self.noise, context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state of the plant, shape (n,), as given.
+        """Sets the state x of the plant, without a projection onto the constraints.
 
         Args:
             context: The diagram's context.
-            state: x.
+            state: x, shape (n,).
 
         Raises:
             ModelError: The shape is wrong.
@@ -125,11 +125,11 @@ class ClosedLoop:
         return self.controller.changes(self.controller.GetMyContextFromRoot(context))
 
     def record(self, context: Context, after: float | None = None) -> Record:
-        """The logged signals up to now, and those computed from them.
+        """The record of a run: the logged signals up to now, and signals computed from them.
 
         It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
-        controller; see its class. Parameters and gains are those of each time. At an impact or a
-        change of phase, values are those before it.
+        controller; see its class. Each row is computed with the parameters and gains of its time.
+        At an impact or a change of phase, values are those before it.
 
         Args:
             context: The diagram's context.
@@ -142,32 +142,28 @@ class ClosedLoop:
         logged = Record.from_logs(self.loggers, context, after)
         if self.plant.functions:
             logged = completed(logged, self, context)
-        found = self.with_errors(logged, context).while_finite()
+        record = self.with_errors(logged, context).while_finite()
         begin = -np.inf if after is None else after
-        end = found.time[-1] if found.time.size else -np.inf
+        end = record.time[-1] if record.time.size else -np.inf
         events = self.plant.events(self.plant.GetMyContextFromRoot(context))
-        return replace(found, events=tuple(one for one in events if begin < one.time <= end))
+        return replace(record, events=tuple(event for event in events if begin < event.time <= end))
 
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
-        """A record with the derived signals of its controller: `tracking_error` and others.
+        """Adds the derived signals of the controller, such as `tracking_error`, to a record.
 
         Args:
             record: The record.
             context: The diagram's context after the run, for controllers that need it.
         """
+        plant, controller, at_controller = self.plant, self.controller, None
         values = {name: recorded.values for name, recorded in record.signals.items()}
-        own = None
         if context is not None:
-            own, at_plant = (
-                block.GetMyContextFromRoot(context) for block in (self.controller, self.plant)
-            )
-            along = self.plant.parameters_along(at_plant, record.time)
-            values["parameters"] = self.controller.law.system.parameters_of(self.plant.dae, along)
-        derived = {
-            name: recorded_values(found, tuple(signals))
-            for name, (found, signals) in self.controller.derived(own, record.time, values).items()
-        }
-        return Record(record.time, {**record.signals, **derived})
+            at_controller = controller.GetMyContextFromRoot(context)
+            along = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+            values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
+        derived = controller.derived(at_controller, record.time, values)
+        added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
+        return Record(record.time, {**record.signals, **added})
 
     def predicted_error(self, record: Record) -> FloatArray:
         """The predicted error (30), (31) of a record, one column for each output."""

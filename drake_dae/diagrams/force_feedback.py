@@ -1,13 +1,13 @@
-"""The wire from a plant's constraint force to its law."""
+"""The connection from a plant's constraint force to its law."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.common import RandomDistribution, RandomGenerator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.observing import Observer
+from drake_dae.diagrams.sources import add_noise
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.sampling import Sampling
@@ -44,18 +44,13 @@ def add_force_feedback(
     if sensor is not None:
         builder.Connect(force, sensor.GetInputPort("force"))
         force = sensor.GetOutputPort("measured_force")
-        if sensor.HasInputPort("noise"):
-            size = sensor.GetInputPort("noise").size()
-            period = sensor.sample_period or sensor.time_constant
-            source = RandomSource(RandomDistribution.kGaussian, size, period)
-            noise = builder.AddSystem(source)
-            noise.set_name("force_noise")
-            builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+        period = sensor.sample_period or sensor.time_constant
+        noise = add_noise(builder, sensor, period, "force_noise")
     builder.Connect(force, controller.GetInputPort("measured_force"))
     if controller.HasOutputPort("tared_force"):
         force = controller.GetOutputPort("tared_force")
-    for taker in others:
-        builder.Connect(force, taker.GetInputPort("measured_force"))
+    for block in others:
+        builder.Connect(force, block.GetInputPort("measured_force"))
     return noise
 
 
@@ -99,30 +94,18 @@ def _check_loop(
 
 
 def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> float:
-    """The factor of the force error of a rigid robot per sample.
+    """The factor by which each sample multiplies the force error of a rigid robot.
 
     The force follows the acting control, lambda = -Gbar y of an earlier sample, and the sensor
-    follows the force, y' = a y + (1 - a) lambda: z^(d + 1) - a z^d + (1 - a) Gbar = 0 for d late
-    samples.
+    follows the force, y' = a y + (1 - a) lambda. With a delay of d samples the factor is the
+    largest root, in magnitude, of z^(d + 1) - a z^d + (1 - a) Gbar = 0.
     """
     lag = sensor.time_constant if sensor is not None else 0.0
     a = float(np.exp(-sampling.period / lag)) if lag else 0.0
-    # A value that a sensor takes at the same instant is read at the next one.
+    # The law reads what a sensor samples at the same instant one sample later.
     late = sampling.late_samples + bool(sensor is not None and sensor.sample_period)
     polynomial = np.zeros(late + 2)
     polynomial[0] = 1.0
     polynomial[1] -= a
     polynomial[-1] += (1.0 - a) * gain
     return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))
-
-
-def seed_noise(noise: RandomSource | None, context: Context, seed: int) -> None:
-    """Chooses the noise of a sensor, if it has any.
-
-    Args:
-        noise: Its source.
-        context: The diagram's context.
-        seed: The seed of the random numbers.
-    """
-    if noise is not None:
-        noise.SetRandomContext(noise.GetMyMutableContextFromRoot(context), RandomGenerator(seed))

@@ -1,4 +1,4 @@
-"""The wires of an observer, and the law that a scenario's observer feeds."""
+"""The observer of a closed loop, and its connections."""
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
@@ -28,9 +28,10 @@ def add_observer(
     limits: ControlLimits | None,
     encoders: Encoders | None,
 ) -> Observer:
-    """Adds the observer that feeds a controller's exogenous signals, but not yet its force.
+    """Adds the observer and connects it to the controller's exogenous port.
 
-    If it estimates the state, it also feeds the controller's state.
+    If it estimates the state, it is connected to the controller's state port as well. Its port
+    `measured_force` is left open: `add_force_feedback` connects it.
 
     Args:
         builder: The builder of the diagram, with the other blocks in it.
@@ -39,8 +40,8 @@ def add_observer(
         observing: The rates of the observer.
         state: The measured state.
         sampling: The sampling of the hold after the controller.
-        control: The control at the plant. An observer of a controller with `observed` ports takes
-            these in place of both.
+        control: The control at the plant. If the controller has `observed` ports, they replace
+            state and control.
         reference: R(t).
         limits: The limits of the drives.
         encoders: What measures the state; None if it is exact.
@@ -72,16 +73,16 @@ def add_observer(
         )
     late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
-    seen = state
+    observed_state = state
     if controller.observed is not None:
-        seen, control = (controller.GetOutputPort(name) for name in controller.observed)
-        lag = 0.5  # What is measured at both ends of a sample: their mean.
+        observed_state, control = (controller.GetOutputPort(name) for name in controller.observed)
+        lag = 0.5  # The mean of the measurements at both ends of a sample.
     observer: Observer
     if observing.state_rate is None:
         observer = builder.AddSystem(
             DisturbanceObserver(controller.law, observing, period, lag, delay)
         )
-        builder.Connect(seen, observer.GetInputPort("estimated_state"))
+        builder.Connect(observed_state, observer.GetInputPort("estimated_state"))
     elif controller.observed is not None:
         raise WiringError(
             f"a state_rate is for robots with rigid joints, and {controller.get_name()} has "

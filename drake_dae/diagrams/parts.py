@@ -54,7 +54,7 @@ def add_block(builder: DiagramBuilder, block: Block) -> Block:
 def add_signals(
     builder: DiagramBuilder, controller: Controller, signals: Mapping[str, Reference | float]
 ) -> None:
-    """Wires the signals for which a controller waits; the others become inputs of the diagram.
+    """Connects the signals for which a controller waits; without a source they become inputs.
 
     Args:
         builder: The builder of the diagram, with the controller in it.
@@ -75,8 +75,8 @@ def add_signals(
         if name not in signals:
             builder.ExportInput(port, SIGNAL + name)
             continue
-        given = signals[name]
-        reference = given if isinstance(given, Reference) else ConstantReference(given)
+        signal = signals[name]
+        reference = signal if isinstance(signal, Reference) else ConstantReference(signal)
         if reference.size != 1:
             raise WiringError(
                 f"the signal '{name}' is one number, its reference has {reference.size}"
@@ -89,7 +89,7 @@ def add_signals(
 def contact_reference(
     controller: Controller, reference: ReferenceGenerator | None
 ) -> OutputPort | None:
-    """R of the law in contact, from its generator, or from a controller that plans it; or None."""
+    """The port of R(t) of the law in contact, of a generator or of the controller; None if none."""
     block, name = reference or controller, "reference" if reference else "contact_reference"
     return block.GetOutputPort(name) if block.HasOutputPort(name) else None
 
@@ -121,23 +121,22 @@ def check_parts(
     missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}
     refused = {name: needs for name, source in missing.items() if source is None}
     refused |= controller.refused
-    given = {name: getattr(parts, name) for name in refused}
-    found = [
-        f"{name}: {refused[name]}"
-        for name, value in given.items()
-        if value is not None and not (name == "exogenous" and not value)
+    problems = [
+        f"{name}: {reason}"
+        for name, reason in refused.items()
+        if (value := getattr(parts, name)) is not None and (name != "exogenous" or value)
     ]
-    if found:
-        raise WiringError("; ".join(found))
+    if problems:
+        raise WiringError("; ".join(problems))
     sensor = parts.sensor
     if sensor is None:
         return
-    own, size = plant.dae, sensor.GetInputPort("force").size()
-    if size != own.num_constraints:
-        names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
+    dae, size = plant.dae, sensor.GetInputPort("force").size()
+    if size != dae.num_constraints:
+        names = ", ".join(signal.name for signal in dae.constraint_input_signals) or "none"
         raise WiringError(
-            f"the sensor measures {size} forces, the plant '{own.name}' has "
-            f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
+            f"the sensor measures {size} forces, the plant '{dae.name}' has "
+            f"{dae.num_constraints} ({names}); make it as ForceSensor({dae.num_constraints}, "
             "...)"
         )
     if not controller.HasInputPort("measured_force"):
@@ -151,7 +150,7 @@ def add_feasible(
     control_limits: ArrayLike,
     state: OutputPort,
 ) -> FeasibleControl:
-    """Adds limits of the control by which errors leave their prediction least.
+    """Adds limits of the control under which errors deviate least from their prediction.
 
     Args:
         builder: The builder of the diagram, with the controller in it.
@@ -182,13 +181,12 @@ def add_feasible(
 
 def add_drives(
     builder: DiagramBuilder,
-    controller: Controller,
+    control: OutputPort,
     sampling: Sampling | None,
     control_limits: ArrayLike | None,
-    control: OutputPort | None = None,
 ) -> tuple[OutputPort, ControlLimits | None]:
-    """Adds hold and limits between controller and plant; returns the control at the plant."""
-    control, limits = control or controller.GetOutputPort("control"), None
+    """Adds hold and limits behind a control; returns the control at the plant, and the limits."""
+    limits = None
     if sampling is not None:
         hold = builder.AddSystem(ControlHold(control.size(), sampling))
         builder.Connect(control, hold.get_input_port())
@@ -212,23 +210,23 @@ def add_watch(
     law: TrackingLaw,
     tolerances: Tolerances,
 ) -> None:
-    """Adds the watch that ends a run with too large errors.
+    """Adds the block that ends a run whose errors exceed the tolerances.
 
     Raises:
         WiringError: There is no such output.
     """
-    dae = plant.dae
-    sizes = law.layout.reference_size, dae.num_states
+    dae, layout = plant.dae, law.layout
+    signals, sizes = (
+        (dae.output_signals, dae.force_signals),
+        (layout.reference_size, dae.num_states),
+    )
     # For a continuous plant, often enough for the time constant.
     period = plant.time_step or tolerances.window / 20.0
-    lowest = law.layout.lowest
     try:
-        made = ToleranceWatch(
-            tolerances, dae.output_signals, dae.force_signals, lowest, sizes, period
-        )
+        watch = ToleranceWatch(tolerances, *signals, layout.lowest, sizes, period)
     except ModelError as error:
         raise WiringError(str(error)) from None
-    watch = builder.AddSystem(made)
+    builder.AddSystem(watch)
     builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
     for name in ("controlled_output", "constraint_force", "state"):
         builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
@@ -237,12 +235,12 @@ def add_watch(
 def add_hold(
     builder: DiagramBuilder, controller: Controller, sources: Sequence[OutputPort]
 ) -> None:
-    """Connects signals that stop the integrals of a controller while they are not 0.
+    """Connects the signals that stop the integrals of a controller while they are not 0.
 
     Args:
         builder: The builder of the diagram.
         controller: The controller.
-        sources: The signals: of one entry for all integrals, or of one for each.
+        sources: The signals, each with one entry for all integrals or one entry per integral.
     """
     if not (sources and controller.HasInputPort("hold")):
         return
@@ -258,35 +256,37 @@ def add_hold(
 
 
 def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) -> list[OutputPort]:
-    """Ports for the `hold` of a controller: integrals of forces of open contacts are not updated.
+    """Adds the block that stops the integrals of the forces of open contacts.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The plant.
         controller: The controller of the integrals.
+
+    Returns:
+        Its output port, for the controller's `hold`; empty if there is no such integral.
     """
     if not controller.HasInputPort("hold"):
         return []
     law = controller.law
     inputs = law.measured_force.inputs if law.measured_force else {}
-    found = np.zeros((len(law.integral.outputs), len(plant.contacts)))
+    integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
     for row, output in enumerate(law.integral.outputs):
         for column, normal in enumerate(plant.normals):
-            found[row, column] = inputs.get(output) == normal
-    if not found.any():
+            integrates[row, column] = inputs.get(output) == normal
+    if not integrates.any():
         return []
-    system = AffineSystem(D=-found, y0=found.sum(axis=1))
-    hold = builder.AddSystem(system)
+    hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
     return [hold.get_output_port()]
 
 
 def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> VectorLogSink:
-    """Logs once per step.
+    """Adds a log with one sample per step.
 
-    For a discrete plant it is periodic: after the last step of a run its state belongs to a time
-    that the run has not reached.
+    For a discrete plant the log is periodic, since after the last step of a run the state of the
+    plant belongs to a time that the run has not reached.
     """
     if plant.time_step:
         return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
@@ -294,7 +294,7 @@ def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> Vector
 
 
 def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
-    """The sampling of the hold: a discrete plant uses the control held one of its steps before."""
+    """The sampling of the hold; a discrete plant adds a delay of one of its own steps."""
     step = plant.time_step
     if step and sampling.delay < step * (1.0 - 1e-9):
         raise WiringError(

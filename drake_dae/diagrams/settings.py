@@ -27,28 +27,30 @@ class LoopSettings:
             force is connected directly, if that closes no algebraic loop.
         encoders: The measurement of the state for the law, at its samples; the record has it as
             "estimated_state". None for the exact state.
-        sampling: The period and delay of the law; its control is held between. The error is
-            predicted up to first order in these times. None for a continuous law, or, on a discrete
-            plant, one that acts at each of its steps.
+        sampling: The period and delay of the law, with a zero-order hold of its control. The error
+            is predicted up to first order in these times. None for a continuous law, or on a
+            discrete plant for a law that is evaluated at each step of the plant.
         control_limits: The largest |u| of the drives, shape (p,), such as `model.control_limits`;
             the record has "excess", the part beyond. Integrals are not updated meanwhile. None for
             no limits.
         observer: The settings of a `DisturbanceObserver`, for a sampled law with measured force of
             a system that `with_disturbance` made. The record has its "disturbance" and "friction",
             and integrals are not updated while a contact is lost.
-        exogenous: The exogenous signals of plant and law, as references for all entries of w in
-            their order; constant if none are given.
-        plant_exogenous: Those of the plant if they differ from the law's; None if they are equal.
-        governed: The limits within which a `PathGovernor` slows the references; None for none. With
-            `control_limits` as well, these and the limits of forces hold by `FeasibleControl`, and
-            the record has its "departure".
+        exogenous: The references of all exogenous signals w of plant and law, in their order; w is
+            constant if empty.
+        plant_exogenous: The references of the plant's exogenous signals; None if they equal the
+            law's.
+        governed: The limits that a `PathGovernor` keeps by slowing down the references; None for no
+            governor. If `control_limits` are given as well, `FeasibleControl` keeps both, and the
+            record has its "departure".
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
-        signals: Name -> reference of a signal for which a controller waits, as phases of a task do;
-            it has come where it is above 1/2. One that is not given is an input port signal_<name>
-            of the loop.
-        commands: How fast references and exogenous signals follow what a person commands while the
-            loop runs; see `CommandedReferences`. None for references that nobody changes.
-        start_time: The start of a run, in s: the zero dynamics are judged at the references then.
+        signals: Name -> reference of a signal for which a controller waits, such as phases of a
+            task; the signal is set where the reference is above 1/2. For any other signal the loop
+            has an input port signal_<name>.
+        commands: The limits with which references and exogenous signals follow a person's commands
+            during the run; see `CommandedReferences`. None for no commands.
+        start_time: The start time of a run, in s: the stability of the zero dynamics is judged with
+            the references at this time.
     """
 
     sensor: ForceSensor | None = None

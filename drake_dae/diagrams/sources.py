@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.framework import Context, DiagramBuilder, System
+from pydrake.systems.primitives import RandomSource
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.system import DaeSystem
@@ -19,11 +21,11 @@ from drake_dae.systems.plants.contract import Plant
 def make_generator(
     references: Sequence[Reference], law: TrackingLaw, parts: LoopSettings
 ) -> ReferenceGenerator:
-    """The generator of a law's references, which are commanded if the settings say so.
+    """The reference block of a law: `CommandedReferences` if the settings have `commands`.
 
     Raises:
-        WiringError: References are to be governed and commanded.
-        ReferenceSignalError: They do not fit the law.
+        WiringError: The settings have both `governed` and `commands`.
+        ReferenceSignalError: The references do not fit the law.
     """
     if parts.commands is None:
         return ReferenceGenerator(references, law.degrees)
@@ -36,18 +38,21 @@ def make_generator(
 def add_exogenous(
     builder: DiagramBuilder, plant: Plant, controller: Controller, parts: LoopSettings
 ) -> tuple[ReferenceGenerator | None, ReferenceGenerator | None]:
-    """Adds the generators of exogenous signals, of the plant and of the law as known there.
+    """Adds the generators of the exogenous signals of the plant and of the law.
 
-    The diagram shows the latter as `known_exogenous`.
+    The output of the second one is exported as `known_exogenous`.
+
+    Returns:
+        The generator for the plant and that for the law, each None without exogenous signals.
 
     Raises:
         WiringError: The number of references differs from that of the signals.
     """
-    own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
-    # What is commanded passes as many lags to the plant as to the law.
+    of_plant = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
+    # Commands pass as many lags to the plant as to the law.
     degrees = *plant.exogenous_layout.degrees, *controller.exogenous_layout.degrees
     lags = parts.commands, max(degrees, default=0) + 1
-    moving = _add_exogenous(builder, plant, plant.dae, own, *lags)
+    moving = _add_exogenous(builder, plant, plant.dae, of_plant, *lags)
     known = _add_exogenous(builder, controller, controller.law.system, parts.exogenous, *lags)
     if known is not None:
         builder.ExportOutput(known.get_output_port(), "known_exogenous")
@@ -59,43 +64,50 @@ def _add_exogenous(
     block: Plant | Controller,
     dae: DaeSystem,
     exogenous: Sequence[Reference],
-    commands: CommandLimits | None = None,
-    depth: int = 0,
+    commands: CommandLimits | None,
+    depth: int,
 ) -> ReferenceGenerator | None:
-    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
-
-    Args:
-        builder: The builder of the diagram.
-        block: The block.
-        dae: The block's system.
-        exogenous: The references, in the order of the signals.
-        commands: How fast they follow what is commanded; None if nothing is.
-        depth: The least number of lags of these; plant and law have the same.
-
-    Raises:
-        WiringError: The number of references differs from that of the signals.
-    """
+    """Adds the generator of a block's exogenous signals, with as many lags as `depth`."""
+    if not exogenous:
+        return None
     names = [signal.name for signal in dae.exogenous.signals]
     size = sum(reference.size for reference in exogenous)
-    if exogenous and size != len(names):
+    if size != len(names):
         raise WiringError(
             f"the references of exogenous signals cover {size}, '{dae.name}' has "
             f"{len(names)}: {', '.join(names) or 'none'}"
         )
-    if not exogenous:
-        return None
     if any(reference.parameters for reference in exogenous):
         raise WiringError(
             "references of exogenous signals take no parameters: write their numbers into the "
             "expressions"
         )
     degrees, signals = block.exogenous_layout.degrees, dae.exogenous.signals
-    made = ReferenceGenerator(exogenous, degrees)
+    generator = ReferenceGenerator(exogenous, degrees)
     if commands is not None:
-        made = CommandedReferences(
+        generator = CommandedReferences(
             exogenous, degrees, signals, commands, has_speed=False, depth=depth
         )
-    generator = builder.AddSystem(made)
+    builder.AddSystem(generator)
     generator.set_name(f"{block.get_name()}_exogenous")
     builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
     return generator
+
+
+def add_noise(
+    builder: DiagramBuilder, sensor: System, period: float, name: str
+) -> RandomSource | None:
+    """Adds the source of a sensor's noise, with a period in s; None for a sensor without noise."""
+    if not sensor.HasInputPort("noise"):
+        return None
+    port = sensor.GetInputPort("noise")
+    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, port.size(), period))
+    noise.set_name(name)
+    builder.Connect(noise.get_output_port(), port)
+    return noise
+
+
+def seed_noise(noise: RandomSource | None, context: Context, seed: int) -> None:
+    """Sets the seed of a sensor's noise in the context of the diagram, if there is noise."""
+    if noise is not None:
+        noise.SetRandomContext(noise.GetMyMutableContextFromRoot(context), RandomGenerator(seed))

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.diagrams.sources import add_noise, seed_noise
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.systems.plants.contract import Plant
@@ -30,28 +30,20 @@ class MeasuredState:
         return self.sensor.GetOutputPort("estimated_state")
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Chooses the noise.
-
-        Args:
-            context: The context of the diagram around.
-            seed: The seed of the random numbers, below 2^32.
-        """
-        if self.noise is not None:
-            own = self.noise.GetMyMutableContextFromRoot(context)
-            self.noise.SetRandomContext(own, RandomGenerator(encoder_seed(seed)))
+        """Sets the seed of the noise, below 2^32, in the context of the diagram."""
+        seed_noise(self.noise, context, encoder_seed(seed))
 
 
 def encoder_seed(seed: int) -> int:
-    """The seed of the noise of encoders, other than a force sensor's with the same seed.
+    """The seed of the noise of encoders for a user's seed below 2^32.
 
-    Args:
-        seed: The user's seed, below 2^32.
+    It differs from the user's seed, which a force sensor uses, so that their noise is independent.
     """
     return (seed + 2**31) % 2**32
 
 
 def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
-    """The encoders of a robot; the arguments and errors are those of `add_encoders`."""
+    """Makes the encoders of a robot; the arguments and errors are those of `add_encoders`."""
     if not period:
         raise WiringError(
             "encoders are read at samples, and this law acts continuously; give it a sampling"
@@ -90,10 +82,4 @@ def add_encoders(
     sensor = make_sensor(plant, encoders, period)
     builder.AddSystem(sensor)
     builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
-    noise = None
-    if sensor.HasInputPort("noise"):
-        size = sensor.GetInputPort("noise").size()
-        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, size, period))
-        noise.set_name("encoder_noise")
-        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    return MeasuredState(sensor, noise)
+    return MeasuredState(sensor, add_noise(builder, sensor, period, "encoder_noise"))

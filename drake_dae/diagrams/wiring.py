@@ -1,4 +1,4 @@
-"""The wiring of a closed loop: plant, references and controller."""
+"""The connections of a closed loop: plant, references and controller."""
 
 from collections.abc import Mapping, Sequence, Set
 
@@ -56,11 +56,11 @@ def make_closed_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
 ) -> ClosedLoop:
-    """Wires a plant, a tracking law and its references, with loggers and a view.
+    """Builds the closed loop of a plant, a tracking law and references, with loggers and a view.
 
-    While a contact of a `UnilateralRobotPlant` is open the law continues, so that phi'' = -A(x)
-    lambda_d with the desired force lambda_d, and the integral of its force is not updated. With a
-    `ContactPlant` everything is logged at its steps.
+    While a contact of a `UnilateralRobotPlant` is open, the law continues, so that phi'' = -A(x)
+    lambda_d with the desired force lambda_d. The integral of this force is not updated. With a
+    `ContactPlant` all signals are logged at its steps.
 
     Args:
         plant: A `RobotPlant`, or any other `Plant`.
@@ -129,7 +129,7 @@ def wire_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
 ) -> ClosedLoop:
-    """Wires a plant and any controller, such as that of a task, with loggers and a view.
+    """Builds the closed loop of a plant and any controller, such as that of a task.
 
     Args:
         plant: The plant.
@@ -165,15 +165,13 @@ def wire_loop(
 
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
-    held = None if parts.sampling is None else hold_before(plant, parts.sampling)
+    sampling = None if parts.sampling is None else hold_before(plant, parts.sampling)
+    control, control_limits = controller.GetOutputPort("control"), parts.control_limits
     feasible = None
-    if parts.governed is not None and parts.control_limits is not None:
-        feasible = add_feasible(builder, controller, parts.governed, parts.control_limits, state)
-        control, limits = add_drives(
-            builder, controller, held, None, feasible.GetOutputPort("control")
-        )
-    else:
-        control, limits = add_drives(builder, controller, held, parts.control_limits)
+    if parts.governed is not None and control_limits is not None:
+        feasible = add_feasible(builder, controller, parts.governed, control_limits, state)
+        control, control_limits = feasible.GetOutputPort("control"), None
+    control, limits = add_drives(builder, control, sampling, control_limits)
     if controller.HasOutputPort("feedback"):
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
@@ -190,8 +188,8 @@ def wire_loop(
     # updated while a contact is open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if observing is not None and goal is not None:
-        wires = state, held, control, goal, limits
-        observer = add_observer(builder, plant, controller, observing, *wires, parts.encoders)
+        ports = state, sampling, control, goal, limits
+        observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
         holds.append(observer.GetOutputPort("hold"))
     for block in (limits if observer is None else None, feasible):
         if block is not None:
@@ -218,10 +216,9 @@ def wire_loop(
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
         named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
     if reference is not None:
-        for name, signals in reference.further_signals.items():
-            named[name] = (reference.GetOutputPort(name), signals)
+        named |= _further(reference)
     sources = {"reference": reference, "exogenous": moving}
-    by_time = {name for name, each in sources.items() if each is None or each.follows_time}
+    by_time = {name for name, block in sources.items() if block is None or block.follows_time}
     loggers = _logged(builder, plant, controller, control, named, by_time)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -251,10 +248,10 @@ def wire_loop(
 def can_be_fed_back(
     law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
 ) -> bool:
-    """Whether a plant can take a law itself, in place of its control: see `DaePlant.feedback`.
+    """Whether a plant can evaluate the law itself instead of an input `control`; see `DaePlant`.
 
-    So it is where the law acts continuously, through no drive with limits, and takes the state and
-    references alone; the arguments are those of `LoopSettings`.
+    The law must be continuous, without control limits, and depend on state and references only.
+    The arguments are those of `LoopSettings`.
     """
     takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
     is_direct = sampling is None and control_limits is None
@@ -274,7 +271,7 @@ def _logged(
     Args:
         builder: The builder of the diagram.
         plant, controller: The blocks.
-        control: What arrives at the plant.
+        control: The source of the plant's control.
         named: The signals.
         by_time: The signals that follow from the time.
     """
@@ -302,18 +299,18 @@ def _of_plant(
     law: TrackingLaw,
     control: OutputPort,
 ) -> Named:
-    """What a record has of every plant, and what goes into it."""
+    """The signals of every plant and its inputs that a record contains."""
     dae, named = plant.dae, Named()
     if moving is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         named["exogenous"] = (moving.get_output_port(), signals)
-    for name, own in {
+    for name, signals in {
         "state": dae.state_signals,
         "constraint_force": dae.force_signals,
         "constraint_residual": plant.structure.manifold.residual_signals,
         "controlled_output": dae.output_signals,
     }.items():
-        named[name] = (plant.GetOutputPort(name), own)
+        named[name] = (plant.GetOutputPort(name), signals)
     if reference is not None:
         named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
     return {**named, "control": (control, dae.control_signals)}
@@ -327,7 +324,7 @@ def _of_parts(
     observer: Observer | None,
     sensor: ForceSensor | None,
 ) -> Named:
-    """What a record has besides of this controller, these parts and this plant."""
+    """The further signals of controller, parts and plant that a record contains."""
     dae, named = plant.dae, Named()
     estimates = observer is not None and observer.HasOutputPort("estimated_state")
     if measured is not None:
@@ -339,11 +336,12 @@ def _of_parts(
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     for block in (controller, observer):
         if block is not None:
-            for name, signals in block.further_signals.items():
-                named[name] = (block.GetOutputPort(name), signals)
+            named |= _further(block)
     if sensor is not None:
         port = sensor.GetOutputPort("measured_force")
         named["measured_force"] = (port, dae.constraint_input_signals)
-    for name, signals in plant.further_signals.items():
-        named[name] = (plant.GetOutputPort(name), signals)
-    return named
+    return named | _further(plant)
+
+
+def _further(block: Plant | Controller | Observer | ReferenceGenerator) -> Named:
+    return {name: (block.GetOutputPort(name), s) for name, s in block.further_signals.items()}

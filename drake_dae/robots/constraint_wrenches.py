@@ -80,14 +80,14 @@ class ConstraintWrenches:
         nq, nv = self._sizes
         q, v = state[:nq], state[nq : nq + nv]
         values = self._parameters if parameters is None else parameters
-        found = self.function(q, v, constraint_force, values)
-        return Wrenches(*(columns.reshape(3, -1, order="F").T for columns in found))
+        tables = self.function(q, v, constraint_force, values)
+        return Wrenches(*(table.reshape(3, -1, order="F").T for table in tables))
 
 
 def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -> FloatArray:
     """The values of a constraint's parameters in one vector, from those of the system."""
-    own = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
-    return np.concatenate([np.zeros(0), *own])
+    values = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
+    return np.concatenate([np.zeros(0), *values])
 
 
 def contact_normals(model: RobotModel) -> TracedFunction:
@@ -99,5 +99,5 @@ def contact_normals(model: RobotModel) -> TracedFunction:
     links = model.links
     kinematics = links.kinematics()
     axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
-    found = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
-    return model.dae.trace("normals", {"normals": ca.densify(found)})
+    normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
+    return model.dae.trace("normals", {"normals": ca.densify(normals)})

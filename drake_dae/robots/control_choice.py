@@ -32,9 +32,9 @@ def check_outputs(
     Raises:
         ModelError: The numbers do not fit.
     """
-    own, count = len(links.actuator_signals), len(positions)
-    rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if own else 0
-    nu = own + len(motors)
+    of_joints, count = len(links.actuator_signals), len(positions)
+    rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if of_joints else 0
+    nu = of_joints + len(motors)
     if nu == 0 and count + forces:
         raise ModelError(
             f"{name}: there are no actuators, so no output can be controlled, but {count} "
@@ -50,12 +50,12 @@ def check_outputs(
                 "out"
             )
         return
-    if rank < own:
+    if rank < of_joints:
         actuators = ", ".join(signal.name for signal in links.actuator_signals)
         raise ModelError(
-            f"{name}: the {own} actuators {actuators} move the joints in {rank} independent ways "
-            "only, as where two drive one joint; leave one out, or give control_weights and fewer "
-            "outputs"
+            f"{name}: the {of_joints} actuators {actuators} move the joints in only {rank} "
+            "independent ways, for example if two drive one joint; leave one out, or give "
+            "control_weights and fewer outputs"
         )
     if forces > nu:
         raise ModelError(
@@ -100,5 +100,5 @@ def control_choice(
             "give each a weight, as 1 / limit^2"
         )
     nu = len(controls)
-    own, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
-    return own, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")
+    chosen, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
+    return chosen, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")

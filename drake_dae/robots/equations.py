@@ -95,11 +95,7 @@ def robot_equations(
             *(parameter for load in known_forces for parameter in load.parameters),
             *choice,
         ),
-        state_signals=(
-            *links.position_signals,
-            *links.velocity_signals,
-            *driven.state_signals,
-        ),
+        state_signals=(*links.position_signals, *links.velocity_signals, *driven.state_signals),
         constraint_input_signals=bound.force_signals,
         constraint_output_signals=bound.residual_signals,
         control_signals=controls,

@@ -84,7 +84,7 @@ class ForceCombination(ForceOutput):
         forces = [constraints.force_signals[constraints.place(name)] for name in self.weights]
         units = dict.fromkeys(signal.unit for signal in forces)
         if len(units) > 1:
-            raise ModelError(f"'{self.name}' adds what has different units: {', '.join(units)}")
+            raise ModelError(f"'{self.name}' adds forces with different units: {', '.join(units)}")
         return (Signal(self.name, *units),)
 
 

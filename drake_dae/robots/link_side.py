@@ -1,4 +1,4 @@
-"""The links of a robot by themselves: what stands before the springs of its joints."""
+"""The links of a robot with springs in its joints, as a rigid robot."""
 
 from typing import Any, cast
 
@@ -16,12 +16,12 @@ from drake_dae.robots.model import RobotModel
 
 @checked(ModelError)
 def link_side(model: RobotModel) -> RobotModel:
-    """The rigid robot that the springs of a robot move,
+    """The links of a robot with springs in its joints, as a rigid robot,
 
         (M(q) - B) v' + H(q, v) = J(q)^T lambda + tau,
 
-    whose control is the torque tau of the springs. Rotors B move with the shafts and are no part of
-    it. It has the symbols q and v, the constraints and the outputs of the robot.
+    whose control is the torque tau of the springs. The rotors B move with the shafts and do not
+    belong to it. It has the symbols q and v, the constraints and the outputs of the robot.
 
     Args:
         model: A robot with springs in its joints.
@@ -34,26 +34,26 @@ def link_side(model: RobotModel) -> RobotModel:
             f"{model.name} has no springs in its joints, so that its links are not moved by springs"
         )
     links = cast(Links, _WithoutRotors(model.links))
-    own = model.constraints[: len(model.constraints) - len(plant_constraints(model.links))]
-    known = [parameter.name for parameter in model.dae.parameters if parameter.exogenous]
-    found = RobotModel(
+    constraints = model.constraints[: len(model.constraints) - len(plant_constraints(model.links))]
+    exogenous = [parameter.name for parameter in model.dae.parameters if parameter.exogenous]
+    robot = RobotModel(
         links,
-        own,
+        constraints,
         model.outputs,
         model.nominal_positions,
         model.name,
         (),
         model.forces,
-        known,
+        exogenous,
         model.known_forces,
         compiled=model.dae.compiled,
     )
-    found.control_limits = np.array(model.links.effort_limits)
-    return found
+    robot.control_limits = np.array(model.links.effort_limits)
+    return robot
 
 
 class _WithoutRotors:
-    """Links whose M is without the inertia of rotors; all else is that of the given links."""
+    """The given links with an M that does not include the inertia of rotors."""
 
     def __init__(self, links: Links) -> None:
         self._links = links
@@ -74,7 +74,7 @@ class _WithoutRotors:
         return np.zeros_like(self._links.reflected_inertia)
 
     def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
-        """M(q) v' + H(q, v) - tau of (37) with that M, shape (nv, 1)."""
-        found = self._links.inverse_dynamics(kinematics, reaction)
+        """M(q) v' + H(q, v) - tau of (37) with this M, shape (nv, 1)."""
+        balance = self._links.inverse_dynamics(kinematics, reaction)
         rotors = ca.SX(ca.sparsify(ca.DM(self._rotors)))
-        return found - ca.mtimes(rotors, kinematics.acceleration)
+        return balance - ca.mtimes(rotors, kinematics.acceleration)

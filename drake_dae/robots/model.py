@@ -109,8 +109,8 @@ class RobotModel:
         compiled: Compiled = "auto",
     ) -> None:
         self.links = links
-        every = (*constraints, *plant_constraints(links))
-        self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
+        all_constraints = (*constraints, *plant_constraints(links))
+        self.constraints = tuple(constraint.moving(exogenous) for constraint in all_constraints)
         self.outputs = tuple(outputs)
         self.name = name
         self.known_forces = tuple(known_forces)
@@ -243,15 +243,15 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        found, left = self._placing.solve(wanted, q, values)
-        size = float(np.max(np.abs(left), initial=0.0))
+        solution, residual = self._placing.solve(wanted, q, values)
+        size = float(np.max(np.abs(residual), initial=0.0))
         if size < 1e-10:
-            return found
+            return solution
         raise InconsistentStateError(
             f"{self.name}: no configuration near the guess satisfies the constraints with "
             f"outputs {show(wanted)}; {size:.2g} is left. They may be out "
             "of reach",
-            left,
+            residual,
         )
 
     def rest_state(
@@ -316,8 +316,8 @@ class RobotModel:
                     "velocities"
                 )
 
-    def _nominal(self, given: ArrayLike | None) -> FloatArray:
-        nominal = self.links.default_positions if given is None else given
+    def _nominal(self, positions: ArrayLike | None) -> FloatArray:
+        nominal = self.links.default_positions if positions is None else positions
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:

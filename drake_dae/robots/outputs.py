@@ -81,9 +81,7 @@ class AxisCoordinates(PositionOutput):
 
     def __post_init__(self) -> None:
         check_axes("components", self.components)
-        if len(self.axis) != 1:
-            raise ModelError(f"axis must be one of x, y, z, got '{self.axis}'")
-        check_axes("axis", self.axis)
+        _check_axis(self.axis)
 
     def expression(self, links: Links) -> ca.SX:
         column = links.rotation(self.frame)[:, "xyz".index(self.axis)]
@@ -140,16 +138,14 @@ class TiltFromNormal(PositionOutput):
     components: str = ""
 
     def __post_init__(self) -> None:
-        if len(self.axis) != 1:
-            raise ModelError(f"axis must be one of x, y, z, got '{self.axis}'")
-        check_axes("axis", self.axis)
+        _check_axis(self.axis)
         others = "xyz".replace(self.axis, "")
         if self.components:
             check_axes("components", self.components)
         if self.axis in self.components:
             raise ModelError(
-                f"components must be of {' and '.join(others)}, which are across the axis "
-                f"{self.axis}, got '{self.components}'"
+                f"components must be of {' and '.join(others)}, the axes normal to {self.axis}, "
+                f"got '{self.components}'"
             )
         object.__setattr__(self, "components", self.components or others)
 
@@ -157,8 +153,8 @@ class TiltFromNormal(PositionOutput):
         touch = self.contact.touch(links)
         if touch is None:
             raise ModelError(
-                f"constraint '{self.contact.name}' has no normal, as what touches a surface does; "
-                "use AxisCoordinates"
+                f"constraint '{self.contact.name}' is not a contact with a surface and has no "
+                "normal; use AxisCoordinates"
             )
         normal = ca.mtimes(links.rotation(touch.frame).T, touch.normal)
         return normal[["xyz".index(a) for a in self.components]]
@@ -213,3 +209,9 @@ class ExpressionOutput(PositionOutput):
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
         return tuple(self.outputs)
+
+
+def _check_axis(axis: str) -> None:
+    if len(axis) != 1:
+        raise ModelError(f"axis must be one of x, y, z, got '{axis}'")
+    check_axes("axis", axis)

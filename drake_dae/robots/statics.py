@@ -47,8 +47,8 @@ class StaticPlacement:
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
 
-        found, _ = newton(guess, linearize)
-        return found, residual(found)
+        q, _ = newton(guess, linearize)
+        return q, residual(q)
 
 
 class StaticBalance:
@@ -71,15 +71,15 @@ class StaticBalance:
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
         balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
         alone = [_unit_row(S[i, :]) for i in range(S.shape[0])]
-        given = {place: i for i, place in enumerate(alone) if place is not None}
-        known = ca.SX(force)
-        for place, i in given.items():
-            known[place] = load[i]
+        determined = {place: i for i, place in enumerate(alone) if place is not None}
+        forces = ca.SX(force)
+        for place, i in determined.items():
+            forces[place] = load[i]
         combined = [i for i, place in enumerate(alone) if place is None]
         rows = (ca.mtimes(S, force) - load)[combined]
-        balance = ca.substitute(ca.vertcat(balance, rows), force, known)
-        every = ca.substitute(dae.forces(known), v, ca.SX.zeros(v.numel()))
-        free = [i for i in range(dae.num_constraints) if i not in given]
+        balance = ca.substitute(ca.vertcat(balance, rows), force, forces)
+        all_forces = ca.substitute(dae.forces(forces), v, ca.SX.zeros(v.numel()))
+        free = [i for i in range(dae.num_constraints) if i not in determined]
         unknown = ca.vertcat(dae.state[links:], control, force[free])
         self._unknowns = unknown.numel()
         self._stages = dae.num_states - links
@@ -90,7 +90,7 @@ class StaticBalance:
             {
                 "balance": balance,
                 "gradient": ca.jacobian(balance, unknown),
-                "constraint_force": every,
+                "constraint_force": all_forces,
             },
         )
 
@@ -120,9 +120,9 @@ class StaticBalance:
             return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
-        left, _, constraint_force = self._function(q, forces, solution, parameters)
+        residuals, _, constraint_force = self._function(q, forces, solution, parameters)
         state = np.concatenate([q, self._still, solution[: self._stages]])
-        return state, constraint_force, float(np.max(np.abs(left), initial=0.0))
+        return state, constraint_force, float(np.max(np.abs(residuals), initial=0.0))
 
 
 def _unit_row(row: ca.SX) -> int | None:

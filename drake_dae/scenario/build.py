@@ -9,7 +9,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
@@ -44,7 +43,7 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.systems.cascade.cascade import SpringCascade
 from drake_dae.systems.control.command_filter import CommandLimits
-from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -141,17 +140,17 @@ def build_loop(
 
     # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
-    own = own_model(scenario, model.links) if plant is None else None
+    of_plant = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
-    if own is not None:
-        plant = make_plant(scenario, own.model, own.structure, opens=opens)
-        scene_graph = own.scene_graph
+    if of_plant is not None:
+        plant = make_plant(scenario, of_plant.model, of_plant.structure, opens=opens)
+        scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
-        plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
+        plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
     pushed = commands is not None
     plant = plant or make_plant(scenario, model, structure, feedback, opens, pushed)
 
-    # The parts between them; problems are reported with their key.
+    # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
         sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
     settings = LoopSettings(
@@ -170,28 +169,13 @@ def build_loop(
     )
     _check_parts(settings, plant)
 
-    # The wiring.
-    if task is not None:
-        controller = task_controller(scenario, model, law, settings.period(plant.time_step))
-        with at("task"):
+    # The connections.
+    with at("law" if task is None else "task"):
+        controller = _controller(scenario, model, structure, law, plant)
+        if controller is not None:
+            generator = None if task is not None else make_generator(references, law, settings)
             return wire_loop(
-                plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
-            )
-    if isinstance(scenario.law, Adaptive):
-        with at("law"):
-            period = settings.period(plant.time_step)
-            adapts = adaptive_controller(scenario.law, model, structure, period)
-            generator = make_generator(references, law, settings)
-            return wire_loop(
-                plant, adapts, generator, settings, scene_graph=scene_graph, meshcat=meshcat
-            )
-    loop = None if scenario.law is None else scenario.law.loop()
-    if loop is not None:
-        with at("law"):
-            cascade = _cascade(loop, law, model, plant, sampling)
-            generator = make_generator(references, law, settings)
-            return wire_loop(
-                plant, cascade, generator, settings, scene_graph=scene_graph, meshcat=meshcat
+                plant, controller, generator, settings, scene_graph=scene_graph, meshcat=meshcat
             )
     keys = ["observer"] if scenario.observer is not None else []
     keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
@@ -201,13 +185,21 @@ def build_loop(
         )
 
 
-def _cascade(
-    loop: SpringLoop, law: TrackingLaw, model: RobotModel, plant: Plant, sampling: Sampling | None
-) -> SpringCascade:
-    """The controller of a cascade."""
+def _controller(
+    scenario: Scenario, model: RobotModel, structure: Structure, law: TrackingLaw, plant: Plant
+) -> Controller | None:
+    """The controller of a task, an adaptive law or a cascade; None for the tracking law."""
+    sampling = scenario.sampling
+    period = plant.time_step if sampling is None else sampling.period
+    if scenario.task is not None:
+        return task_controller(scenario, model, law, period)
+    if isinstance(scenario.law, Adaptive):
+        return adaptive_controller(scenario.law, model, structure, period)
+    if scenario.spring_loop is None:
+        return None
     assert sampling is not None  # law_robot.
     lag = control_lag(plant, hold_before(plant, sampling))
-    return SpringCascade(law, model, loop, sampling.period, lag, sampling.delay)
+    return SpringCascade(law, model, scenario.spring_loop, period, lag, sampling.delay)
 
 
 def make_plant(
@@ -232,24 +224,30 @@ def make_plant(
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
     check_disturbances(scenario.plant_disturbances, model.links)
-    adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
-    parameters, disturbances = scenario.plant_parameters, scenario.plant_disturbances
-    given = parameters, disturbances, pushed
-    robot = RobotToSimulate(model, structure, feedback, opens, adds, *given)
+    robot = RobotToSimulate(
+        model,
+        structure,
+        feedback,
+        opens,
+        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
+        scenario.plant_parameters,
+        scenario.plant_disturbances,
+        pushed,
+    )
     return scenario.plant.plant(robot)
 
 
-def _law(scenario: Scenario, known: Structure) -> TrackingLaw:
+def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
     """The law of a scenario for a system."""
     force, damping = scenario.force_feedback, scenario.constraint_damping
-    keys = [key for key, used in (("force_feedback", force.is_measured), ("gains", True)) if used]
+    keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.
         return TrackingLaw(
-            known.system,
+            structure.system,
             scenario.gains.design(),
-            structure=known,
+            structure=structure,
             measured_force=force.is_measured,
             force_gain=force.gain,
             constraint_damping=None if damping is None else damping.design(),
@@ -283,12 +281,12 @@ def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
 def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -> list[Reference]:
     """References in the order of the outputs, each smooth enough."""
     outputs = [signal.name for signal in law.system.output_signals]
-    found = []
+    smooth = []
     for name, reference in references.items():
         with at(f"references.{name}"):
-            found.append(assigned(name, reference, outputs, law.degrees))
+            smooth.append(assigned(name, reference, outputs, law.degrees))
     with at("references"):
-        return in_order(found, outputs)
+        return in_order(smooth, outputs)
 
 
 def exogenous_references(
@@ -309,8 +307,8 @@ def exogenous_references(
     for parameter in system.exogenous.moving:
         key = f"exogenous.{parameter.name}"
         references = [
-            one if isinstance(one, Reference) else ConstantReference(one)
-            for one in scenario.exogenous[parameter.name]
+            entry if isinstance(entry, Reference) else ConstantReference(entry)
+            for entry in scenario.exogenous[parameter.name]
         ]
         size = sum(reference.size for reference in references)
         if size != parameter.value.size:

@@ -1,6 +1,7 @@
-"""A scenario whose references, surfaces and links a person moves while it runs."""
+"""A scenario whose references, surfaces and links a person can move while it runs."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,20 +20,21 @@ from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.systems.control.command_filter import CommandLimits
+from drake_dae.systems.task.phases.by_hand import ended_by_hand
 
 PUSH = "push."
-"""Begins the names of the wrenches that push links."""
+"""The prefix of the names of wrenches on links."""
 
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """A loop that a person changes while it runs.
+    """A loop that a person can change while it runs.
 
     Attributes:
-        scenario: The scenario, completed, with what was added to it.
-        loop: Its loop.
+        scenario: The completed scenario, with the added parameters and wrenches.
+        loop: Its closed loop.
         context: The context of its diagram at the start.
-        left_out: What cannot be changed in it, a sentence for each.
+        left_out: A sentence for each kind of change that is not possible.
     """
 
     scenario: Scenario
@@ -43,59 +45,74 @@ class Commanded:
 
 @checked(lambda text: ScenarioError(("", text)))
 def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> Commanded:
-    """The loop of a scenario with `CommandedReferences`, surfaces that move, and links to push.
+    """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
 
-    What nobody commands is as in the scenario: surfaces stand still, wrenches and friction are
-    zero. Signals for which a task waits are inputs of the diagram, to be given by hand. Where a
-    part does not fit the scenario, it is left out.
+    Without commands the loop runs as in the scenario: surfaces are fixed, and wrenches and
+    additional friction are zero. Signals for which a task waits are inputs of the diagram. Changes
+    that the scenario does not permit are left out.
 
     Args:
         scenario: What `load_scenario` returns.
-        limits: How fast references follow; `CommandLimits()` if None.
+        limits: How fast references follow commands; `CommandLimits()` if None.
 
     Raises:
-        ScenarioError: The scenario itself does not fit; the message names its key.
+        ScenarioError: The scenario itself is not valid; the message names the key.
     """
-    limits = limits or CommandLimits()
-    parts = dict(_PARTS)
-    left_out = dict[str, str]()
-    while True:
+    limits, left_out = limits or CommandLimits(), dict[str, str]()
+    with suppress(DrakeDaeError):
+        return _built(scenario, _with_parts(scenario, left_out), limits, left_out)
+    # Some part does not fit: one is added after the other.
+    left_out, wanted = {}, scenario
+    found = _built(scenario, wanted, limits, left_out)
+    for name, add in _PARTS.items():
+        added = add(wanted)
         try:
-            found = scenario
-            for name, add in parts.items():
-                added = add(found)
-                if isinstance(added, str):
-                    left_out[name] = f"{name}: {added}"
-                else:
-                    found = added
-            completed, loop = build_completed(found, commands=limits)
-            # At rest, where the scenario itself starts at rest.
-            begun = replace(completed.scenario, exogenous=scenario.exogenous)
-            context = start_scenario(begun, loop)
-            if loop.plant.pushes is not None:
-                left_out.pop(_PUSHED, None)
-            return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
+            if isinstance(added, str):
+                raise ScenarioError(("", added))
+            found = _built(scenario, added, limits, left_out)
+            wanted = added
         except DrakeDaeError as error:
-            if not parts:
-                raise
-            name = next(iter(parts))
-            del parts[name]
             left_out[name] = f"{name}: {error}"
+    return replace(found, left_out=tuple(left_out.values()))
 
 
-_PUSHED = "links that are pushed"
+def _with_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
+    """A scenario with all parts, except those that say why not."""
+    for name, add in _PARTS.items():
+        added = add(scenario)
+        if isinstance(added, str):
+            left_out[name] = f"{name}: {added}"
+        else:
+            scenario = added
+    return scenario
 
-_COMPLIANT = "none, since the contact of the plant is compliant"
+
+def _built(
+    given: Scenario, wanted: Scenario, limits: CommandLimits, left_out: Mapping[str, str]
+) -> Commanded:
+    """The loop of a scenario that is made from a given one."""
+    completed, loop = build_completed(wanted, commands=limits)
+    # At rest, where the scenario itself starts at rest.
+    begun = replace(completed.scenario, exogenous=given.exogenous)
+    context = start_scenario(begun, loop)
+    return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Surfaces whose positions are exogenous signals that stand still; or why there are none."""
+    """Makes the positions of surfaces constant exogenous signals; or says why it cannot.
+
+    Those of a compliant contact are moved as parameters of the plant, which no law knows.
+    """
+    if scenario.plant.carries:
+        return "none, since the surfaces of Drake's own contact stand still"
     if scenario.plant.material is not None:
-        return _COMPLIANT
-    if scenario.task is not None:
-        return "none, since tasks support no moving surfaces"
-    if scenario.observer is not None:
-        return "none, since an observer supports no exogenous signals"
+        return scenario
+    for part, what in ((scenario.task, "a task"), (scenario.observer, "an observer")):
+        if part is not None:
+            return (
+                f"none, since {what} does not know how a surface moves, and an ideal contact needs "
+                "a law that does; with `plant: !CompliantContact` they are dragged"
+            )
     moving = dict[str, Any]()
     for constraint in scenario.constraints:
         if isinstance(constraint, PointOnSurface):
@@ -106,27 +123,25 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
 
 
 def _with_friction(scenario: Scenario) -> Scenario | str:
-    """Surfaces with the parameters of friction, which is zero; or why without."""
-    lacks = any(
-        isinstance(each, PointOnSurface) and each.friction is None for each in scenario.constraints
-    )
-    if not lacks or scenario.plant.material is not None:
-        return scenario  # The plant may have a friction of its own.
+    """Gives frictionless contacts a coefficient of friction of 0; or says why it cannot."""
+    constraints = [
+        replace(constraint, friction=0.0)
+        if isinstance(constraint, PointOnSurface) and constraint.friction is None
+        else constraint
+        for constraint in scenario.constraints
+    ]
+    # The plant may have a friction of its own.
+    if constraints == scenario.constraints or scenario.plant.material is not None:
+        return scenario
     if scenario.actuation:
         return "none, since the law would differentiate it; give the constraint a friction"
-    constraints = [
-        replace(each, friction=0.0)
-        if isinstance(each, PointOnSurface) and each.friction is None
-        else each
-        for each in scenario.constraints
-    ]
     return replace(scenario, constraints=constraints)
 
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
-    """Links with wrenches that are zero; or why there are none."""
-    if scenario.plant.material is not None:
-        return _COMPLIANT
+    """Adds a zero wrench to each movable link; or says why it cannot."""
+    if scenario.plant.carries:
+        return scenario  # Its plant has pushes of its own.
     plant = robot_links(scenario.robot, SceneGraph())[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
@@ -137,9 +152,26 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
 
 
+def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
+    """A task whose phases end by hand, too, except those that make or break contact."""
+    task = scenario.task
+    if task is None:
+        return scenario
+    contacts = task.make().contacts
+    phases = [
+        phase
+        if phase.signal or contacts[place] != contacts[place + 1]
+        else ended_by_hand(phase, place)
+        for place, phase in enumerate(task.phases)
+    ]
+    given = {phase.signal: 0.0 for phase in phases if phase.signal}
+    return replace(scenario, task=replace(task, phases=phases, signals={**given, **task.signals}))
+
+
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
+    "phases that are ended by hand": _with_phases_ended_by_hand,
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
-    _PUSHED: _with_pushes,
+    "links that are pushed": _with_pushes,
 }
-"""What is added, in the order in which it is left out again."""
+"""The additions by name, in this order."""

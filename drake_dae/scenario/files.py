@@ -77,15 +77,17 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         # The working directory is gone; a link that leads to itself; a null byte.
         raise ScenarioError(("robot", f"no path: {error}")) from None
 
-    def located(one: Any) -> Any:
-        if isinstance(one, Mapping):
-            return {name: located(inner) for name, inner in one.items()}
-        if isinstance(one, list):
-            return [*map(located, one)]
-        if isinstance(one, phases.Phase):
-            inside = {part.name: located(getattr(one, part.name)) for part in fields(one)}
-            return replace(one, **inside)
-        return one.beside(here) if isinstance(one, references.Reference) else one
+    def located(value: Any) -> Any:
+        """A value with absolute file names in its references."""
+        if isinstance(value, Mapping):
+            return {name: located(inner) for name, inner in value.items()}
+        if isinstance(value, list):
+            return [*map(located, value)]
+        if isinstance(value, phases.Phase):
+            return replace(
+                value, **{f.name: located(getattr(value, f.name)) for f in fields(value)}
+            )
+        return value.beside(here) if isinstance(value, references.Reference) else value
 
     task = scenario.task
     return replace(
@@ -101,14 +103,10 @@ _ROBOT = re.compile(r"<(?:robot|sdf|mujoco)\b|^directives\s*:", re.MULTILINE)
 
 
 def _check_no_robot(path: Path, text: str) -> None:
-    """Refuses a robot's file in place of a scenario.
-
-    Raises:
-        ScenarioError: It is one; the message says how to make a scenario of it.
-    """
+    """Checks that a text is not a robot's file; the error says how to make a scenario of it."""
     is_markup = text.lstrip().startswith("<")
-    found = _ROBOT.search(text) if is_markup or "directives" in text else None
-    if found is None or is_markup == found[0].startswith("directives"):
+    match = _ROBOT.search(text) if is_markup or "directives" in text else None
+    if match is None or is_markup == match[0].startswith("directives"):
         return
     problem = (
         f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, and "

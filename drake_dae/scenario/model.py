@@ -28,13 +28,13 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.forms.keys import at, each
-from drake_dae.scenario.parts.written import WrittenForm, made
+from drake_dae.scenario.parts.written import WrittenForm, make
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0
-"""A surface from a file that is larger than the robot by this factor is probably in millimetres."""
+"""The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -52,26 +52,26 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
 @checked(lambda text: ScenarioError(("", text)))
 def complete_scenario(scenario: Scenario) -> Completed:
-    """The scenario with all outputs and a start.
+    """Adds missing outputs and a start to a scenario.
 
-    Outputs may be left out, or be fewer than the actuators minus the force outputs. They are
-    completed, in this order and only by independent ones, with: the world coordinates along the
-    surface of each contact point; the directions of the tool's axis by `tool_axis`; and positions
-    of joints, chosen such that B(x) (16) is best conditioned and joints are away from their limits
-    along the reference. Outputs without a reference keep their initial value.
+    Outputs are missing if there are fewer than actuators minus force outputs. Independent outputs
+    are added, in this order: the world coordinates along the surface of each contact point; the
+    directions of the tool's axis by `tool_axis`; and positions of joints, chosen so that B(x) of
+    (16) is best conditioned and joints are away from their limits along the reference. Outputs
+    without a reference keep their initial value.
 
-    If start.positions are left out and the default configuration does not lead to a regular start,
-    a start is searched with the first values of the references.
+    If start.positions are left out and Newton's method finds no regular start from the default
+    configuration, a start with the first values of the references is searched.
 
     Args:
         scenario: What `load_scenario` returns.
 
     Returns:
-        The scenario, unchanged if nothing was left out, and the choices in words.
+        The scenario, unchanged if nothing is missing, and the choices in words.
 
     Raises:
-        ScenarioError: Something does not fit, the start cannot be reached, or no outputs complete
-            those that are given; the message names the key.
+        ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
+            are independent of those in the scenario; the message names the key.
     """
     return _read(scenario, SceneGraph()).completed
 
@@ -81,7 +81,7 @@ def completed_model(
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
 ) -> tuple[Completed, RobotModel]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with these payloads."""
+    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads."""
     robot = _read(scenario, scene_graph or SceneGraph(), payloads)
     scenario = robot.completed.scenario
     outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
@@ -141,9 +141,11 @@ def _read(
     _outputs(scenario.outputs, constraints, links)
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
-    _check_forces(scenario.forces, constraints, links)
-    _check_compliances(scenario.compliances, constraints, links)
-    known_forces = each("known_forces", scenario.known_forces, lambda load: _load(load, links))
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    _check_forces(scenario.forces, bound, links)
+    _check_compliances(scenario.compliances or {}, bound)
+    known_forces = scenario.known_forces
+    each("known_forces", known_forces, lambda force: force.reaction(links.kinematics()))
     with at("control_weights"):
         choice = control_choice(name, scenario.control_weights or None, actuators)
     _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
@@ -178,15 +180,15 @@ def _constraints(
     loops: Sequence[Constraint],
     links: MultibodyExpressions,
 ) -> list[Constraint]:
-    constraints = each("constraints", forms, lambda form: made(form, ()))
-    each("constraints", constraints, lambda constraint: _try(constraint, links))
-    taken = [constraint.name for constraint in (*plant_constraints(links), *loops)]
+    constraints = each("constraints", forms, lambda form: make(form, ()))
+    each("constraints", constraints, lambda constraint: _evaluate(constraint, links))
+    names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
         name = constraint.name
-        if not name or name in taken:
+        if not name or name in names:
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
-        taken.append(name)
+        names.append(name)
         _compare_sizes(constraint, links)
     return [*constraints, *loops]
 
@@ -211,26 +213,22 @@ def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
         )
 
 
-def _try(constraint: Constraint, links: Links) -> None:
-    """Evaluates a constraint's equations, so that unknown names are found."""
+def _evaluate(constraint: Constraint, links: Links) -> None:
+    """Evaluates a constraint's equations, which raises an error for unknown names."""
     if constraint.residual(links).numel() < len(constraint.force_signals):
         constraint.rate(links.kinematics())
 
 
 def _check_forces(
-    forces: Sequence[str | ForceOutput] | None, constraints: Sequence[Constraint], links: Links
+    forces: Sequence[str | ForceOutput] | None, bound: ConstraintSet, links: Links
 ) -> None:
-    bound = ConstraintSet([*constraints, *plant_constraints(links)])
-    each("forces", forces or (), lambda one: force_rows(force_outputs([one], bound), bound, links))
+    each("forces", forces or (), lambda f: force_rows(force_outputs([f], bound), bound, links))
     with at("forces"):
         force_outputs(forces, bound)
 
 
-def _check_compliances(
-    compliances: Mapping[str, float] | None, constraints: Sequence[Constraint], links: Links
-) -> None:
-    bound = ConstraintSet([*constraints, *plant_constraints(links)])
-    for name, value in (compliances or {}).items():
+def _check_compliances(compliances: Mapping[str, float], bound: ConstraintSet) -> None:
+    for name, value in compliances.items():
         with at(f"compliances.{name}"):
             bound.place(name)
             if not value > 0.0:
@@ -242,7 +240,7 @@ def _outputs(
     constraints: Sequence[Constraint],
     links: Links,
 ) -> list[PositionOutput]:
-    outputs = each("outputs", forms, lambda form: made(form, constraints))
+    outputs = each("outputs", forms, lambda form: make(form, constraints))
     each("outputs", outputs, lambda output: output.expression(links))
     return outputs
 
@@ -256,11 +254,6 @@ def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
     return stages
 
 
-def _load(load: KnownForce, links: Links) -> KnownForce:
-    load.reaction(links.kinematics())
-    return load
-
-
 @at("exogenous")
 def _check_exogenous(
     names: Iterable[str],
@@ -269,7 +262,7 @@ def _check_exogenous(
     stages: Sequence[Stage],
     choice: Sequence[Parameter],
 ) -> None:
-    """Refuses exogenous names that are not parameters."""
+    """Checks that exogenous names are parameters."""
     attached = [stage.attach(links).parameters for stage in stages]
     groups = [links.parameters, *(member.parameters for member in members), *attached]
     known = [parameter.name for group in (*groups, choice) for parameter in group]
@@ -282,12 +275,13 @@ def _check_exogenous(
 def start_guess(
     positions: dict[str, float], links: Links, others: FloatArray | None = None
 ) -> FloatArray:
-    """The guess of q at the start.
+    """The initial guess of q for the computation of the start.
 
     Args:
         positions: Joint name -> position.
         links: The robot.
-        others: Those of all others, shape (nq,); the robot's default if None.
+        others: The positions of all joints that are not named, shape (nq,); the robot's defaults
+            if None.
     """
     guess = (links.default_positions if others is None else others).copy()
     for name, value in positions.items():

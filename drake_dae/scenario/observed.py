@@ -13,7 +13,7 @@ from drake_dae.systems.cascade.torque_loop import stages_of
 def law_robot(
     scenario: Scenario, model: RobotModel, structure: Structure
 ) -> tuple[RobotModel, Structure]:
-    """The robot that the law of a scenario is for, and the structure of its system.
+    """The model on which the law of a scenario is based, and the structure of its system.
 
     Args:
         scenario: The scenario.
@@ -21,7 +21,7 @@ def law_robot(
         structure: The structure of the robot's system.
 
     Returns:
-        These, or for the law of a cascade the links alone.
+        The model and structure given; for a cascade those of the links without springs and motors.
 
     Raises:
         ScenarioError: The cascade does not fit the scenario; the message names the key.
@@ -29,14 +29,9 @@ def law_robot(
     if not scenario.is_cascade:
         return model, structure
     with at("law"):
-        refused = {
-            "task": scenario.task is not None,
-            "compliances": scenario.compliances is not None,
-            "control_weights": bool(scenario.control_weights),
-            "parameters": bool(scenario.parameters),
-        }
-        for key, is_given in refused.items():
-            if is_given:
+        for key in ("task", "compliances", "control_weights", "parameters"):
+            value = getattr(scenario, key)
+            if value or (key == "compliances" and value is not None):
                 raise ModelError(
                     f"a cascade does not know `{key}`: leave it out, or take !Tracking"
                 )

@@ -23,11 +23,11 @@ from drake_dae.systems.plants.contract import Plant
 
 @dataclass(frozen=True, eq=False)
 class OwnModel:
-    """The model of a plant that differs from its law's.
+    """The model of a plant with payloads and disturbances that its law does not know.
 
     Attributes:
-        scenario: The scenario in which the payloads and disturbances are known.
-        model, structure: The robot with them.
+        scenario: The scenario with disturbances among its known forces.
+        model, structure: The robot with payloads and disturbances.
         scene_graph: The scene graph of its geometry.
     """
 
@@ -62,14 +62,14 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     moving: dict[str, Any] = {
         f"{name}.course": [disturbance.course] for name, disturbance in named.items()
     }
-    own = replace(
+    of_plant = replace(
         scenario,
         known_forces=[*scenario.known_forces, *known_forces],
         exogenous={**scenario.exogenous, **moving},
     )
     scene_graph = SceneGraph()
-    model = completed_model(own, scene_graph, payloads)[1]
-    return OwnModel(own, model, scenario_structure(model), scene_graph)
+    model = completed_model(of_plant, scene_graph, payloads)[1]
+    return OwnModel(of_plant, model, scenario_structure(model), scene_graph)
 
 
 def _name(index: int) -> str:
@@ -84,24 +84,23 @@ def begin_own_model(scenario: Scenario, plant: Plant, context: Context) -> None:
     """
     if scenario.plant.carries:
         return
-    given: dict[str, list[tuple[str, ArrayLike]]] = {
-        "plant_payloads": [(f"{one.name}.mass", one.mass) for one in scenario.plant_payloads],
-        "plant_disturbances": [
-            (f"{_name(index)}.force", one.force)
-            for index, one in enumerate(scenario.plant_disturbances)
-        ],
-    }
+    numbers: list[tuple[str, str, ArrayLike]] = [
+        *(("plant_payloads", f"{p.name}.mass", p.mass) for p in scenario.plant_payloads),
+        *(
+            ("plant_disturbances", f"{_name(index)}.force", disturbance.force)
+            for index, disturbance in enumerate(scenario.plant_disturbances)
+        ),
+    ]
     values = plant.parameters(context)
-    for key, numbers in given.items():
+    for key, name, value in numbers:
         with at(key):
-            for name, wanted in numbers:
-                # A plant of one's own may have fixed numbers, made with these.
-                if not np.array_equal(values[plant.dae.parameter_slice(name)], np.ravel(wanted)):
-                    plant.set_parameter(context, name, wanted)
+            # A user's own plant may not let these numbers be set, and has been made with them.
+            if not np.array_equal(values[plant.dae.parameter_slice(name)], np.ravel(value)):
+                plant.set_parameter(context, name, value)
 
 
 def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
-    """Refuses disturbances on unknown or fixed frames.
+    """Checks that disturbances act on movable frames.
 
     Raises:
         ScenarioError: There is no such frame of the robot.

@@ -1,4 +1,4 @@
-"""The plants of a scenario: a family whose members each make a plant."""
+"""The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -30,14 +30,14 @@ from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
 
 @dataclass(frozen=True, eq=False)
 class RobotToSimulate:
-    """The robot of a plant.
+    """The robot for which a plant is made.
 
     Attributes:
         model, structure: The robot, and the structure of its system.
-        feedback: Whether its plant may take a law itself.
+        feedback: Whether the plant may evaluate the law itself.
         opens: The contact that a task opens and closes; empty without a task.
-        add_robot: Adds the robot with its payloads to a MultibodyPlant.
-        parameters: Parameter name -> the plant's changed value.
+        add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
+        parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
         pushed: Whether the links of Drake's own plant can be pushed while it runs.
     """
@@ -56,13 +56,14 @@ class ScenarioPlant(ABC):
     """The contract of the key `plant` of a scenario.
 
     1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
-    2. With `carries` the plant includes payloads, disturbances and changed parameters. Otherwise
+    2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise
        the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context.
-    3. `material` is the material of compliant contacts; None for ideal ones.
-    4. `rolled` is the member that a rollout runs in its place: itself, or one with a traced plant.
-    5. With `adjusts` the parameters of the plant can be set in a context. `in_context` are the keys
-       of numbers that `begin` sets in the context of a plant that was made with others.
+       the context. A plant that `carries` has `pushes` of its own.
+    3. `material` is the material of compliant contacts, and None for ideal contacts.
+    4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
+    5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
+       keys of numbers that `begin` sets in a context, even if the plant was made with other
+       numbers.
     """
 
     carries: ClassVar[bool] = False
@@ -76,7 +77,7 @@ class ScenarioPlant(ABC):
 
     @property
     def rolled(self) -> "ScenarioPlant":
-        """What a rollout runs in its place."""
+        """The member that a rollout runs instead."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
@@ -88,7 +89,7 @@ class ScenarioPlant(ABC):
 
     @abstractmethod
     def plant(self, robot: RobotToSimulate) -> Plant:
-        """The plant.
+        """Makes the plant.
 
         Raises:
             ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -110,15 +111,15 @@ class IdealConstraints(ScenarioPlant):
 class Unilateral(ScenarioPlant):
     """The plant is a `UnilateralRobotPlant`: contacts open instead of pulling, and impact.
 
-    The law is that of closed contacts and continues while a contact is open. Without the contact
-    force phi'' = -A(x) lambda_d, with the desired force lambda_d: the robot returns if lambda_d >
-    0, and stays away if lambda_d < 0.
+    The law is that of closed contacts, also while a contact is open. Then phi'' = -A(x) lambda_d
+    with the desired force lambda_d: the robot returns to the surface if lambda_d > 0, and leaves it
+    if lambda_d < 0.
 
     Attributes:
         restitution: Constraint -> its coefficient of restitution, 0 (no bounce) to 1 (no loss), a
             pure number. Other constraints stay closed. If left out, all unilateral contacts open,
             without bouncing.
-        settling_time: Bouncing that would end within this time, in s, ends immediately.
+        settling_time: Bouncing that would end within this time, in s, is ended immediately.
 
     Raises:
         ModelError: A number makes no sense.
@@ -150,14 +151,14 @@ class Unilateral(ScenarioPlant):
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    The robot touches with a ball; the surfaces are those of its constraints. With point contact the
-    force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness.
+    A ball at the tool touches the surfaces of the constraints. With point contact the force is
+    stiffness times depth. With hydroelastic contact the ball is rigid, and the pressure of the
+    surface is modulus times depth / thickness.
 
     If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
-    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
-    stiffer contact. A tool that stays normal to its surface does not roll.
+    a) off the surface. A smaller radius reduces this deviation from ideal contact; a stiffer
+    contact does not. A tool that stays normal to its surface does not roll.
     """
 
     carries: ClassVar[bool] = True
@@ -190,8 +191,8 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 class CompliantContact(PointMaterial, ScenarioPlant):
     """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
 
-    It takes no MultibodyPlant, so that rollouts are hundreds of times as fast as Drake's plant, and
-    knows what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
+    It contains no MultibodyPlant, so rollouts are hundreds of times as fast as Drake's plant. It
+    supports what `!MultibodyPlant` does not: surfaces of any shape, moving surfaces, exogenous
     signals, exports. It has no stops at the limits of joints. With a time_step of 0 it is
     continuous.
     """
@@ -217,9 +218,9 @@ class CompliantContact(PointMaterial, ScenarioPlant):
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.
 
-    It is called with the robot and its structure, as `maker(model, structure)`. Reading such a
-    scenario imports and runs that module, found by PYTHONPATH, also in the processes of a sweep:
-    use only files from people whose code you trust.
+    It is called with the robot and its structure, as `maker(model, structure)`. Running such a
+    scenario imports the module, found by PYTHONPATH, also in the processes of a sweep: use only
+    files from people whose code you trust.
 
     Attributes:
         maker: The module and the class in it, as "my_plants:SpringyPlant".
@@ -255,7 +256,7 @@ class OwnPlant(ScenarioPlant):
 
 
 def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
-    """The member chosen by plain data; the first one by default.
+    """The member that plain data choose by their tag; by default `IdealConstraints`.
 
     Args:
         data: The value of the key `plant`.

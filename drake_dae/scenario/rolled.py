@@ -1,4 +1,4 @@
-"""The run of a scenario by `rollout`, for the command and for studies."""
+"""Runs of a scenario by `rollout`, for the command and for studies."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,23 +26,23 @@ ROWS = 1000
 """The number of rows of a record of a rollout under error control, after the first."""
 
 PERIOD = 0.2
-"""So often what a rollout has recorded is looked at for divergence while it goes on, in s."""
+"""The time by the clock between checks of a running rollout for divergence, in s."""
 
 SAME = 1e-6
-"""Two times that differ by less than this part of a step are one row."""
+"""Two times are equal if they differ by less than this fraction of a step."""
 
 MOST_ROWS = 1e7
 """The largest number of rows of fixed steps; a larger record takes gigabytes."""
 
 
 def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
-    """A scenario with the plant that a rollout runs, and a remark if it is another one."""
+    """A scenario with a plant that rollouts support, and a remark if this changed the plant."""
     plant = scenario.plant.rolled
     if plant is scenario.plant:
         return scenario, ""
     name, before = type(plant).__name__, type(scenario.plant).__name__
-    viscous = [one for one in scenario.constraints if getattr(one, "viscous_friction", None)]
-    parameters = {**scenario.plant_parameters, **_without_viscous(one.name for one in viscous)}
+    viscous = [c for c in scenario.constraints if getattr(c, "viscous_friction", None)]
+    parameters = {**scenario.plant_parameters, **_without_viscous(c.name for c in viscous)}
     # One of the scenario's own plants, as the contract says.
     return replace(scenario, plant=plant, plant_parameters=parameters), (  # type: ignore[arg-type]
         f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
@@ -52,33 +52,30 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
 
 
 def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
-    """The same of a scenario's complete plain data."""
+    """The plain data of a scenario with a plant that rollouts support, as for `for_rollout`."""
     kind = plant_kind(data["plant"])
     try:
         plant = kind(**{key: value for key, value in data["plant"].items() if key != TAG})
     except (ModelError, TypeError):
-        return data  # Who reads it says so.
+        return data  # The reader of the data reports it.
     if (rolled := plant.rolled) is plant:
         return data
-    numbers = {each.name: getattr(rolled, each.name) for each in fields(cast(Any, rolled))}
-    viscous = [one for one in data["constraints"] if one.get("viscous_friction")]
+    numbers = {f.name: getattr(rolled, f.name) for f in fields(cast(Any, rolled))}
+    viscous = _without_viscous(c["name"] for c in data["constraints"] if c.get("viscous_friction"))
     return {
         **data,
         "plant": {TAG: f"!{type(rolled).__name__}", **numbers},
-        "plant_parameters": {
-            **data["plant_parameters"],
-            **_without_viscous(one["name"] for one in viscous),
-        },
+        "plant_parameters": {**data["plant_parameters"], **viscous},
     }
 
 
 def _without_viscous(names: Iterable[str]) -> dict[str, float]:
-    """Parameters of contacts without viscous friction, which Drake's do not have."""
+    """The parameters for no viscous friction of contacts, since Drake's contact has none."""
     return {f"{name}.viscous_friction": 0.0 for name in names}
 
 
 def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
-    """The times of the rows of a rollout's record, in s: equidistant, or the fixed steps.
+    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps.
 
     Args:
         scenario: The scenario.
@@ -118,7 +115,7 @@ def roll_scenario(
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> Rollout:
-    """Runs a scenario by `rollout`; what diverges ends, as by `simulate`.
+    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`.
 
     Args:
         scenario: The scenario.
@@ -134,7 +131,7 @@ def roll_scenario(
     """
     start, parameters = start_values(loop, context)
     watched = _DivergenceWatch(scenario, loop, look)
-    (found,) = run_loop(
+    (rollout,) = run_loop(
         loop,
         start,
         parameters,
@@ -144,7 +141,7 @@ def roll_scenario(
         lasting=lasting,
         look=watched,
     )
-    return watched.judged(found)
+    return watched.judged(rollout)
 
 
 def roll_together(
@@ -159,20 +156,20 @@ def roll_together(
         lasting: As of `roll_scenario`.
 
     Returns:
-        A run for each; None for one that is left to `roll_scenario`, as `run_together` has it.
+        One run per scenario; None where `roll_scenario` has to be used, as for `run_together`.
 
     Raises:
         ModelError: The loop cannot be rolled out.
     """
     groups: dict[str, list[int]] = {}
-    for index, each in enumerate(scenarios):
-        groups.setdefault(repr((each.duration, each.integrator)), []).append(index)
+    for index, scenario in enumerate(scenarios):
+        groups.setdefault(repr((scenario.duration, scenario.integrator)), []).append(index)
     together: list[Rollout | None] = [None] * len(scenarios)
     for places in groups.values():
         first = scenarios[places[0]]
         starts, parameters = zip(*(start_values(loop, contexts[i]) for i in places), strict=True)
         with suppress(InconsistentStateError):  # That run says so itself.
-            found = run_together(
+            runs = run_together(
                 loop,
                 np.array(starts),
                 np.array(parameters),
@@ -181,7 +178,7 @@ def roll_together(
                 seeds=[_seeds(scenarios[i]) for i in places],
                 lasting=lasting,
             )
-            for index, run in zip(places, found, strict=True):
+            for index, run in zip(places, runs, strict=True):
                 if run is not None:
                     together[index] = _DivergenceWatch(scenarios[index], loop).judged(run)
     return together
@@ -189,12 +186,12 @@ def roll_together(
 
 def _seeds(scenario: Scenario) -> dict[str, int]:
     """The seed of each source of noise."""
-    found = {}
+    seeds = {}
     if scenario.force_feedback.is_measured:
-        found["force_noise"] = scenario.force_feedback.seed
+        seeds["force_noise"] = scenario.force_feedback.seed
     if scenario.encoders is not None:
-        found["encoder_noise"] = encoder_seed(scenario.encoders.seed)
-    return found
+        seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+    return seeds
 
 
 class _DivergenceWatch:
@@ -227,7 +224,7 @@ class _DivergenceWatch:
         except SimulationError as error:
             self._failure = error
 
-    def judged(self, found: Rollout) -> Rollout:
-        """A rollout up to where it diverges."""
-        self._see(found.record.after(self._time), is_last=found.failure is None)
-        return found if self._failure is None else found.ended(self._failure)
+    def judged(self, rollout: Rollout) -> Rollout:
+        """The rollout, or its part up to the time at which it diverges."""
+        self._see(rollout.record.after(self._time), is_last=rollout.failure is None)
+        return rollout if self._failure is None else rollout.ended(self._failure)

@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
+from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -48,13 +49,13 @@ T = TypeVar("T")
 
 
 def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
-    """A check that passes the value on."""
+    """The check as a function that returns its argument, as pydantic needs it."""
 
-    def passed_on(value: T) -> T:
+    def checked(value: T) -> T:
         check(value)
         return value
 
-    return passed_on
+    return checked
 
 
 _INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
@@ -89,8 +90,8 @@ class Scenario:
         forces: The force outputs: names of constraint forces, and combinations of forces by tags;
             all constraint forces if left out. Leave out forces that are not to be controlled, such
             as those of wheels and mimic joints; [] is none.
-        control_weights: One for each actuator, if there are more actuators than outputs: the law
-            then takes the control with the least sum of weight * (u - free_control)^2. The
+        control_weights: One weight per actuator, if there are more actuators than outputs. The law
+            then chooses the control with the least sum of weight * (u - free_control)^2. The
             parameter "free_control" is zero unless it is in `exogenous`.
         actuation: Stages from the joints toward the motor; none for rigid joints.
         force_feedback: Whether the law uses its model's force or a measured one.
@@ -98,27 +99,27 @@ class Scenario:
             file, a constraint or a stage; one number for all entries, or a list. `drake-dae
             identify` writes it.
         plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
-            number for all entries, or a list. To tilt a surface give it `rpy`.
+            number for all entries, or a list. A surface can be tilted if it has the key `rpy`.
         plant_payloads: Additional masses on the plant, unknown to the law's model.
         plant_disturbances: Disturbance forces on the plant, unknown to the law.
         known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
             `plant_parameters`.
         exogenous: Parameter name -> references of its entries, known to plant and law;
             "wall.position" for example.
-        bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; each
-            a number or one for each entry. Relative degrees are checked for all such values; bounds
-            of one value fix it. They do not restrict a run.
+        bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; a
+            number, or one per entry. Relative degrees are checked for all values within bounds; if
+            both bounds are equal, the value is fixed. Bounds do not restrict a run.
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The law: the tracking law (28) of the whole robot, for springs in the joints a cascade
-            of low degree, or with rigid joints an adaptive law that learns masses. If left out it
-            is the tracking law; with springs in Drake's own contact and without `gains` it is the
-            cascade.
+        law: The law: the tracking law (28) of the whole robot, a cascade for springs in the joints,
+            or an adaptive law that estimates masses of a robot with rigid joints. By default the
+            tracking law; with springs in Drake's own contact and without `gains` the cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
-            constraints; with Drake's own contact they are computed, see `advised`, together
-            with `integral`, `constraint_damping`, `observer` and measured force if these are left
-            out. The scenario as run has them all. With `actuation` this needs the cascade.
+            constraints. With Drake's own contact gains are computed, see `advised`, together with
+            `integral`, `constraint_damping`, `observer` and measured force if these are left out;
+            the scenario in the folder of the run contains them. With `actuation` the law must be
+            the cascade.
         integral: Names of outputs whose errors are integrated as well, with one more pole:
             positions, and forces if `force_feedback` is measured; none if left out while `gains`
             are given.
@@ -126,9 +127,9 @@ class Scenario:
             - 1 poles per constraint; none if left out while `gains` are given.
         observer: The observer of a disturbance and of coefficients of friction, for a sampled law
             with measured `force_feedback`; none if left out while `gains` are given.
-        largest_roughness: The largest rms change of the controls from sample to sample that
-            computed gains may make of the noise of `encoders`, over all joints, in N m; 0.3 % of
-            the largest effort limit if left out, or 1 N m without limits.
+        largest_roughness: The largest permitted rms change of the controls from sample to sample by
+            the noise of `encoders`, over all joints, in N m, for computed gains; if left out 0.3 %
+            of the largest effort limit, or 1 N m without limits.
         plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
             MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.
@@ -141,8 +142,8 @@ class Scenario:
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
             of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
             Completed outputs without a reference keep their initial value.
-        time_optimal: The references as paths that are followed in the shortest time within the
-            robot's limits; as the references are timed if left out.
+        time_optimal: The references are paths that are followed in the shortest time within the
+            robot's limits. If left out, the references are functions of time.
         task: A sequence of phases with opening and closing contact, in place of references.
         start: The start; without positions it is computed (not for a task).
         duration: The duration of the run, in s.
@@ -212,6 +213,11 @@ class Scenario:
         return self.is_advised and any(stage.is_spring for stage in self.actuation)
 
     @property
+    def spring_loop(self) -> SpringLoop | None:
+        """The loop around the springs of a cascade, if all of its numbers are known; else None."""
+        return None if self.law is None else self.law.loop()
+
+    @property
     def is_advised(self) -> bool:
         """Whether the gains are left out and will be computed."""
         return self.gains is None and self.plant.material is not None
@@ -241,29 +247,28 @@ def scenario_schema(tags: bool = True) -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data.
 
     Args:
-        tags: Whether the data have tags as entries "_tag", as for `read_scenario`. Otherwise it is
-            for data without tags, from a plain reader of YAML or an editor: any form fits where a
-            tag would choose.
+        tags: Whether the data have tags as entries "_tag", as for `read_scenario`. Without tags, as
+            from a plain reader of YAML or an editor, any form of a family fits.
     """
     schema = scenario_reader().schema
     return schema if tags else dict(without_tags(schema))
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
-    """A scenario as plain data, the inverse of `read_scenario`."""
+    """Converts a scenario to plain data, the inverse of `read_scenario`."""
     return dict(scenario_reader().write(scenario))
 
 
 def read_scenario(
     data: Mapping[str, Any], folder: Path | None = None, known: dict[Any, Any] | None = None
 ) -> Scenario:
-    """The scenario of plain data, with the paths of its robot unchanged.
+    """Makes a scenario from plain data, with the paths of its robot unchanged.
 
     Args:
         data: Plain data.
         folder: The folder of relative file names; None for the working directory.
-        known: What parts of scenarios were read into before, for many that have most of them in
-            common; the parts of this one are put into it.
+        known: The cache of parts that were read already, for many scenarios that have most parts in
+            common; the parts of this scenario are added.
 
     Raises:
         ScenarioError: Keys are unknown or missing, or values are not valid; all problems are

@@ -1,6 +1,7 @@
 """The files that come with drake_dae; they are found and listed without Drake."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from drake_dae import diagrams
@@ -27,11 +28,9 @@ def find_scenario(name: str) -> Path:
     if name in shipped:
         return shipped[name]
     path = Path(name)
-    try:
+    with suppress(OSError, ValueError):  # Such as a null byte.
         if path.is_file():
             return path
-    except (OSError, ValueError):
-        pass  # Such as a null byte.
     raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 

@@ -22,8 +22,8 @@ _SLACK = 1e-6
 """The allowed excess over a joint limit at the start, rad or m: references may start at the
 limit."""
 
-_NEAREST = np.array([0.0, -1.0, 1.0])
-"""The numbers of turns that are tried besides the nearest to a guess."""
+_TURNS = np.array([0.0, -1.0, 1.0])
+"""The whole turns that are tried, relative to the number of turns nearest to a guess."""
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
@@ -48,20 +48,20 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                 f"{scenario.integrator.start_time:g} s"
             )
     context.SetTime(scenario.integrator.start_time)
-    plant, controller = loop.plant, loop.controller
-    own = plant.GetMyMutableContextFromRoot(context)
+    plant = loop.plant
+    at_plant = plant.GetMyMutableContextFromRoot(context)
     if not scenario.plant.carries:
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
-                plant.set_parameter(own, name, numbers)
-    begin_own_model(scenario, plant, own)
+                plant.set_parameter(at_plant, name, numbers)
+    begin_own_model(scenario, plant, at_plant)
     with at("plant"):
-        scenario.plant.begin(plant, own)
+        scenario.plant.begin(plant, at_plant)
     if loop.sensor is not None:
         with at("force_feedback"):
-            sensed = loop.sensor.GetMyMutableContextFromRoot(context)
-            scenario.force_feedback.begin(loop.sensor, sensed)
-    if controller.takes_over:
+            at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
+            scenario.force_feedback.begin(loop.sensor, at_sensor)
+    if loop.controller.takes_over:
         _begin_at_rest(scenario, loop, context)
     else:
         _begin_with_references(scenario, loop, context)
@@ -74,17 +74,17 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
     """Starts plant and sensor at rest at start.positions, or next to them on the constraints."""
     plant = loop.plant
-    model, own = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
-    parameters = plant.current_parameters(own)
+    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
+    parameters = plant.current_parameters(at_plant)
     forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
     with at("start"):
         guess = start_guess(scenario.start.positions, model.links)
         near = model.rest_state(guess, forces, parameters)
         structure = loop.controller.start_structure
-        known = structure.system.parameters_of(plant.dae, parameters)
-        q = structure.manifold.settle(near, known)[: guess.size]
+        of_law = structure.system.parameters_of(plant.dae, parameters)
+        q = structure.manifold.settle(near, of_law)[: guess.size]
         _check_limits(model, q, "Give")
-        plant.set_state(own, model.rest_state(q, forces, parameters))
+        plant.set_state(at_plant, model.rest_state(q, forces, parameters))
     _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
 
 
@@ -100,59 +100,59 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     model = plant.robot("a scenario")
     if scenario.gains is not None:  # Recommended gains are in the law.
         with at("gains"):
-            of_law = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(of_law, _designed(scenario.gains, loop))
-    own = plant.GetMyMutableContextFromRoot(context)
-    parameters = plant.current_parameters(own)
-    wanted = _wanted(scenario.start.errors, loop, context.get_time())
-    positions, forces = np.split(wanted, [len(model.position_signals)])
+            at_controller = controller.GetMyMutableContextFromRoot(context)
+            controller.set_gains(at_controller, _designed(scenario.gains, loop))
+    at_plant = plant.GetMyMutableContextFromRoot(context)
+    parameters = plant.current_parameters(at_plant)
+    outputs = _outputs_at_start(scenario.start.errors, loop, context.get_time())
+    positions, forces = np.split(outputs, [len(model.position_signals)])
     with at("start"):
         # By default near the start of the completion, which is not reported elsewhere.
         guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
         q = _configuration(model, positions, guess, parameters)
         state = model.rest_state(q, forces, parameters)
         if scenario.exogenous:
-            state = _in_motion(loop, context, wanted, state)
-        plant.set_consistent_state(own, state)
+            state = _in_motion(loop, context, outputs, state)
+        plant.set_consistent_state(at_plant, state)
     _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
-    """The gains of a scenario; many runs of a study have those of the last one."""
-    key, (known, found) = repr(gains), loop.memory.get("gains", ("", None))
-    if known != key:
-        found = loop.controller.law.design(gains.design())
-        loop.memory["gains"] = key, found
-    return cast(FeedbackGains, found)
+    """The gains of a scenario; those of the last run are reused if the design is the same."""
+    key, (last_key, design) = repr(gains), loop.memory.get("gains", ("", None))
+    if last_key != key:
+        design = loop.controller.law.design(gains.design())
+        loop.memory["gains"] = key, design
+    return cast(FeedbackGains, design)
 
 
 def _in_motion(
-    loop: ClosedLoop, context: Context, wanted: FloatArray, guess: FloatArray
+    loop: ClosedLoop, context: Context, outputs: FloatArray, guess: FloatArray
 ) -> FloatArray:
-    """The state whose outputs move with their references, plus the errors.
+    """The state with these outputs, whose rates are those of the references.
 
-    With exogenous motion the parts in contact are not at rest.
+    With exogenous motion the robot cannot start at rest.
     """
     law, controller = loop.controller.law, loop.controller
     goal = loop.reference.reference(context.get_time())
-    goal[law.layout.lowest] = wanted
+    goal[law.layout.lowest] = outputs
     parameters = controller.current_parameters(controller.GetMyContextFromRoot(context))
     return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, parameters)
 
 
 @at("start.errors")
-def _wanted(errors: dict[str, float], loop: ClosedLoop, time: float) -> FloatArray:
+def _outputs_at_start(errors: dict[str, float], loop: ClosedLoop, time: float) -> FloatArray:
     """z at the start: the references plus the errors, shape (p,)."""
     degrees = loop.controller.law.degrees
-    wanted = loop.controller.law.layout.values(loop.reference.reference(time))
+    outputs = loop.controller.law.layout.values(loop.reference.reference(time))
     for name, error in errors.items():
         index = index_of(name, loop.plant.dae.output_signals, "output")
         if degrees[index] == 0:
             raise ModelError(
                 f"'{name}' has degree 0: the law meets it at once and it has no start error"
             )
-        wanted[index] += error
-    return wanted
+        outputs[index] += error
+    return outputs
 
 
 def _configuration(
@@ -160,8 +160,8 @@ def _configuration(
 ) -> FloatArray:
     """q with given position outputs, on the constraints, without whole turns and within limits."""
     try:
-        found = model.configuration(positions, guess, parameters)
-        q = _unwound(model, positions, found, guess, parameters)
+        solution = model.configuration(positions, guess, parameters)
+        q = _unwound(model, positions, solution, guess, parameters)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -176,7 +176,7 @@ def _configuration(
 
 
 def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
-    """Refuses a configuration with joints outside of their limits."""
+    """Checks that all joints of a configuration are within their limits."""
     low, high = model.links.position_limits
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
@@ -195,23 +195,22 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
 def _unwound(
     model: RobotModel,
     positions: FloatArray,
-    found: FloatArray,
+    solution: FloatArray,
     guess: FloatArray,
     parameters: FloatArray,
 ) -> FloatArray:
-    """A configuration whose joints are whole turns nearer to a guess, or within their limits.
+    """Removes whole turns of joints from a configuration, as far as limits and outputs permit.
 
-    Newton's method may add whole turns to a joint. A turn is kept if an output, a constraint or a
-    limit needs it.
+    Newton's method may add whole turns to a joint.
     """
-    q, turn = found, 2 * np.pi
+    q, turn = solution, 2 * np.pi
     limits = model.links.position_limits
     is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
     for index in np.flatnonzero(~is_inside | (np.abs(q - guess) >= np.pi)):
         if model.links.position_signals[index].unit != "rad":
             continue
         low, high = limits[0][index], limits[1][index]
-        turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _NEAREST
+        turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _TURNS
         inside = [value for value in turns if low - _SLACK <= value <= high + _SLACK]
         nearest = min(inside, key=lambda value: abs(value - guess[index]), default=q[index])
         if abs(nearest - q[index]) < 1.0:

@@ -1,4 +1,4 @@
-"""Runs that end where they diverge, with what grew and since when."""
+"""Detection of runs that diverge: which state, control or error grew, and since when."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -13,24 +13,24 @@ from drake_dae.systems.control.contract import Compared, Controller
 from drake_dae.systems.plants.contract import Plant
 
 EVERY = 32
-"""After so many steps one is looked at: an output is computed for it."""
+"""The number of steps from one check to the next, since each check evaluates output ports."""
 
 
 class DivergenceWatch:
-    """Ends a run whose states or errors leave all measure.
+    """Raises an error if the states, controls or tracking errors of a run grow beyond all bounds.
 
-    A state is compared with its value at the start and with `DaeSystem.scale`, a control at the end
-    with what had its unit at the start: before, as near a singular configuration, the run ends by
-    itself, and tells why. The error z - r of
-    an output is compared with the largest number in its unit that the reference has had up to now,
-    or that outputs, states, forces and controls had at the start. So nothing depends on units, and
-    the force of an impact, the sag under a load or a start far away are no divergence.
+    A state is compared with its initial value and with `DaeSystem.scale`. The tracking error z - r
+    of an output is compared with the largest value of the reference up to now, and of outputs,
+    states, forces and controls at the start, in the same unit. A control is compared with the
+    initial values in its unit, and only at the end of the run: if it is large before, as near a
+    singular configuration, the run fails with a better message. So no verdict depends on units, and
+    the force of an impact, the sag under a payload or a distant start are not divergence.
 
     Args:
-        diagram: What runs: each `Plant` in it is watched, and the errors of a `Controller` that
-            knows what they are, where one plant is there.
+        diagram: The diagram. Each `Plant` in it is checked, and the errors of each `Controller` if
+            there is exactly one plant.
         context: Its context at the start of the run.
-        duration: How long the run lasts, in s.
+        duration: The duration of the run, in s.
     """
 
     def __init__(self, diagram: System, context: Context, duration: float) -> None:
@@ -47,7 +47,7 @@ class DivergenceWatch:
         self._controls: StateGrowth | None = None
         for controller in self._controllers:
             plant = self._plants[0]
-            start = _sizes(plant, self._shown(context))
+            start = _sizes(plant, self._signals(context))
             self._controls = StateGrowth.controls(plant, time, start)
             if (now := self._compared(controller, context)) is None:
                 continue
@@ -57,15 +57,15 @@ class DivergenceWatch:
 
     @property
     def sees(self) -> bool:
-        """Whether there is anything to watch."""
+        """Whether there is a plant to check."""
         return bool(self._states)
 
     def look(self, context: Context, *, always: bool = False) -> None:
-        """Looks at an accepted step, at some of them.
+        """Checks an accepted step; of consecutive steps only every 32nd is checked.
 
         Args:
             context: The context of the diagram.
-            always: Whether to look at this one, the last.
+            always: Whether this step is checked in any case, since it is the last.
 
         Raises:
             SimulationError: The run diverges.
@@ -76,17 +76,17 @@ class DivergenceWatch:
         self.look_at_states(context)
         if not self._controllers:
             return
-        times, shown = np.array([context.get_time()]), self._shown(context)
-        state, control = shown("state")[None], shown("control")[None]
+        times, signal = np.array([context.get_time()]), self._signals(context)
+        state, control = signal("state")[None], signal("control")[None]
         if self._controls is not None and control.size:
-            found = self._controls.look(times, control, state)
-            _raise_first([found] if always else [])
+            error = self._controls.look(times, control, state)
+            _raise_first([error] if always else [])
         for controller, errors in self._errors:
             if (now := self._compared(controller, context)) is not None:
                 _raise_first([errors.look(times, now[0][None], now[1][None], state)])
 
     def look_at_states(self, context: Context) -> None:
-        """Looks at the states alone: where a run has failed, outputs may have no values.
+        """Checks only the states, since outputs may have no values after the failure of a run.
 
         Raises:
             SimulationError: They diverge.
@@ -97,38 +97,37 @@ class DivergenceWatch:
             _raise_first([amounts.look(times, state, state)])
 
     def _compared(self, controller: Controller, context: Context) -> Compared | None:
-        """The outputs of a controller and what they should be; None if nobody says."""
-        own = controller.GetMyContextFromRoot(context)
-        return controller.compared(own, self._shown(context))
+        """The outputs of a controller and their references; None if it does not compare any."""
+        at_controller = controller.GetMyContextFromRoot(context)
+        return controller.compared(at_controller, self._signals(context))
 
-    def _shown(self, context: Context) -> Callable[[str], FloatArray]:
-        """What the plant shows now, by the names that a record has; empty for nothing."""
+    def _signals(self, context: Context) -> Callable[[str], FloatArray]:
+        """A function from names of recorded signals to their present values; empty if unknown."""
         plant = self._plants[0]
-        own = plant.GetMyContextFromRoot(context)
+        at_plant = plant.GetMyContextFromRoot(context)
 
         def value(name: str) -> FloatArray:
             if name == "state":
-                return plant.state(own)
+                return plant.state(at_plant)
             if name != "control":
-                return np.array(plant.GetOutputPort(name).Eval(own))
+                return np.array(plant.GetOutputPort(name).Eval(at_plant))
             port = plant.GetInputPort("control")
-            if port.HasValue(own):
-                return np.array(port.Eval(own))
-            # A law that is fed back as a value.
-            is_known = self._diagram.HasOutputPort("control")
-            return np.array(
-                self._diagram.GetOutputPort("control").Eval(context) if is_known else []
-            )
+            if port.HasValue(at_plant):
+                return np.array(port.Eval(at_plant))
+            # The plant evaluates the law itself.
+            if not self._diagram.HasOutputPort("control"):
+                return np.zeros(0)
+            return np.array(self._diagram.GetOutputPort("control").Eval(context))
 
         return value
 
 
 class RecordWatch:
-    """`DivergenceWatch` for a run of which only rows of its record are seen, in their order.
+    """`DivergenceWatch` for a run whose record is checked, part by part.
 
     Args:
         plant: The plant.
-        duration: How long the run lasts, in s.
+        duration: The duration of the run, in s.
     """
 
     def __init__(self, plant: Plant, duration: float) -> None:
@@ -136,14 +135,14 @@ class RecordWatch:
         self._watched: tuple[StateGrowth, StateGrowth, ErrorGrowth] | None = None
 
     def look(self, record: Record, *, is_last: bool = False) -> None:
-        """Looks at rows that follow those that were looked at.
+        """Checks the next rows of a record.
 
         Args:
             record: The rows.
-            is_last: Whether the run has come to its end with them.
+            is_last: Whether the run ends with them.
 
         Raises:
-            SimulationError: The run diverges; the time is that of the first row that says so.
+            SimulationError: The run diverges; with the time of the first row that shows it.
         """
         if not record.time.size:
             return
@@ -159,16 +158,16 @@ class RecordWatch:
             )
         of_states, of_controls, of_errors = self._watched
         controls = of_controls.look(record.time, record["control"], states)
-        found = [
+        errors = [
             of_errors.look(record.time, outputs, record["desired_output"], states),
             of_states.look(record.time, states, states),
         ]
-        _raise_first([*found, controls] if is_last else found)
+        _raise_first([*errors, controls] if is_last else errors)
 
 
-def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
+def _sizes(plant: Plant, value: Callable[[str], FloatArray]) -> Sizes:
     """The largest numbers in each unit of a plant's signals."""
-    found: Sizes = {}
+    sizes: Sizes = {}
     dae = plant.dae
     for name, signals in (
         ("state", dae.state_signals),
@@ -176,12 +175,12 @@ def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
         ("constraint_force", dae.force_signals),
         ("control", dae.control_signals),
     ):
-        found = with_sizes(found, signals, shown(name))
-    return found
+        sizes = with_sizes(sizes, signals, value(name))
+    return sizes
 
 
 def _least(plant: Plant) -> Sizes:
-    """Sizes of their own: a turn of one radian, the axis of a robot's frame."""
+    """The least sizes in some units: one radian; the length 1 of an axis of a robot's frame."""
     return {"rad": 1.0} if plant.model is None else {"rad": 1.0, "": 1.0}
 
 
@@ -194,6 +193,6 @@ def _blocks(system: System) -> Iterator[System]:
         yield system
 
 
-def _raise_first(found: Sequence[SimulationError | None]) -> None:
-    if errors := [error for error in found if error is not None]:
+def _raise_first(candidates: Sequence[SimulationError | None]) -> None:
+    if errors := [error for error in candidates if error is not None]:
         raise min(errors, key=lambda error: error.time)

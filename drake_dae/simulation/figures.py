@@ -1,4 +1,4 @@
-"""The figures of a run as numbers, under names for tables of many runs."""
+"""The figures of a run as numbers, with names for tables of many runs."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,12 +13,12 @@ from drake_dae.simulation.summary import SLACK, Limits
 
 
 def run_figures(record: Record, limits: Limits) -> dict[str, float]:
-    """The figures of a run, by names with units such as "largest error of tool.z [m]".
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
-    For each output the largest |z - r|, the last z - r, and the root mean square of z - r over the
-    second half of the time, the "late" error; for each constraint force its least and
-    largest value, for each control the largest |u|, then the `margins`, the largest constraint
-    residual before a projection, and the time at which the record ends.
+    For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
+    of z - r over the second half of the time. For each constraint force: its least and largest
+    value. For each control: the largest |u|. Then the `margins`, the largest constraint residual
+    before a projection, and the time at which the record ends.
 
     Args:
         record: A record with tracking_error, constraint_force, control, constraint_residual and
@@ -27,29 +27,29 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     """
     if not record.time.size:
         return {}
-    found = {}
+    figures = {}
     errors = record["tracking_error"]
-    figures = _each(
+    rows = _each(
         record, "tracking_error", _largest(errors), errors[-1], late_rms(record.time, errors)
     )
-    for signal, largest, final, late in figures:
-        found[_label("largest error of", signal)] = largest
-        found[_label("final error of", signal)] = final
-        found[_label("late error of", signal)] = late
+    for signal, largest, final, late in rows:
+        figures[_label("largest error of", signal)] = largest
+        figures[_label("final error of", signal)] = final
+        figures[_label("late error of", signal)] = late
     for signal, least, largest in _each(
         record, "constraint_force", *_extremes(record["constraint_force"])
     ):
-        found[_label("least", signal)] = least
-        found[_label("largest", signal)] = largest
+        figures[_label("least", signal)] = least
+        figures[_label("largest", signal)] = largest
     for signal, largest in _each(record, "control", _largest(record["control"])):
-        found[_label("largest", signal)] = largest
+        figures[_label("largest", signal)] = largest
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     return {
-        **found,
+        **figures,
         **{
             _label("margin of", signal): room
             for signal, room in margins(record, limits)
-            if _label("least", signal) not in found  # They are equal.
+            if _label("least", signal) not in figures  # They are equal.
         },
         "largest residual": float(residual),
         "end [s]": float(record.time[-1]),
@@ -57,28 +57,28 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
-    """The distance of each signal from its limit, in its unit; negative beyond it.
+    """The distance of each signal from its limits, in its unit; negative beyond a limit.
 
-    The limit of a control is on |u|, that of a unilateral force is zero, and positions and
-    velocities have a lower and an upper limit. A start may be on a limit, up to round-off.
+    The limit of a control is on |u|, the lower limit of a unilateral force is 0, and positions and
+    velocities have two limits. An excess by round-off counts as 0, since a start may be on a limit.
     """
-    found = []
+    rooms = []
     for index, (signal, largest) in enumerate(
         _each(record, "control", _largest(record["control"]))
     ):
         limit = np.inf if limits.control is None else limits.control[index]
-        found.append((signal, float(limit - largest)))
+        rooms.append((signal, float(limit - largest)))
     forces = record["constraint_force"]
     for signal, least, _ in _each(record, "constraint_force", *_extremes(forces)):
         if not limits.can_pull(signal):
-            found.append((signal, least))
+            rooms.append((signal, least))
     for name, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and name in record.signals:
             extremes = _each(record, name, *_extremes(record[name]))
             for (signal, least, largest), low, high in zip(extremes, *bounds, strict=False):
                 room = float(min(least - low, high - largest))
-                found.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
-    return [(signal, room) for signal, room in found if np.isfinite(room)]
+                rooms.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
+    return [(signal, room) for signal, room in rooms if np.isfinite(room)]
 
 
 def exceeded(record: Record, limits: Limits) -> list[str]:
@@ -89,9 +89,9 @@ def exceeded(record: Record, limits: Limits) -> list[str]:
 
 
 def _each(record: Record, name: str, *numbers: FloatArray) -> Iterator[tuple[Any, ...]]:
-    """Each entry of a signal: its name and unit, and its numbers."""
+    """The entries of a signal, each with its name and unit and with some numbers."""
     signals = record.signals[name].signals
-    return zip(signals, *(each.tolist() for each in numbers), strict=True)
+    return zip(signals, *(values.tolist() for values in numbers), strict=True)
 
 
 def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -11,57 +11,57 @@ from drake_dae.errors import SimulationError
 from drake_dae.systems.plants.contract import Plant
 
 LASTING = 100.0
-"""An error that is so many times the size of its output, on average over the `WINDOW`, diverges."""
+"""The mean ratio of an error to the size of its output, over the `WINDOW`, that is divergence."""
 
 ENORMOUS = 1e6
-"""An error that is so many times the size of its output diverges at once."""
+"""The ratio of an error to the size of its output that is divergence even at a single time."""
 
 BEYOND = 1e9
-"""A state or a control that is so many times its size diverges at once. A joint that turns all day
-does not."""
+"""The ratio of a state or a control to its size that is divergence. A joint that turns all day does
+not reach it."""
 
 WINDOW = 0.01
-"""The share of a run over which errors are averaged. The mean is that of their logarithms: the peak
-of an impact hardly counts."""
+"""The fraction of a run over which errors are averaged. The logarithms are averaged, so that the
+peak of an impact hardly counts."""
 
-KNOWN = 1e-6
-"""A smaller size, relative to the largest number that a run starts with, may be round-off: it tells
-nothing of an output, which is then not judged."""
+MEANINGFUL = 1e-6
+"""An output whose size is below this fraction of the largest number at the start is not judged: its
+size may be round-off."""
 
 Sizes = dict[str, float]
 """Unit -> the largest number in it."""
 
 
 def with_sizes(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
-    """Sizes together with those of some signals."""
-    found = dict(sizes)
+    """The largest numbers in each unit, of these sizes and of further values."""
+    merged = dict(sizes)
     for signal, value in zip(signals, values, strict=False):
         if np.isfinite(value):
-            found[signal.unit] = max(found.get(signal.unit, 0.0), abs(float(value)))
-    return found
+            merged[signal.unit] = max(merged.get(signal.unit, 0.0), abs(float(value)))
+    return merged
 
 
 class StateGrowth:
-    """The states, or the controls, of a plant beside their sizes."""
+    """The ratios of the states, or of the controls, of a plant to their sizes."""
 
     def __init__(self, signals: Sequence[Signal], time: float, size: FloatArray) -> None:
         self._signals, self._since, self._size = signals, time, size
 
     @classmethod
     def states(cls, plant: Plant, time: float, start: FloatArray) -> Self:
-        """Those of its states."""
+        """The growth of the states of a plant."""
         return cls(plant.dae.state_signals, time, np.maximum(plant.dae.scale, np.abs(start)))
 
     @classmethod
     def controls(cls, plant: Plant, time: float, sizes: Sizes) -> Self:
-        """Those of its controls; of a unit in which nothing has a size none is watched."""
-        found = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
-        return cls(plant.dae.control_signals, time, np.array(found))
+        """The growth of the controls of a plant; those in a unit without a size are not judged."""
+        size = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
+        return cls(plant.dae.control_signals, time, np.array(size))
 
     def look(
         self, times: FloatArray, values: FloatArray, states: FloatArray
     ) -> SimulationError | None:
-        """What diverges first in rows of a run; None if nothing does."""
+        """The error of the first row in which a value diverges; None if none does."""
         if (np.abs(by_columns(values)).max(axis=1) <= 10.0 * self._size).all():
             self._since = times[-1]
             return None
@@ -87,56 +87,57 @@ class StateGrowth:
 
 
 class ErrorGrowth:
-    """The errors of outputs beside their sizes."""
+    """The ratios of the errors of outputs to their sizes."""
 
     def __init__(
         self, signals: Sequence[Signal], time: float, window: float, sizes: Sizes, least: Sizes
     ) -> None:
         self._signals, self._time, self._window = signals, time, window
         self._largest = max(sizes.values(), default=0.0)
-        self._sizes = sizes | {
-            unit: max(size, sizes.get(unit, 0.0)) for unit, size in least.items()
-        }
+        self._sizes = sizes | {u: max(size, sizes.get(u, 0.0)) for u, size in least.items()}
         self._mean, self._since = np.zeros(len(signals)), np.full(len(signals), time)
 
     def look(
         self, times: FloatArray, outputs: FloatArray, desired: FloatArray, states: FloatArray
     ) -> SimulationError | None:
-        """What diverges first in rows of a run; None if nothing does."""
+        """The error of the first row in which an output diverges; None if none does."""
         errors = np.abs(outputs - desired)
         if self._is_small(errors, desired):
-            self._mean *= np.exp((self._time - times[-1]) / self._window)
-            self._since[:] = self._time = times[-1]
+            self._decay(times[-1])
             return None
         sizes = self._along(desired)
-        least = KNOWN * np.maximum(self._largest, sizes.max(axis=1, initial=0.0, keepdims=True))
-        shares = np.divide(errors, sizes, out=np.zeros_like(errors), where=sizes > least)
-        if (shares <= 1.0).all():
-            self._mean *= np.exp((self._time - times[-1]) / self._window)
-            self._since[:] = self._time = times[-1]
+        largest = np.maximum(self._largest, sizes.max(axis=1, initial=0.0, keepdims=True))
+        is_judged = sizes > MEANINGFUL * largest
+        ratios = np.divide(errors, sizes, out=np.zeros_like(errors), where=is_judged)
+        if (ratios <= 1.0).all():
+            self._decay(times[-1])
             return None
-        held = -np.expm1(-np.diff(times, prepend=self._time) / self._window)
-        logs = np.log(np.maximum(shares, 1.0))
+        weights = -np.expm1(-np.diff(times, prepend=self._time) / self._window)
+        logs = np.log(np.maximum(ratios, 1.0))
         for row, time in enumerate(times.tolist()):
-            self._mean += held[row] * (logs[row] - self._mean)
-            self._since[shares[row] <= 1.0] = self._time = time
-            beyond = (self._mean > np.log(LASTING)) | (shares[row] > ENORMOUS)
+            self._mean += weights[row] * (logs[row] - self._mean)
+            self._since[ratios[row] <= 1.0] = self._time = time
+            beyond = (self._mean > np.log(LASTING)) | (ratios[row] > ENORMOUS)
             if not beyond.any():
                 continue
-            worst = int(np.argmax(np.where(beyond, shares[row], 0.0)))
+            worst = int(np.argmax(np.where(beyond, ratios[row], 0.0)))
             signal, size = self._signals[worst], sizes[row, worst]
             error = outputs[row, worst] - desired[row, worst]
             return _diverged(
-                f"the error of {_amount(signal, error)}, {shares[row, worst]:.2g} times the "
+                f"the error of {_amount(signal, error)}, {ratios[row, worst]:.2g} times the "
                 f"{_quantity(size, signal)} that was asked for or was there at the start",
                 (float(self._since[worst]), time),
                 states[row],
             )
-
         return None
 
+    def _decay(self, time: float) -> None:
+        """Updates the means for a time up to which no error was larger than its size."""
+        self._mean *= np.exp((self._time - time) / self._window)
+        self._since[:] = self._time = time
+
     def _is_small(self, errors: FloatArray, desired: FloatArray) -> bool:
-        """Whether no error is larger than its size was before these rows; then sizes grow."""
+        """Whether no error exceeds its size before these rows; if so, updates the sizes."""
         units = [signal.unit for signal in self._signals]
         sizes = np.array([self._sizes.get(unit, 0.0) for unit in units])
         if not (by_columns(errors).max(axis=1) <= sizes).all():
@@ -148,14 +149,14 @@ class ErrorGrowth:
 
     def _along(self, desired: FloatArray) -> FloatArray:
         """The sizes of all outputs at each time, from what was desired up to then."""
-        units, found = [signal.unit for signal in self._signals], np.zeros_like(desired)
+        units, along = [signal.unit for signal in self._signals], np.zeros_like(desired)
         for unit in dict.fromkeys(units):
-            own = np.array([each == unit for each in units])
-            largest = np.nan_to_num(np.abs(desired[:, own]), nan=0.0, posinf=0.0).max(axis=1)
+            columns = np.array([other == unit for other in units])
+            largest = np.nan_to_num(np.abs(desired[:, columns]), nan=0.0, posinf=0.0).max(axis=1)
             grown = np.maximum.accumulate(np.maximum(largest, self._sizes.get(unit, 0.0)))
             self._sizes[unit] = float(grown[-1])
-            found[:, own] = grown[:, None]
-        return found
+            along[:, columns] = grown[:, None]
+        return along
 
 
 def _quantity(value: float, signal: Signal) -> str:

@@ -1,4 +1,4 @@
-"""Whether a run did what the user wished: outputs at their references, and nothing violated."""
+"""Judges whether a run succeeded: outputs reach their references, and no limit is violated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,22 +14,21 @@ from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 from drake_dae.systems.control.phase_change import PhaseChange
 
 SHARE = 0.01
-"""The tolerance of an output, relative to how far references in its unit move."""
+"""The default tolerance of an output, as a fraction of the range of references in its unit."""
 
 LATE = 0.5
-"""An output must be within its tolerance from this fraction of the run on, or from when it is
-predicted to be, if that is later."""
+"""The fraction of a run from which outputs must be within tolerance, unless predicted later."""
 
 GRACE = 0.1
-"""So much later than predicted, as a fraction of the run, it may be."""
+"""The permitted delay relative to the prediction, as a fraction of the run."""
 
 
-_MOST_TOLD = 3
+_MOST_FAILURES = 3
 """The number of failed phases, the last ones, that the verdict of a finished task names."""
 
 
 class JobOutcome(Enum):
-    """Whether a run did its job; the values start the sentence."""
+    """Whether a run succeeded. The verdict's sentence begins with the value."""
 
     GOOD = "GOOD"
     BAD = "BAD"
@@ -63,13 +62,13 @@ class OutputQuality:
 
 @dataclass(frozen=True)
 class JobVerdict:
-    """Whether a run did its job.
+    """Whether a run succeeded, and why.
 
     Attributes:
-        outcome: The outcome.
-        outputs: The quality of each output; none for a task, whose phases have their own ends.
-        problems: What was violated, each in words.
-        remarks: What the user should know besides.
+        outcome: Good, bad, or undecided if the run is too short to tell.
+        outputs: The quality of each output; empty for a task, whose phases have their own criteria.
+        problems: The violations, a phrase each.
+        remarks: Further information, a phrase each.
     """
 
     outcome: JobOutcome
@@ -88,14 +87,14 @@ class JobVerdict:
             "problems": list(self.problems),
             "remarks": list(self.remarks),
             "outputs": {
-                one.signal.name: {
-                    "unit": one.signal.unit,
-                    "tolerance": one.tolerance,
-                    "within_since": one.since,
-                    "largest": one.largest,
-                    "rms": one.rms,
+                output.signal.name: {
+                    "unit": output.signal.unit,
+                    "tolerance": output.tolerance,
+                    "within_since": output.since,
+                    "largest": output.largest,
+                    "rms": output.rms,
                 }
-                for one in self.outputs
+                for output in self.outputs
             },
         }
 
@@ -110,22 +109,22 @@ def judge_job(
     is_cut_short: bool = False,
     notes: Sequence[str] = (),
 ) -> JobVerdict:
-    """Whether a run did its job.
+    """Judges whether a run succeeded.
 
-    Without phases each output must come within its tolerance in the first half of the run, or
-    when the prediction does, and stay there. A run that follows a predicted error which is still
-    larger at the end is undecided. With phases the last one must have come to its end.
+    Without phases, each output must be within its tolerance from the first half of the run on, or
+    from the time at which the predicted error is. If the predicted error exceeds the tolerance even
+    at the end, and the run follows it, the run is undecided. With phases, the last one must end.
 
     Args:
         record: A record with desired_output, tracking_error and constraint_force.
         predicted: The tracking error by theory, shape (k, p).
         tolerances: Output name -> tolerated |z - r|. For the others it is 1 % of the range of the
             references in their unit, or of their largest value where they do not move.
-        violations: What was violated, in words, such as joint limits.
+        violations: Further violations, such as of joint limits, a phrase each.
         pushing: Names of the unilateral constraint forces; None if all are.
         changes: The starts of phases of a task.
         is_cut_short: Whether the run failed or was interrupted before its end.
-        notes: What the user should know besides, each in words.
+        notes: Further remarks, a phrase each.
     """
     ended = [f"the run broke off at {record.time[-1]:.4g} s"] if is_cut_short else []
     problems, remarks = [*ended, *violations], list[str]()
@@ -141,7 +140,7 @@ def judge_job(
 
 
 def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: list[str]) -> bool:
-    """Whether a task was still going on."""
+    """Adds the problems and remarks of a task; returns whether it had not ended yet."""
     last, count = changes[-1], len({change.place for change in changes})
     failures = [
         change
@@ -162,7 +161,7 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
         remarks.append(f"the task was done at {last.time:.4g} s, in {ended}{repeated}")
         remarks += [
             f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
-            for change in failures[-_MOST_TOLD:]
+            for change in failures[-_MOST_FAILURES:]
         ]
     else:
         remarks.append(
@@ -176,7 +175,7 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
 def _judge_contacts(
     record: Record, pushing: frozenset[str] | None, problems: list[str], remarks: list[str]
 ) -> None:
-    """The contacts that were lost: a problem in the second half of a run."""
+    """Adds lost contacts: as problems if they are lost in the second half of the run."""
     times, forces = record.time, record.signals["constraint_force"]
     steps, middle = np.diff(times), times[0] + LATE * (times[-1] - times[0])
     for signal, values in zip(forces.signals, forces.values.T, strict=True):
@@ -200,33 +199,34 @@ def _judge_outputs(
     problems: list[str],
     remarks: list[str],
 ) -> bool:
-    """Whether the run is too short for some output."""
+    """Adds the problems and remarks of outputs; returns whether the run is too short for some."""
     times = record.time
     middle, grace = times[0] + LATE * (times[-1] - times[0]), GRACE * (times[-1] - times[0])
     short = []
-    for one in outputs:
-        due = None if one.predicted_since is None else max(middle, one.predicted_since + grace)
-        if one.since is not None and (due is None or one.since <= due):
+    for output in outputs:
+        predicted, name = output.predicted_since, output.signal.name
+        due = None if predicted is None else max(middle, predicted + grace)
+        if output.since is not None and (due is None or output.since <= due):
             continue
-        if due is None and one.follows_prediction:
-            short.append(one.signal.name)
+        if due is None and output.follows_prediction:
+            short.append(name)
             continue
-        unit = f" {one.signal.unit}".rstrip()
+        unit = f" {output.signal.unit}".rstrip()
         when = "ends off its reference"
-        if one.since is not None:
-            when = f"is off its reference until {one.since:.3g} s"
+        if output.since is not None:
+            when = f"is off its reference until {output.since:.3g} s"
         problems.append(
-            f"{one.signal.name} {when}, by up to {one.largest:.2g}{unit} in the second half of the "
-            f"run ({one.tolerance:.2g}{unit} tolerated)"
+            f"{name} {when}, by up to {output.largest:.2g}{unit} in the second half of the run "
+            f"({output.tolerance:.2g}{unit} tolerated)"
         )
     if short:
         remarks.append(
             f"the run is too short: {', '.join(short)} cannot yet be at the reference, by the gains"
         )
-    settled = [one for one in outputs if one.since is not None]
+    settled = [output for output in outputs if output.since is not None]
     if settled and not problems:
-        worst = max(settled, key=lambda one: one.largest / one.tolerance)
-        since = max(one.since for one in settled if one.since is not None)
+        worst = max(settled, key=lambda output: output.largest / output.tolerance)
+        since = max(output.since for output in settled if output.since is not None)
         which = "every output" if len(settled) == len(outputs) else "every other output"
         unit = f" {worst.signal.unit}".rstrip()
         remarks.append(
@@ -244,11 +244,12 @@ def _qualities(
     if not error.size:
         return []
     signals = record.signals["tracking_error"].signals
-    sizes, rms, found = SHARE * _ranges(record, predicted), late_rms(record.time, error), []
+    tolerated = SHARE * _ranges(record, predicted)
+    rms, qualities = late_rms(record.time, error), []
     first = int(np.searchsorted(record.time, (record.time[0] + record.time[-1]) / 2.0))
     for i, signal in enumerate(signals):
-        tolerance = tolerances.get(signal.name, float(sizes[i]))
-        found.append(
+        tolerance = tolerances.get(signal.name, float(tolerated[i]))
+        qualities.append(
             OutputQuality(
                 signal,
                 tolerance,
@@ -259,28 +260,22 @@ def _qualities(
                 float(rms[i]),
             )
         )
-    return found
+    return qualities
 
 
 def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
-    """How far the references in the unit of each output move, shape (p,), positive."""
+    """The range of the references in the unit of each output, shape (p,), positive."""
     desired = record["desired_output"]
     sizes = output_sizes(record, predicted)
     ranges = desired.max(axis=0) - desired.min(axis=0)
     ranges[ranges <= ROUND_OFF * sizes] = 0.0
-    units = [signal.unit for signal in record.signals["desired_output"].signals]
-    found = {unit: float(ranges[[u == unit for u in units]].max()) for unit in set(units)}
-    largest = {
-        unit: float(np.abs(desired[:, [u == unit for u in units]]).max()) for unit in set(units)
-    }
-    return np.array(
-        [
-            found[unit] or largest[unit] or size
-            if unit not in ("", "rad")
-            else max(found[unit], 1.0)
-            for unit, size in zip(units, sizes, strict=True)
-        ]
-    )
+    largest = np.abs(desired).max(axis=0)
+    units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
+    for i, unit in enumerate(units.tolist()):
+        span = ranges[units == unit].max()
+        is_pure = unit in ("", "rad")
+        sizes[i] = max(span, 1.0) if is_pure else span or largest[units == unit].max() or sizes[i]
+    return sizes
 
 
 def _within_since(times: FloatArray, error: FloatArray, tolerance: float) -> float | None:
@@ -305,8 +300,8 @@ def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
         return np.abs(values[:, -1])
     before, after = values[:, first - 1], values[:, first]
     begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
-    found = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
+    courses = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
     steps = np.diff(np.concatenate([[middle], times[first:]]))
-    squares = (found[:, :-1] ** 2 + found[:, :-1] * found[:, 1:] + found[:, 1:] ** 2) / 3.0
+    squares = (courses[:, :-1] ** 2 + courses[:, :-1] * courses[:, 1:] + courses[:, 1:] ** 2) / 3.0
     sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
     return sizes

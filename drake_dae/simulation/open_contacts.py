@@ -1,4 +1,4 @@
-"""Opening contacts in a record, in words and as intervals of time."""
+"""The opening contacts of a record, in words and as intervals of time."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from drake_dae.simulation.records.record import Record
 
 
 def contact_notes(record: Record) -> list[tuple[str, str]]:
-    """The behavior of opening contacts, as labels and texts; empty if there are none."""
+    """The impacts and open times of contacts as (label, text); empty if no contact can open."""
     if "mode" not in record.signals:
         return []
     hits = impacts(record.events)

@@ -9,22 +9,22 @@ from pydrake.systems.framework import Context, System
 from drake_dae.errors import DrakeDaeError
 
 TRIAL = 0.3
-"""The longest duration of a trial, in s."""
+"""The longest duration of a trial by the clock, in s."""
 
 FIRST, PIECE = 0.02, 1.0 / 32.0
-"""The simulated time before the measurement, and per measurement, in s."""
+"""The simulated time before the measurement, and that of a piece of the measurement, in s."""
 
 
 def attainable_rate(
     diagram: System, context: Context, duration: float, config: SimulatorConfig
 ) -> float | None:
-    """The simulated seconds per second on this machine, at the start of a run.
+    """Measures the simulated seconds per second on this machine, by a short trial run.
 
     Args:
         diagram: The system.
         context: Its context with the start state; not changed.
         duration: The duration of the run, in s.
-        config: Its settings; it starts at their start_time.
+        config: The settings of the run.
 
     Returns:
         The rate; None if the run is too short, or fails immediately.

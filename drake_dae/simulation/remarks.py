@@ -1,4 +1,4 @@
-"""Remarks of a run on contact surfaces, and on its end."""
+"""Remarks on a run: surfaces, limits, references, and its end."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -18,7 +18,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 def surface_remarks(model: RobotModel, record: Record) -> list[str]:
-    """The approximations of the surfaces, and where the robot left their defined range.
+    """Remarks on approximations of surfaces, and on leaving their defined range.
 
     Args:
         model: The robot.
@@ -30,7 +30,7 @@ def surface_remarks(model: RobotModel, record: Record) -> list[str]:
 
 
 def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
-    """The first time a point is beyond the edge of its surface; empty if there is none."""
+    """A remark on the first time at which a point is beyond the edge of its surface, or ""."""
     extent, dae = constraint.extent, model.dae
     if extent is None:
         return ""
@@ -53,40 +53,40 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
 
 
 def limit_remarks(record: Record, limits: Limits) -> list[str]:
-    """The drive and the joint that come closest to a limit, each relative to its own limits.
+    """Remarks on the drive and the joint that come closest to their limits, relative to these.
 
     Args:
         record: A record with control and state.
         limits: The limits of the robot.
     """
-    found = []
+    remarks = []
     if limits.control is not None and np.isfinite(limits.control).any():
         shares = np.max(np.abs(record["control"]), axis=0) / limits.control
         place, signal = int(np.argmax(shares)), record.signals["control"].signals
         unit = f" {signal[place].unit}".rstrip()
-        found.append(
+        remarks.append(
             f"of the drives {signal[place].name} comes closest to its limit, with "
             f"{shares[place]:.0%} of {limits.control[place]:.4g}{unit}"
         )
     if limits.state is not None:
         lower, upper = limits.state
         values = record["state"][:, : lower.size]
-        left = np.minimum(values - lower, upper - values).min(axis=0)
+        room = np.minimum(values - lower, upper - values).min(axis=0)
         # A joint with one limit alone, or none, has no range to compare with.
         shares = np.full(lower.size, np.inf)
-        np.divide(left, upper - lower, out=shares, where=np.isfinite(upper - lower))
+        np.divide(room, upper - lower, out=shares, where=np.isfinite(upper - lower))
         place, signal = int(np.argmin(shares)), record.signals["state"].signals
         if np.isfinite(shares[place]):
             unit = f" {signal[place].unit}".rstrip()
-            found.append(
+            remarks.append(
                 f"of the joints {signal[place].name} comes closest to a limit, with "
-                f"{left[place]:.3g}{unit} left"
+                f"{room[place]:.3g}{unit} left"
             )
-    return found
+    return remarks
 
 
 def ball_remarks(radius: float | None) -> list[str]:
-    """The effect of the ball of Drake's own contact, compared to a point.
+    """A remark on the rolling of the ball in Drake's own contact.
 
     Args:
         radius: The radius of the ball in m; None without a ball.
@@ -101,7 +101,7 @@ def ball_remarks(radius: float | None) -> list[str]:
 
 
 def departure_remarks(record: Record, limits: FloatArray | None) -> list[str]:
-    """When limits made the error leave its prediction, by how much, and which drives.
+    """A remark on the times at which limits made the error deviate from its prediction.
 
     Args:
         record: A record; with "departure" where limits hold by `FeasibleControl`.
@@ -133,35 +133,35 @@ def departure_remarks(record: Record, limits: FloatArray | None) -> list[str]:
 
 
 def reference_remarks(references: Mapping[str, Any]) -> list[str]:
-    """The approximations of the references.
+    """Remarks on approximations in references.
 
     Args:
-        references: Objects with references, in lists, mappings and data classes, by name.
+        references: Name -> object; lists, mappings and dataclasses are searched for references.
     """
     return list(dict.fromkeys(_remarks_of(references)))
 
 
-def _remarks_of(one: Any, name: str = "") -> Iterator[str]:
-    if isinstance(one, Reference):
-        if one.remark:
-            yield f"{name}: {one.remark}" if name else one.remark
-    elif isinstance(one, Mapping):
-        for key, inner in one.items():
+def _remarks_of(value: Any, name: str = "") -> Iterator[str]:
+    if isinstance(value, Reference):
+        if value.remark:
+            yield f"{name}: {value.remark}" if name else value.remark
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
             yield from _remarks_of(inner, key)
-    elif isinstance(one, (list, tuple)):
-        for inner in one:
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
             yield from _remarks_of(inner, name)
-    elif is_dataclass(one):
-        for part in fields(one):
-            yield from _remarks_of(getattr(one, part.name), name)
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from _remarks_of(getattr(value, field.name), name)
 
 
 def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:
-    """A remark if a task has ended its run early, without failure or signal.
+    """A remark if a task ended its run before the duration was over.
 
     Args:
         statistics: The statistics of the run; None if it failed.
-        duration: Its requested duration, in s.
+        duration: The requested duration, in s.
     """
     if statistics is None or statistics.interrupted:
         return []

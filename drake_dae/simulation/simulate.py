@@ -1,4 +1,4 @@
-"""Running a diagram: progress, clean interruption, and statistics."""
+"""Runs a diagram: progress, clean interruption, and statistics."""
 
 import os
 import signal
@@ -36,7 +36,7 @@ BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""
 
 MANY_STEPS = 1e7
-"""The number of steps that takes over an hour, and gigabytes for the log."""
+"""A number of steps that takes over an hour, and gigabytes of memory for the log."""
 
 TYPICAL_STEP = 5e-4
 """The time of a step of a robot with seven joints, in s: five evaluations of its closed loop."""
@@ -74,15 +74,15 @@ def simulate(
     after_step: Callable[[Context], None] | None = None,
     may_diverge: bool = False,
 ) -> RunStatistics:
-    """Runs a diagram from a context; the context is the end state afterwards, on the manifold.
+    """Runs a diagram from a context; afterwards the context has the final state, on the manifold.
 
-    A diverging run of a `Plant` ends with the reason and its start: see `DivergenceWatch`.
+    If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
 
-    A run that continues another one, with its end as start_time, appends to the logs. A run that
-    starts earlier clears them.
+    A run whose start_time is the end of an earlier run appends to its logs. A run that starts
+    earlier clears them.
 
-    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second one ends it immediately
-    with a KeyboardInterrupt. Logs are kept, also if the run fails with an exception.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second signal ends it
+    immediately with a KeyboardInterrupt. Logs are kept, also if an exception ends the run.
 
     Args:
         diagram: The system.
@@ -90,7 +90,8 @@ def simulate(
         duration: The duration to simulate, in s.
         config: Drake's integrator settings; its defaults if None. The run starts at its start_time.
         progress: Shows simulated time and speed on stderr.
-        after_step: Called with the context after each step, such as `RecordWriter.update`.
+        after_step: A function that is called with the context after each step, such as
+            `RecordWriter.update`.
         may_diverge: Whether a diverging run continues.
 
     Warns:
@@ -99,7 +100,7 @@ def simulate(
     Raises:
         ModelError: The duration or the settings are not valid.
         InconsistentStateError: The start state is not on the manifold.
-        SimulationError: The run cannot go on, or diverges; the exception has time and state.
+        SimulationError: The run cannot continue, or diverges; the exception has time and state.
     """
     config = config or SimulatorConfig()
     check_duration(duration)
@@ -108,7 +109,7 @@ def simulate(
     _warn_of_many_steps(duration, _longest_step(diagram, config.max_step_size))
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
-    _forget_later(diagram, context, config.start_time)
+    _clear_later(diagram, context, config.start_time)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
@@ -138,10 +139,9 @@ def simulate(
             simulator.Initialize()
             began = time.perf_counter()
             if not may_diverge:
-                found = DivergenceWatch(diagram, context, duration)
-                watch = found if found.sees else None
+                watch = DivergenceWatch(diagram, context, duration)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            is_needed = progress or watch is not None or after_step is not None
+            is_needed = progress or after_step is not None or (watch is not None and watch.sees)
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
             simulator.AdvanceTo(start + duration)
@@ -154,7 +154,7 @@ def simulate(
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
             if watch is not None:
-                watch.look_at_states(context)  # Those of a few steps may have grown so fast.
+                watch.look_at_states(context)  # They may diverge within a few steps.
             if not isinstance(error, InconsistentStateError | RuntimeError):
                 raise
             state = context.get_continuous_state_vector().CopyToVector()
@@ -163,11 +163,11 @@ def simulate(
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 
 
-def _forget_later(system: System, context: Context, start: float) -> None:
-    """Clears the logs with samples later than the start of a run, in s."""
+def _clear_later(system: System, context: Context, start: float) -> None:
+    """Clears the logs that have samples after a time in s."""
     if isinstance(system, Diagram):
         for part in system.GetSystems():
-            _forget_later(part, context, start)
+            _clear_later(part, context, start)
     elif isinstance(system, VectorLogSink):
         log = system.FindMutableLog(context)
         if log.num_samples() and log.sample_times()[-1] > start:
@@ -175,7 +175,7 @@ def _forget_later(system: System, context: Context, start: float) -> None:
 
 
 def _longest_step(system: System, max_step_size: float) -> tuple[str, float]:
-    """The longest step in s, which ends at each sample, and its cause in words."""
+    """What limits the length of a step, in words, and the longest step in s."""
     least = "max_step_size", max_step_size
     if isinstance(system, Diagram):
         for part in system.GetSystems():
@@ -204,7 +204,7 @@ def _warn_of_many_steps(duration: float, longest: tuple[str, float]) -> None:
 
 
 def check_duration(duration: float) -> None:
-    """Refuses a duration that is not positive.
+    """Checks that a duration is positive.
 
     Raises:
         ModelError: The duration is not positive.
@@ -214,7 +214,7 @@ def check_duration(duration: float) -> None:
 
 
 def _check_times(start: float, duration: float) -> None:
-    """Refuses times that floating-point numbers cannot resolve."""
+    """Checks that floating-point numbers can resolve the times of a run."""
     if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
         raise ModelError(
             f"start_time must be a time from which {duration:g} s can be counted, got {start:g} s"
@@ -223,7 +223,7 @@ def _check_times(start: float, duration: float) -> None:
 
 @cache
 def _schemes() -> tuple[str, ...]:
-    """All of Drake's schemes except CENIC, which simulates only a MultibodyPlant."""
+    """All integration schemes of Drake except CENIC, which simulates only a MultibodyPlant."""
     return tuple(name for name in GetIntegrationSchemes() if name != "cenic")
 
 
@@ -235,7 +235,7 @@ def _has_error_control(scheme: str) -> bool:
 
 
 def check_config(config: SimulatorConfig) -> None:
-    """Refuses settings that Drake accepts but that hang, fail late, or are ignored.
+    """Checks for settings that Drake accepts but that hang, fail late, or are ignored.
 
     Raises:
         ModelError: A setting is not valid; the message names it and valid ones.
@@ -266,7 +266,7 @@ def check_config(config: SimulatorConfig) -> None:
 
 
 class _StepMonitor:
-    """Simulated time and speed on stderr: a bar on a terminal, otherwise periodic lines."""
+    """Shows simulated time and speed on stderr: a bar on a terminal, otherwise periodic lines."""
 
     def __init__(self, duration: float, enabled: bool) -> None:
         self._duration = duration
@@ -321,7 +321,8 @@ class _StepMonitor:
 def default_size() -> dict[str, int]:
     """The size for tqdm if the terminal reports no columns, as in some containers."""
     try:
-        known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
+        if os.get_terminal_size(sys.stderr.fileno()).columns > 0:
+            return {}
     except OSError:
-        known = False
-    return {} if known else {"ncols": 79, "nrows": 24}
+        pass
+    return {"ncols": 79, "nrows": 24}

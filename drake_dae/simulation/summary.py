@@ -18,15 +18,13 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
-_PROJECTED = "before each step's projection"
-
 _ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
 
 WIDTH = 100
 """The width of a paragraph, in characters."""
 
 SLACK = 1e-9
-"""The excess over a joint limit that counts, in its unit: a start may be on it."""
+"""A smaller excess over a joint limit, in its unit, is ignored: a start may be on the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +34,7 @@ class Limits:
     Attributes:
         control: The largest |u|, shape (p,).
         state: The lowest and the highest (q, v), shape (nq + nv,) each.
-        loops: The same of the joints that close loops, (c, c').
+        loops: The same for the joints that close loops, (c, c').
         pushing: Names of the unilateral constraint forces; None if all are unilateral.
     """
 
@@ -77,7 +75,7 @@ def summary(
     reasons: Sequence[str] = (),
     bound: FloatArray | None = None,
 ) -> str:
-    """The figures of a run in plain text, compared with the prediction.
+    """A summary of a run in plain text: its figures, compared with the prediction.
 
     Numbers that are round-off relative to others of the same unit are shown as 0.
 
@@ -86,12 +84,12 @@ def summary(
             constraint_force and control; and "mode" and "gap" with opening contacts.
         predicted: The tracking error by theory, shape (k, p).
         limits: The limits of the robot.
-        run: Its statistics; None for a failed run.
+        run: The statistics of the run; None for a failed run.
         failure: The reason of the failure.
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        accuracy: The accuracy of error control; None with fixed steps.
         reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
-        bound: A bound of what the controller adds to the prediction by design, shape (p,); None if
-            it adds nothing.
+        bound: A bound of the errors that the controller adds to the prediction by design, shape
+            (p,); None if it adds none.
     """
     limits = limits or Limits()
     sections = [
@@ -101,8 +99,9 @@ def summary(
         _controls(record, limits),
     ]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    # Of compliant contact the state is not projected.
-    kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
+    # In compliant contact the state is not projected.
+    is_compliant = "contact_force" in record
+    kind = "in compliant contact" if is_compliant else "before each step's projection"
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += _identified(record)
@@ -131,44 +130,24 @@ def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> 
         return []
     sizes = unit_sizes(record)
     errors = record["tracking_error"].T
-    columns = zip(
-        signals, errors, predicted.T, late_rms(record.time, record["tracking_error"]), strict=True
-    )
-    added = [[] if bound is None else [f"{number:.2g}"] for number in _numbers(bound, len(signals))]
-    more = [] if bound is None else ["springs add"]
-    about = [] if bound is None else [_ADDED]
-    return [
-        *Table(
-            [
-                "tracking error",
-                "unit",
-                "start",
-                "largest",
-                "final",
-                "late rms",
-                "off prediction by",
-                *more,
-            ],
-            [
-                [
-                    signal.name,
-                    signal.unit or "1",
-                    _number(error[0], sizes[signal.unit], 3),
-                    _number(np.max(np.abs(error)), sizes[signal.unit], 3),
-                    _number(error[-1], sizes[signal.unit], 3),
-                    _number(rms, sizes[signal.unit], 2),
-                    _number(np.max(np.abs(error - theory)), sizes[signal.unit], 2),
-                    *own,
-                ]
-                for (signal, error, theory, rms), own in zip(columns, added, strict=True)
-            ],
-            left=2,
-        ).lines(),
+    late = late_rms(record.time, record["tracking_error"])
+    head = ["tracking error", "unit", "start", "largest", "final", "late rms", "off prediction by"]
+    rows = []
+    for signal, error, theory, rms in zip(signals, errors, predicted.T, late, strict=True):
+        size, off = sizes[signal.unit], np.max(np.abs(error - theory))
+        courses = (error[0], np.max(np.abs(error)), error[-1])
+        numbers = [*(_number(e, size, 3) for e in courses), _number(rms, size, 2)]
+        rows.append([signal.name, signal.unit or "1", *numbers, _number(off, size, 2)])
+    notes = [
         "late rms: the root mean square in the second half of the run",
         "off prediction by: the largest deviation from the predicted error, which decays",
         "from its initial value by the gains alone",
-        *about,
     ]
+    if bound is not None:
+        head.append("springs add")
+        rows = [[*row, f"{number:.2g}"] for row, number in zip(rows, bound.tolist(), strict=True)]
+        notes.append(_ADDED)
+    return [*Table(head, rows, left=2).lines(), *notes]
 
 
 def _phases(record: Record) -> list[str]:
@@ -193,68 +172,51 @@ def _phases(record: Record) -> list[str]:
     ]
 
 
-def _numbers(bound: FloatArray | None, count: int) -> list[float]:
-    return [0.0] * count if bound is None else bound.tolist()
+def _extremes(record: Record, name: str) -> list[list[str]]:
+    """Name, unit, least and largest value of each entry of a signal."""
+    recorded, sizes = record.signals[name], unit_sizes(record)
+    return [
+        [s.name, s.unit or "1", *(_number(f(v), sizes[s.unit], 4) for f in (np.min, np.max))]
+        for s, v in zip(recorded.signals, recorded.values.T, strict=True)
+    ]
 
 
 def _forces(record: Record, limits: Limits) -> list[str]:
     forces = record.signals["constraint_force"]
     if not forces.signals:
         return []
-    sizes = unit_sizes(record)
-    return Table(
-        ["constraint force", "unit", "least", "largest", ""],
-        [
-            [
-                signal.name,
-                signal.unit or "1",
-                _number(np.min(values), sizes[signal.unit], 4),
-                _number(np.max(values), sizes[signal.unit], 4),
-                "pulls: a real contact would open" if _pulls(signal, values, limits) else "",
-            ]
-            for signal, values in zip(forces.signals, forces.values.T, strict=True)
-        ],
-        left=2,
-    ).lines()
+    pulls = [
+        "pulls: a real contact would open" if _pulls(signal, values, limits) else ""
+        for signal, values in zip(forces.signals, forces.values.T, strict=True)
+    ]
+    rows = zip(_extremes(record, "constraint_force"), pulls, strict=True)
+    head = ["constraint force", "unit", "least", "largest", ""]
+    return Table(head, [[*row, text] for row, text in rows], left=2).lines()
 
 
 def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
     if not controls.signals:
         return []
-    sizes = unit_sizes(record)
     largest = _largest_controls(record, limits)
     # A sample describes the step before it.
-    excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
+    excess = record["excess"] if "excess" in record else np.zeros_like(controls.values)
     cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
-    columns = zip(controls.signals, controls.values.T, largest, cut_off, strict=True)
-    return Table(
-        ["control", "unit", "least", "largest", "limit", ""],
-        [
-            [
-                signal.name,
-                signal.unit or "1",
-                _number(np.min(values), sizes[signal.unit], 4),
-                _number(np.max(values), sizes[signal.unit], 4),
-                f"{limit:.4g}" if np.isfinite(limit) else "none",
-                f"cut off for {time:.3g} s"
-                if time
-                else "over its limit"
-                if np.max(np.abs(values)) > limit
-                else "",
-            ]
-            for signal, values, limit, time in columns
-        ],
-        left=2,
-    ).lines()
+    rows = []
+    columns = zip(controls.values.T, largest, cut_off, strict=True)
+    for row, (values, limit, time) in zip(_extremes(record, "control"), columns, strict=True):
+        remark = "over its limit" if np.max(np.abs(values)) > limit else ""
+        remark = f"cut off for {time:.3g} s" if time else remark
+        rows.append([*row, f"{limit:.4g}" if np.isfinite(limit) else "none", remark])
+    return Table(["control", "unit", "least", "largest", "limit", ""], rows, left=2).lines()
 
 
 def _identified(record: Record) -> list[str]:
     """The friction identified by an observer at the end."""
     if "friction" not in record.signals:
         return []
-    found = record.signals["friction"]
-    pairs = zip(found.signals, found.values[-1], strict=True)
+    friction = record.signals["friction"]
+    pairs = zip(friction.signals, friction.values[-1], strict=True)
     text = ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
     return [f"identified           {text} at the end"]
 
@@ -274,7 +236,7 @@ def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
 
 
 def shortfalls(record: Record, limits: Limits) -> list[str]:
-    """Violations of limits by a run that tracks well, each in words.
+    """The violations of limits in a run, a phrase each.
 
     Args:
         record: A record with constraint_force and control.
@@ -288,14 +250,14 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
     ]
     over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
-    found = []
+    texts = []
     if pulling:
-        found.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
+        texts.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
     if beyond:
-        found.append(f"{', '.join(beyond)} would exceed the limits")
+        texts.append(f"{', '.join(beyond)} would exceed the limits")
     if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
-        found.append(f"{', '.join(joints)} would leave the joint limits")
-    return found
+        texts.append(f"{', '.join(joints)} would leave the joint limits")
+    return texts
 
 
 def _beyond(record: Record, limits: Limits) -> list[str]:
@@ -303,8 +265,8 @@ def _beyond(record: Record, limits: Limits) -> list[str]:
     rows: list[tuple[Signal, FloatArray, float, float]] = []
     for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and key in record.signals:
-            found = record.signals[key]
-            rows += zip(found.signals, found.values.T, *bounds, strict=False)
+            recorded = record.signals[key]
+            rows += zip(recorded.signals, recorded.values.T, *bounds, strict=False)
     return [
         f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
         f"its limits are {lower:.4g} and {upper:.4g}"

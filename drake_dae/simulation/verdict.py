@@ -10,6 +10,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.growth import with_sizes
 from drake_dae.simulation.records.record import Record
 
 ROUND_OFF = 1e-13
@@ -24,7 +25,7 @@ SLACK = 10.0
 
 
 class TrackingResult(Enum):
-    """The errors of a run compared with the predicted ones; the values start the sentence."""
+    """The errors of a run compared with the predicted ones. The sentence begins with the value."""
 
     AS_PREDICTED = "Tracked as predicted"
     NEARLY = "Tracked nearly as predicted"
@@ -36,11 +37,12 @@ class RunVerdict:
     """The comparison of a run with its prediction.
 
     Attributes:
-        tracking: The quality of tracking.
+        tracking: As predicted, nearly, or not.
         worst: The output with the largest relative deviation; None without outputs.
-        off: The largest deviation of its error from the predicted one, in its unit.
-        time: The time of it, in s; if not as predicted, the time since when.
-        share: The same relative to the output's size.
+        off: The largest deviation of its error from the predicted error, in its unit.
+        time: The time of this deviation, in s; if the run is not as predicted, the time from which
+            it is not.
+        share: The deviation relative to the size of the output.
         settled: The largest relative deviation in the second half of the run.
     """
 
@@ -58,21 +60,20 @@ def unit_sizes(record: Record) -> dict[str, float]:
     Args:
         record: A record with any of state, control, constraint_force and desired_output.
     """
-    found = {"": 1.0, "rad": 1.0}
+    sizes = {"": 1.0, "rad": 1.0}
     for name in ("state", "control", "constraint_force", "desired_output"):
-        if name in record.signals:
+        if name in record:
             largest = np.max(np.abs(record[name]), axis=0, initial=0.0)
-            for signal, size in zip(record.signals[name].signals, largest, strict=True):
-                found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
-    return found
+            sizes = with_sizes(sizes, record.signals[name].signals, largest)
+    return sizes
 
 
 def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     """The sizes of the outputs of a run, shape (p,), positive.
 
-    The size is the largest value of references and predicted errors in the unit of an output, so
-    that an output held at zero is compared with moving ones. If all are zero it is the largest
-    value of the record in that unit, or one.
+    The size of an output is the largest value of references and predicted errors in its unit, so
+    that an output with a reference of 0 has the size of others. If all are zero, it is the largest
+    value of the record in that unit, or 1.
 
     Args:
         record: A record with desired_output.
@@ -81,23 +82,21 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     signals = record.signals["desired_output"].signals
     courses = np.vstack([record["desired_output"], predicted])
     largest = np.max(np.abs(courses), axis=0, initial=0.0)
-    anything = unit_sizes(record)
-    found: dict[str, float] = {"": 1.0, "rad": 1.0}
-    for signal, size in zip(signals, largest, strict=True):
-        found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
-    for unit, size in found.items():
-        if size <= ROUND_OFF * anything.get(unit, 0.0):
-            found[unit] = anything[unit] or 1.0
-    return np.array([found[signal.unit] for signal in signals])
+    of_all = unit_sizes(record)
+    sizes = with_sizes({"": 1.0, "rad": 1.0}, signals, largest)
+    for unit, size in sizes.items():
+        if size <= ROUND_OFF * of_all.get(unit, 0.0):
+            sizes[unit] = of_all[unit] or 1.0
+    return np.array([sizes[signal.unit] for signal in signals])
 
 
 def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> RunVerdict:
-    """The comparison of a run with its prediction.
+    """Compares a run with its prediction.
 
     Args:
         record: A record with desired_output and tracking_error.
         predicted: The tracking error by theory, shape (k, p).
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        accuracy: The accuracy of error control; None with fixed steps.
     """
     error = record["tracking_error"]
     if not error.size:
@@ -118,7 +117,7 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
 
 
 def as_data(verdict: RunVerdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
-    """A verdict as plain data, where a number that is not finite is None.
+    """Converts a verdict to plain data; a number that is not finite becomes None.
 
     Args:
         verdict: The verdict.
@@ -150,8 +149,8 @@ def in_words(
 
     Args:
         verdict: The verdict.
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
-        reasons: Why a run is not as predicted, such as "the drives were saturated".
+        accuracy: The accuracy of error control; None with fixed steps.
+        reasons: Reasons for a deviation, such as "the drives were saturated".
         ended: The end of the run, such as "The run failed at 2.1 s"; empty if it is complete.
     """
     head = f"{ended}; up to there: " if ended else ""

@@ -4,7 +4,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
+from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.variations import Variation, run_name
+from drake_dae.studies.variations import Variation, rerun_commands, run_name
 
 FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
 """The names of the files that `Study.save` writes."""
@@ -33,10 +35,15 @@ class Study:
     Attributes:
         variations: For each run, dotted key of the scenario -> value.
         results: The result of each run.
+        scenario: The scenario of the study, from which `save` derives the commands that repeat a
+            run; None if unknown.
+        rollout: Whether the runs were rollouts.
     """
 
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
+    scenario: Scenario | None = field(default=None, repr=False)
+    rollout: bool = False
 
     def __post_init__(self) -> None:
         if len(self.variations) != len(self.results):
@@ -100,22 +107,28 @@ class Study:
         }
 
     def save(
-        self, folder: str | Path, title: str = "", again: Sequence[str] = (), duration: float = 1.0
+        self,
+        folder: str | Path,
+        title: str = "",
+        again: Sequence[str] = (),
+        duration: float | None = None,
     ) -> list[Path]:
         """Writes `runs.csv`, `summary.txt`, `study.html`, and one plot for each available figure.
 
         `study.html` is a self-contained page with a sortable table, parallel coordinates, and a
         comparison of runs. If a folder "run<number>" exists beside the page, the page shows the
-        plots and the animation of this run.
+        plots and the animation of this run. If the study has a scenario, `scenario.yaml` is
+        written, too, and the page shows the commands that create these folders.
 
         Args:
             folder: The folder to write to; created if it does not exist.
             title: The title of the page; the name of the folder if empty.
-            again: For each run the command that creates its folder, shown in the page.
-            duration: The duration of the runs, in s.
+            again: For each run a command that creates its folder, instead of the default one.
+            duration: The duration of the runs, in s; None for that of the scenario, or 1 without a
+                scenario.
 
         Returns:
-            The paths of the written files.
+            The paths of `runs.csv`, `summary.txt`, `study.html` and the plots.
         """
         from drake_dae.studies.study_plots import save_study_plots
 
@@ -123,6 +136,12 @@ class Study:
             raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        if self.scenario is not None:
+            base = folder / "scenario.yaml"
+            save_scenario(self.scenario, base)
+            made = ["drake-dae", "simulate", str(base), *(["--rollout"] if self.rollout else [])]
+            again = again or rerun_commands(made, self.variations, folder)
+            duration = self.scenario.duration if duration is None else duration
         table, summary, page = (folder / name for name in FILES[:3])
         columns = self.table()
         with open(table, "w", newline="", encoding="utf-8") as file:
@@ -133,7 +152,8 @@ class Study:
             )
         summary.write_text(f"{self}\n", encoding="utf-8")
         title = title or folder.resolve().name
-        page.write_text(self._page(title, again, duration), encoding="utf-8")
+        seconds = 1.0 if duration is None else duration
+        page.write_text(self._page(title, again, seconds), encoding="utf-8")
         plots = save_study_plots(columns, self.keys, self.figures, folder)
         return [table, summary, page, *plots]
 

@@ -91,7 +91,8 @@ def sweep(
             _try(Runner(*settings), chosen)
         with open_journal(path, head) as journal:
             _run(settings, chosen, journal, workers, cluster, progress, time_limit)
-    return Study(tuple(chosen), tuple(journal.results[run] for run in range(len(chosen))))
+    found = tuple(journal.results[run] for run in range(len(chosen)))
+    return Study(tuple(chosen), found, scenario, rollout)
 
 
 def _run(

@@ -1,10 +1,12 @@
 """The variations of a study: for each run, keys of the scenario and their values."""
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import product
 from math import isfinite, prod
+from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -273,6 +275,26 @@ def _in_brief(value: Any) -> str:
 def setting(key: str, value: Any) -> str:
     """Returns a change as "key=value", in the form that the command line accepts."""
     return f"{key}={dump_yaml({'v': value}, on_one_line=True).strip()[4:-1]}"
+
+
+def rerun_commands(made: Sequence[str], variations: Sequence[Variation], folder: Path) -> list[str]:
+    """For each run of a study the command that makes its record, plots and animation.
+
+    Args:
+        made: The words of the command that runs the scenario, without what varies.
+        variations: What varies in each run.
+        folder: The folder of the study, in which that of a run is made.
+    """
+    return [
+        shlex.join(
+            [
+                *made,
+                *(part for item in changes.items() for part in ("--set", setting(*item))),
+                *("--out", str(folder / f"run{number}")),
+            ]
+        )
+        for number, changes in enumerate(variations)
+    ]
 
 
 def plain(key: str, value: Any) -> Any:

@@ -13,7 +13,7 @@ from drake_dae.trace.factorization import (
 
 
 def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
-    """Rows and columns of the blocks of a square matrix, in stages.
+    """Returns rows and columns of the diagonal blocks of a square matrix, in stages.
 
     A block needs what blocks of earlier stages solve for, and nothing else.
     """
@@ -23,19 +23,19 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
     stage_of = np.full(pattern.size2(), -1)
     for k in range(count):
         own_rows = rows[row_starts[k] : row_starts[k + 1]]
-        own = columns[column_starts[k] : column_starts[k + 1]]
+        block = columns[column_starts[k] : column_starts[k + 1]]
         stage = int(stage_of[used[own_rows].any(axis=0)].max()) + 1
-        stage_of[own] = stage
+        stage_of[block] = stage
         if stage == len(stages):
             stages.append([])
-        stages[stage].append((own_rows, own))
+        stages[stage].append((own_rows, block))
     return stages
 
 
 def saddle_point_solver(
     mass: ca.SX, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
-    """A solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), from E, g and c^T.
+    """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), from E, g and c^T.
 
     Returns:
         The solver, A = c E^-1 g, and a scalar that is 0 exactly where A is singular.

@@ -20,13 +20,13 @@ from pathlib import Path
 from drake_dae.errors import MachineCodeError, MachineCodeWarning
 
 SUFFIX = ".so"
-"""The suffix of compiled code, also on macOS, where a library may have any."""
+"""The suffix of compiled code, also on macOS, where any suffix works."""
 
 _OURS = re.compile(rf"[0-9a-f]{{32}}-[0-9a-f]{{32}}{re.escape(SUFFIX)}|new-\w+")
 
 
 def cache_folder() -> Path:
-    """The folder, whether it exists or not: DRAKE_DAE_CACHE if it is set.
+    """Returns the path of the cache, also if it does not exist: DRAKE_DAE_CACHE if it is set.
 
     Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
     macOS and ~/.cache elsewhere.
@@ -36,9 +36,9 @@ def cache_folder() -> Path:
     """
     if os.environ.get("DRAKE_DAE_CACHE"):
         return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if given.is_absolute():  # Its specification says to ignore other paths.
-        return given / "drake_dae"
+    folder = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if folder.is_absolute():  # Its specification says to ignore other paths.
+        return folder / "drake_dae"
     try:
         home = Path.home()
     except RuntimeError:
@@ -49,7 +49,7 @@ def cache_folder() -> Path:
 
 
 def open_cache(create: bool = False) -> Path | None:
-    """The folder, if it can be trusted; None if there is none.
+    """Returns the folder of the cache if it can be trusted; None if it does not exist.
 
     Args:
         create: Makes one where there is none, mode 0700.
@@ -58,33 +58,34 @@ def open_cache(create: bool = False) -> Path | None:
         MachineCodeError: It belongs to another user, or others can write it; or it cannot be made.
     """
     folder = cache_folder()
-    try:
+    with _explained(folder):
         if create:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with suppress(FileExistsError):
                 folder.mkdir(0o700)
-        found = folder.stat()
-    except OSError as error:
-        if isinstance(error, FileNotFoundError) and not create:
+        try:
+            status = folder.stat()
+        except FileNotFoundError:
+            if create:
+                raise
             return None
-        raise MachineCodeError(_message(folder, error)) from None
-    if not stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISDIR(status.st_mode):
         raise MachineCodeError(f"the cache {folder} is no folder; remove it")
-    if found.st_uid != os.getuid():
+    if status.st_uid != os.getuid():
         raise MachineCodeError(
-            f"the cache {folder} belongs to another user (id {found.st_uid}), whose code is not "
+            f"the cache {folder} belongs to another user (id {status.st_uid}), whose code is not "
             "loaded; name a folder of your own in DRAKE_DAE_CACHE"
         )
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise MachineCodeError(
-            f"others can write the cache {folder} (mode {stat.S_IMODE(found.st_mode):04o}), so its "
-            f"code is not loaded; chmod 700 {folder}"
+            f"others can write the cache {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so "
+            f"its code is not loaded; chmod 700 {folder}"
         )
     return folder
 
 
 def find(key: str) -> Path | None:
-    """The code stored under a key; None if there is none.
+    """Returns the code that is stored under a key; None if there is none.
 
     Warns:
         MachineCodeWarning: The file is damaged, and was removed.
@@ -95,41 +96,33 @@ def find(key: str) -> Path | None:
     folder = open_cache()
     if folder is None:
         return None
-    try:
+    with _explained(folder):
         path = next(folder.glob(f"{key}-*{SUFFIX}"), None)
-        if path is None:
-            return None
-        if path.name == _name(key, path.read_bytes()):
+        if path is None or path.name == _name(key, path.read_bytes()):
             return path
         path.unlink()
-    except OSError as error:
-        raise MachineCodeError(_message(folder, error)) from None
     warnings.warn(f"{path} was damaged, and is removed", MachineCodeWarning, stacklevel=1)
     return None
 
 
 @contextmanager
 def workplace() -> Iterator[Path]:
-    """A temporary folder in the cache, removed at the end.
+    """Creates a temporary folder in the cache and removes it at the end.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or written.
     """
     folder = open_cache(create=True)
-    try:
-        place = tempfile.mkdtemp(prefix="new-", dir=folder)
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
-    try:
-        yield Path(place)
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
+    with _explained(cache_folder()):
+        temporary = tempfile.mkdtemp(prefix="new-", dir=folder)
+        try:
+            yield Path(temporary)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def store(key: str, file: Path) -> Path:
-    """Moves a file from the `workplace` to its place, under a key for `find`."""
+    """Moves a file from the `workplace` into the cache, under a key for `find`."""
     path = file.parents[1] / _name(key, file.read_bytes())
     file.chmod(0o700)
     os.replace(file, path)
@@ -137,17 +130,15 @@ def store(key: str, file: Path) -> Path:
 
 
 def contents() -> list[Path]:
-    """The files of the cache, and temporary folders of killed processes; nothing else.
+    """Returns the files of the cache, and the temporary folders of killed processes.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or read.
     """
     folder = open_cache()
-    try:
-        found = sorted(folder.iterdir()) if folder is not None else []
-        return [path for path in found if _OURS.fullmatch(path.name)]
-    except OSError as error:
-        raise MachineCodeError(_message(cache_folder(), error)) from None
+    with _explained(cache_folder()):
+        paths = sorted(folder.iterdir()) if folder is not None else []
+    return [path for path in paths if _OURS.fullmatch(path.name)]
 
 
 def clear() -> None:
@@ -157,18 +148,22 @@ def clear() -> None:
         MachineCodeError: The cache cannot be trusted or written.
     """
     for path in contents():
-        try:
+        with _explained(path):
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
-        except OSError as error:
-            raise MachineCodeError(_message(path, error)) from None
 
 
 def _name(key: str, code: bytes) -> str:
     return f"{key}-{hashlib.sha256(code).hexdigest()[:32]}{SUFFIX}"
 
 
-def _message(path: Path, error: OSError) -> str:
-    return f"the cache {path} cannot be used: {error.strerror or error}"
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turns an OSError into a MachineCodeError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise MachineCodeError(f"the cache {path} cannot be used: {reason}") from None

@@ -50,7 +50,7 @@ SLOWEST = 10.0
 
 
 class CompilationAttempt(NamedTuple):
-    """An attempt to get machine code.
+    """When to try to get machine code, and whether to compile.
 
     Attributes:
         calls: The number of calls since the last attempt.
@@ -62,26 +62,25 @@ class CompilationAttempt(NamedTuple):
 
 
 def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
-    """The attempts to get machine code for a function.
+    """Returns the attempts to get machine code for a function.
 
     Args:
         compiled: The choice.
         operations: The number of operations of the function.
     """
-    if compiled == "auto":
-        level = _level(compiled, operations)
-        if not operations:
-            return []
-        seconds = STARTING + COMPILING[level] * operations if level else 0.0
-        pays = (
-            [CompilationAttempt(int(seconds / (INTERPRETED * operations)), True)] if level else []
-        )
-        return [CompilationAttempt(LOOK, False), *pays]
-    return [CompilationAttempt(1, True)] if compiled else []
+    if compiled != "auto":
+        return [CompilationAttempt(1, True)] if compiled else []
+    if not operations:
+        return []
+    result = [CompilationAttempt(LOOK, False)]
+    if level := _level(compiled, operations):
+        seconds = STARTING + COMPILING[level] * operations
+        result.append(CompilationAttempt(int(seconds / (INTERPRETED * operations)), True))
+    return result
 
 
 def check_choice(owner: str, compiled: Any) -> None:
-    """Refuses an invalid choice.
+    """Checks the value of the option `compiled`.
 
     Raises:
         ModelError: It is neither True, False nor "auto".
@@ -91,7 +90,7 @@ def check_choice(owner: str, compiled: Any) -> None:
 
 
 def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Function | None:
-    """A function as machine code; None if there is none.
+    """Returns a function as machine code; None if there is none.
 
     It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
 
@@ -118,14 +117,14 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
 def library(
     source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
 ) -> Path | None:
-    """C source as a shared library in the cache; None if there is none.
+    """Returns a shared library in the cache, compiled from C source; None if there is none.
 
     Args:
         source: The source.
         operations: The approximate number of operations, for the expected time to compile.
         compiled: The choice, True or "auto".
         make: Whether to make it where the cache has none.
-        options: Options of the compiler, which outdo others.
+        options: Options of the compiler, which override others.
 
     Warns:
         MachineCodeWarning: It should be made and cannot be.
@@ -160,24 +159,24 @@ def _library(
     level = _level(compiled, operations)
     if not (make and level):
         return None
-    with files.workplace() as place:
+    with files.workplace() as folder:
         usual = STARTING + COMPILING[level] * operations
         seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
         try:
-            compiler.compile(source, place / "code", level, seconds, options)
+            compiler.compile(source, folder / "code", level, seconds, options)
         except CompilerHangs as error:
             give_up(compiler, error)
             raise
-        return files.store(_key(source, compiler, level, options), place / "code.so")
+        return files.store(_key(source, compiler, level, options), folder / "code.so")
 
 
 def without_branches(source: str) -> str:
-    """The C source of CasADi, changed to write all results unconditionally."""
+    """Changes the C source of CasADi so that it writes all results unconditionally."""
     return re.sub(r"if \(res\[\d+\]!=0\) (?=res\[)", "", source)
 
 
 def generate(*functions: ca.Function) -> str:
-    """The C source of functions, each under its own name."""
+    """Generates the C source of functions, each under its own name."""
     generator = ca.CodeGenerator("code")
     for function in functions:
         generator.add(function)
@@ -185,22 +184,22 @@ def generate(*functions: ca.Function) -> str:
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:
-    """The same function under another name."""
+    """Returns the same function under another name."""
     inputs = function.sx_in()
     return ca.Function(name, inputs, function.call(inputs), {"cse": False})
 
 
 def _level(compiled: Compiled, operations: int) -> str:
-    """The optimization level for a function; empty if compilation would take too long."""
+    """Returns the optimization level for a function; empty if compilation would take too long."""
     if compiled is True:
         return "-O1"
-    fast = (level for level, each in COMPILING.items() if each * operations < LIMIT)
+    fast = (level for level, seconds in COMPILING.items() if seconds * operations < LIMIT)
     return next(fast, "")
 
 
 def _key(source: str, compiler: Compiler, level: str, options: tuple[str, ...]) -> str:
-    given = *FLAGS, *compiler.target, level, *options
-    parts = (source, *compiler.command, compiler.identity, *given)
+    options_of_build = *FLAGS, *compiler.target, level, *options
+    parts = (source, *compiler.command, compiler.identity, *options_of_build)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 

@@ -1,4 +1,4 @@
-"""The available C compiler: which one, its options, and how it is run."""
+"""The available C compiler, its options, and its calls."""
 
 import os
 import platform
@@ -53,7 +53,7 @@ ANSWERS = 10.0
 
 
 class CompilerHangs(MachineCodeError):
-    """A compiler that does not finish."""
+    """The exception for a compiler that does not finish."""
 
 
 _HANGING: dict[str, str] = {}
@@ -62,7 +62,7 @@ once."""
 
 
 class Compiler(NamedTuple):
-    """A C compiler.
+    """A C compiler: its command, its identity and its options.
 
     Attributes:
         command: How it is called.
@@ -82,7 +82,7 @@ class Compiler(NamedTuple):
         seconds: float,
         more: tuple[str, ...] = (),
     ) -> None:
-        """Writes a source to file.c and its machine code to file.so.
+        """Writes C source to file.c and compiles it to file.so.
 
         Raises:
             MachineCodeError: The compiler fails, or takes longer than some seconds.
@@ -101,7 +101,7 @@ class Compiler(NamedTuple):
         seconds: float,
         target: Sequence[str] = (),
     ) -> None:
-        """Compiles sources to one shared library; by default for any processor of this kind.
+        """Compiles source files to one shared library, by default for any processor of this kind.
 
         Raises:
             MachineCodeError: The compiler fails, or takes longer than some seconds.
@@ -113,7 +113,7 @@ class Compiler(NamedTuple):
 
 
 def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:
-    """What a compiler says that fails."""
+    """The message for a compiler that fails, with its first error."""
     lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
     wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
     said = wrong[0].replace(f"{folder}/", "").strip()
@@ -121,19 +121,19 @@ def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", f
 
 
 def find_compiler() -> Compiler:
-    """The C compiler named by CC, with its options; else `cc`; else the one installed by pip.
+    """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang.
 
     The last is `python -m ziglang cc`, the optional group "compiler".
 
     Raises:
         MachineCodeError: There is none.
     """
-    found = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
-    if isinstance(found, str):
-        raise MachineCodeError(found)
-    if found.identity in _HANGING:
-        raise MachineCodeError(_HANGING[found.identity])
-    return found
+    compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+    if isinstance(compiler, str):
+        raise MachineCodeError(compiler)
+    if compiler.identity in _HANGING:
+        raise MachineCodeError(_HANGING[compiler.identity])
+    return compiler
 
 
 def give_up(compiler: Compiler, error: MachineCodeError) -> None:
@@ -143,7 +143,7 @@ def give_up(compiler: Compiler, error: MachineCodeError) -> None:
 
 @cache
 def _find_compiler(named: str, path: str) -> Compiler | str:
-    """The compiler, or the reason why there is none; one that hangs is waited for once."""
+    """Returns the compiler, or the reason why there is none; a hanging one is waited for once."""
     try:
         return _looked_up(named)
     except MachineCodeError as error:
@@ -173,7 +173,7 @@ def _looked_up(named: str) -> Compiler:
 
 
 def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
-    """The option for this processor, and the target that the compiler derives from it.
+    """Returns the option for this processor, and the target that the compiler derives from it.
 
     None if the command chooses a processor, or if the compiler does not know this one. The target
     is part of the identity, so that machines with a shared cache each have their own code.
@@ -185,7 +185,7 @@ def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
 
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
-    """Runs a command to its end; after a timeout its child processes are ended as well."""
+    """Runs a command to its end. After a timeout it also ends the child processes."""
     try:
         with subprocess.Popen(
             command,

@@ -9,14 +9,14 @@ from drake_dae.arrays import Booleans
 
 
 def nonzeros(pattern: ca.Sparsity) -> Booleans:
-    """Which entries of a matrix are not zero by its structure."""
+    """Returns which entries of a matrix are structurally nonzero."""
     result = np.zeros(pattern.shape, dtype=bool)
     result[pattern.get_triplet()] = True
     return result
 
 
 class Factorization:
-    """A regular matrix A = Q R, factored once for many right sides; needs no pivoting.
+    """A factorization A = Q R of a regular matrix, for many right sides, without pivoting.
 
     A right side is orthogonalized along with the columns of A (modified Gram-Schmidt), so that the
     error grows with the condition of A and not, as by Q^T B, with its square.
@@ -53,7 +53,7 @@ class Factorization:
             self._directions.append(direction)
 
     def solve(self, right: ca.SX) -> ca.SX:
-        """X of A X = B, shape (n, k); columns of B that are structurally zero stay so."""
+        """Returns X of A X = B, shape (n, k), with the structurally zero columns of B."""
         result = ca.SX(*right.shape)
         chosen = [j for j in range(right.shape[1]) if right[:, j].nnz()]
         if not (chosen and self._directions):
@@ -66,7 +66,7 @@ class Factorization:
         return result
 
     def shortest(self, right: ca.SX) -> ca.SX:
-        """The shortest x of A^T x = b, shape (l, 1), for b of shape (n, 1): x = Q R^-T b.
+        """Returns the shortest x of A^T x = b, shape (l, 1), for b of shape (n, 1): x = Q R^-T b.
 
         Summed so that directions which are not quite orthogonal do no harm (Bjorck, Numerical
         Methods for Least Squares Problems, 1996, section 2.4.5).
@@ -81,7 +81,7 @@ class Factorization:
 def nearest_solution(
     matrix: ca.SX, right: ca.SX, metric: ca.SX, goal: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Of all u with B u = b the one next to u_0, for which (u - u_0)^T W (u - u_0) is least:
+    """Returns the u with B u = b next to u_0, for which (u - u_0)^T W (u - u_0) is least:
 
         u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (b - B u_0).
 
@@ -104,7 +104,7 @@ def nearest_solution(
 
 
 class PositiveDefiniteFactorization:
-    """A symmetric positive definite matrix A = L D L^T, factored once for many right sides.
+    """A factorization A = L D L^T of a symmetric positive definite matrix, for many right sides.
 
     Args:
         matrix: A, shape (n, n); its structural zeros are used.
@@ -126,19 +126,19 @@ class PositiveDefiniteFactorization:
             self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
 
     def solve(self, right: ca.SX) -> ca.SX:
-        """X of A X = B, shape (n, k); columns of B that are structurally zero stay so."""
+        """Returns X of A X = B, shape (n, k), with the structurally zero columns of B."""
         return self.backward(self.forward(right))
 
     def forward(self, right: ca.SX) -> ca.SX:
-        """Y = L^-1 B, shape (n, k)."""
+        """Returns Y = L^-1 B, shape (n, k)."""
         return right if self._identity else _by_columns(self._lower, right)
 
     def backward(self, half: ca.SX) -> ca.SX:
-        """X = L^-T D^-1 Y, shape (n, k)."""
+        """Returns X = L^-T D^-1 Y, shape (n, k)."""
         return half if self._identity else _by_columns(self._lower.T, self.scaled(half))
 
     def scaled(self, half: ca.SX) -> ca.SX:
-        """D^-1 Y, shape (n, k), so that the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
+        """Returns D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
         return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
 
 
@@ -152,7 +152,7 @@ def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
 
 
 def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
-    """The smallest sine of the angle between a row of a matrix and the span of those before it.
+    """Returns the smallest sine of the angle between a row and the span of earlier rows.
 
     Args:
         rows: The matrix, shape (k, n).
@@ -164,8 +164,8 @@ def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
         row = rest = ca.densify(rows[i, :])
         for direction in basis:
             rest -= ca.dot(direction, rest) * direction
-        left = ca.norm_2(rest)
-        basis.append(rest / left)
+        length_left = ca.norm_2(rest)
+        basis.append(rest / length_left)
         whole = ca.fmax(ca.norm_2(row), length)
-        smallest = ca.fmin(smallest, ca.if_else(whole > 0, left / whole, 0))
+        smallest = ca.fmin(smallest, ca.if_else(whole > 0, length_left / whole, 0))
     return smallest

@@ -1,4 +1,4 @@
-"""Formulas given as text: parsed, never executed as Python."""
+"""Formulas as text: parsed, never executed as Python."""
 
 import ast
 import operator
@@ -43,7 +43,7 @@ CONSTANTS = {"pi": ca.pi}
 
 
 def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
-    """The expression of a text such as "z - 0.1*sin(x)**2".
+    """Parses a text such as "z - 0.1*sin(x)**2" to an expression.
 
     It may have numbers, the symbols, pi, + - * / **, brackets, and sin, cos, tan, asin, acos, atan,
     atan2, sinh, cosh, tanh, asinh, acosh, atanh, exp, log, sqrt, erf.
@@ -75,7 +75,7 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
 
 
 def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
-    """Refuses names of parameters that a formula could not use.
+    """Checks that a formula can use names of parameters.
 
     Raises:
         ModelError: A name is not an identifier, or is reserved.
@@ -88,18 +88,18 @@ def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
 
 
 class _FormulaReader:
-    """A text on one line, with the expressions of its names."""
+    """A formula on one line, with the expressions of its names."""
 
     def __init__(self, text: str, symbols: Mapping[str, ca.SX]) -> None:
         self.text = text
         self._names = {**CONSTANTS, **symbols}
 
     def error(self, what: str, place: int) -> ModelError:
-        """An error at a place, counted from 0, of the text."""
+        """Returns an error at a position of the text, counted from 0."""
         return ModelError(f"formula '{_short(self.text)}', column {place + 1}: {what}")
 
     def value(self, node: ast.expr) -> ca.SX:
-        """The expression of a part of the text."""
+        """Returns the expression of a part of the text."""
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
             return self._number(node)
         if isinstance(node, ast.Name):

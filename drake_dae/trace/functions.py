@@ -24,7 +24,7 @@ SINGULAR_PIVOT = 1e-12
 
 
 class FailureKind(Enum):
-    """The kind of failure of a function."""
+    """The kinds of failures of a function; the enum value is a description."""
 
     INPUT = "an input is not finite"
     OVERFLOW = "an input is beyond all measure"
@@ -53,7 +53,7 @@ class Failure:
 
 
 class TracedFunction:
-    """CasADi expressions, evaluated on preallocated NumPy arrays.
+    """A compiled or interpreted function of CasADi expressions on preallocated NumPy arrays.
 
     A call goes through CasADi's buffer interface and allocates nothing. It also computes one number
     that says whether its values are valid, see `is_valid`. Only here it is decided whether a
@@ -132,7 +132,7 @@ class TracedFunction:
         self._bind(self._function)
 
     def _bind(self, function: ca.Function) -> None:
-        """Binds a function to the arrays, to be called from now on."""
+        """Binds the function that calls evaluate to the arrays."""
         self.is_machine_code = function is not self._function
         self._buffer, self._evaluate = function.buffer()
         for index, array in enumerate(self.arguments):
@@ -152,7 +152,7 @@ class TracedFunction:
             self._bind(code or self._function)
 
     def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
-        """Calls the function without allocation.
+        """Evaluates the function without allocation.
 
         Args:
             arguments: Arrays of the sizes of the inputs, in their order.
@@ -167,14 +167,14 @@ class TracedFunction:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
         # zip(..., strict=True) and [:] would take as long as the function.
         inputs, index = self.arguments, 0
-        for given in arguments:
-            inputs[index][...] = given
+        for argument in arguments:
+            inputs[index][...] = argument
             index += 1  # noqa: SIM113 - enumerate takes longer.
         self.run()
         return self.outputs
 
     def run(self) -> bool:
-        """Calls the function on its `arguments`; returns whether its `outputs` are valid.
+        """Evaluates the function at its `arguments`; returns whether its `outputs` are valid.
 
         This is the fastest call, for callers that write the arguments in place. It is replaced by
         `_run` when there are no more attempts to compile.
@@ -186,7 +186,7 @@ class TracedFunction:
         return isfinite(self._valid[0])
 
     def nowhere(self) -> tuple[FloatArray, ...]:
-        """New arrays of nan in the shapes of the outputs, for points without a value."""
+        """Returns new arrays of nan in the shapes of the outputs, for failed evaluations."""
         return tuple(np.full_like(output, np.nan) for output in self.outputs)
 
     @property
@@ -214,21 +214,21 @@ class TracedFunction:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the last values are valid apart from the doubt."""
+        """Whether the last values are finite and the matrix is regular; ignores the doubt."""
         return self.is_finite and bool(self._pivot[0] >= SINGULAR_PIVOT)
 
     @property
     def pivot(self) -> float:
-        """The pivot of the last call; 1 where there is none."""
+        """The pivot of the last evaluation; 1 without a matrix."""
         return float(self._pivot[0])
 
     def failure(self) -> Failure:
-        """The failure of the last call, if it was not valid."""
+        """Returns the failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
-                name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
-                for name, given in zip(self.input_names, self.arguments, strict=True)
-                if not np.all(np.abs(given) < limit)
+                name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
+                for name, argument in zip(self.input_names, self.arguments, strict=True)
+                if not np.all(np.abs(argument) < limit)
             }
             if bad:
                 return Failure(self.name, fault, bad)
@@ -240,7 +240,7 @@ class TracedFunction:
         return Failure(self.name, fault, {}, self._regular)
 
     def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":
-        """The derivatives of an output with respect to some inputs, side by side."""
+        """Returns the function of the derivatives of an output by some inputs, side by side."""
         names = self.input_names
         symbols = [ca.SX.sym(name, size) for name, size in zip(names, self.sizes, strict=True)]
         value = ca.vec(self._function(*symbols)[output])
@@ -254,7 +254,7 @@ class TracedFunction:
         )
 
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
-        """Calls the function and returns fresh arrays.
+        """Evaluates the function and returns new arrays.
 
         Raises:
             ModelError: The number of arguments is wrong, or one has a wrong shape or is not
@@ -271,22 +271,24 @@ class TracedFunction:
             numbers(f"{self.name}: '{label}'", argument)
             for label, argument in zip(self.input_names, arguments, strict=True)
         ]
-        for label, own, given in zip(self.input_names, self.arguments, arrays, strict=True):
-            if own.size != given.size:
-                raise ModelError(f"{self.name}: '{label}' has size {given.size}, not {own.size}")
-            if given.ndim > 1 and given.shape != (own.size, 1):
-                raise ModelError(f"{self.name}: '{label}' has shape {given.shape}, not {own.shape}")
+        for label, buffer, array in zip(self.input_names, self.arguments, arrays, strict=True):
+            size = buffer.size
+            if array.size != size:
+                raise ModelError(f"{self.name}: '{label}' has size {array.size}, not {size}")
+            if array.ndim > 1 and array.shape != (size, 1):
+                raise ModelError(f"{self.name}: '{label}' has shape {array.shape}, not {(size,)}")
         values = self.evaluate(*(array.reshape(-1) for array in arrays))
         return tuple(output.copy() for output in values)
 
 
-def _fits(given: Any, own: FloatArray) -> bool:
-    """Whether an argument is an array as a function has it, as most are."""
-    return type(given) is np.ndarray and given.dtype is own.dtype and given.shape == own.shape
+def _fits(argument: Any, buffer: FloatArray) -> bool:
+    """Whether an argument is an array of the shape and type of an input buffer, as most are."""
+    is_array = type(argument) is np.ndarray
+    return is_array and argument.dtype is buffer.dtype and argument.shape == buffer.shape
 
 
 def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
-    """A call without attribute lookups."""
+    """Returns a call without attribute lookups."""
 
     def run() -> bool:
         evaluate()
@@ -296,5 +298,5 @@ def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
 
 
 def _identifier(name: str) -> str:
-    """A name that CasADi accepts: no other characters, no two underscores in a row."""
+    """Returns a name that CasADi accepts: letters, digits and single underscores."""
     return re.sub("[^A-Za-z0-9]+", "_", f"f_{name}")

@@ -16,7 +16,7 @@ def result_of(
     *arguments: Any,
     error: Callable[[str], Exception] = ModelError,
 ) -> Any:
-    """The result of a user's function; a failure is an error of the argument.
+    """Calls a user's function; a failure is raised as an error of the argument.
 
     Args:
         what: The name of the function in messages.
@@ -34,20 +34,22 @@ def result_of(
 
 @contextmanager
 def numpy_explained(what: str) -> Iterator[None]:
-    """Warns in one line, once, that a function calls NumPy on symbols; CasADi's warning has twenty.
+    """Replaces CasADi's long warning about NumPy functions of symbols by one line, once.
 
     Args:
         what: The name of the function in the warning.
     """
-    with warnings.catch_warnings(record=True) as found:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
-    for one in found:
-        text = str(one.message)
-        if one.category is FutureWarning and "casadi" in text and "numpy" in text:
+    for warning in caught:
+        text = str(warning.message)
+        if warning.category is FutureWarning and "casadi" in text and "numpy" in text:
             _warn(what)
         else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )
 
 
 @cache

@@ -4,7 +4,7 @@ import casadi as ca
 
 
 def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
-    """L_f k = (dk/dx) f, by one forward sweep.
+    """Returns L_f k = (dk/dx) f, by one forward sweep.
 
     Args:
         expression: k, shape (a, 1).
@@ -18,7 +18,7 @@ def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
 
 
 def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
-    """[L_g1 k, ..., L_gm k], structurally zero where it must be zero.
+    """Returns [L_g1 k, ..., L_gm k] with structural zeros.
 
     Args:
         expression: k, shape (a, 1).

@@ -35,7 +35,7 @@ LENGTHS = tuple(0.5**k for k in range(30))
 
 
 class NewtonModel(NamedTuple):
-    """Equations linearized at an iterate.
+    """Equations that are linearized at an iterate.
 
     Attributes:
         step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
@@ -56,9 +56,10 @@ def newton(
     linearize: Callable[[FloatArray], NewtonModel | None],
     iterations: int = ITERATIONS,
 ) -> tuple[FloatArray, bool]:
-    """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
+    """Solves equations by damped Newton's method.
 
-    That test does not depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
+    A step is shortened until the step after it, by the same matrix, is shorter. This test does not
+    depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
     are measured relative to the start, or to 1 if that is larger. A solution is then improved as
     long as steps decrease, which does not depend on units.
 
@@ -106,7 +107,7 @@ def newton(
 
 
 def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
-    """A function that is evaluated once where `newton` asks for it several times in turn.
+    """Returns a function with a memory of its last value, since `newton` calls it repeatedly.
 
     Args:
         function: The function; its iterates are never written over.
@@ -118,8 +119,8 @@ def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
         nonlocal at, value
         if x is not at:
             at, value = x, function(x)
-        found: T = value
-        return found
+        result: T = value
+        return result
 
     return evaluated
 
@@ -127,7 +128,7 @@ def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
 def _polished(
     state: FloatArray, step: FloatArray, step_from: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """The state after a step and all following ones, until they are round-off."""
+    """Returns the state after a step and all following ones, until they are round-off."""
     length = norm(step)
     while length > 0.0:
         state = state + step
@@ -140,14 +141,14 @@ def _polished(
 
 
 def norm(vector: FloatArray) -> float:
-    """The Euclidean norm, in a fifth of the time of `np.linalg.norm`."""
+    """Returns the Euclidean norm, in a fifth of the time of `np.linalg.norm`."""
     return sqrt(vector.dot(vector))
 
 
 def shortest_steps(
     gradients: FloatArray, residual: Callable[[FloatArray], FloatArray]
 ) -> NewtonModel | None:
-    """The shortest dx with C dx = -residual(x); regular if the rows of C are independent.
+    """Returns the Newton model of shortest steps dx with C dx = -residual(x).
 
     The rows are scaled to length one. If they are dependent, for example at the start of a search,
     dx is the least-squares solution.
@@ -186,7 +187,7 @@ def steps_along(
     directions: FloatArray,
     residual: Callable[[FloatArray], FloatArray],
 ) -> NewtonModel | None:
-    """The steps D mu with C D mu = -residual(x); None if mu is not determined.
+    """Returns the Newton model of steps D y with C D y = -residual(x); None if y is not determined.
 
     Args:
         gradients: C, shape (k, n).

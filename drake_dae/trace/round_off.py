@@ -22,7 +22,7 @@ Sized = tuple[FloatArray, FloatArray]
 def multiply(
     left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
 ) -> Sized:
-    """A product in which entries that are only round-off are zero.
+    """Multiplies matrices; entries that are only round-off are set to zero.
 
     Args:
         left: The left factor, shape (a, k).
@@ -35,13 +35,13 @@ def multiply(
     row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
     column_noise = negligible * np.max(column, axis=0, keepdims=True, initial=0.0)
     left = np.where(row > row_noise, left, 0.0)
-    kept = np.abs(value) / scale[:, None] > column_noise
-    value, size = np.where(kept, value, 0.0), np.where(column > column_noise, size, 0.0)
+    significant = np.abs(value) / scale[:, None] > column_noise
+    value, size = np.where(significant, value, 0.0), np.where(column > column_noise, size, 0.0)
     return without_round_off(left @ value, np.abs(left) @ size)
 
 
 def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
-    """A sum of products in which entries that are only round-off are zero.
+    """Sets those entries of a sum of products to zero that are only round-off.
 
     Args:
         value: The sum, shape (a, b).
@@ -51,17 +51,28 @@ def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
 
 
 def positive(sizes: FloatArray) -> FloatArray:
-    """Sizes to divide by: 1 in place of 0."""
+    """Returns sizes as divisors: 1 in place of 0."""
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
+def unit_rows(matrix: FloatArray) -> FloatArray:
+    """Scales the rows of a matrix to length one; rows of zeros do not change."""
+    return matrix / positive(np.linalg.norm(matrix, axis=-1, keepdims=True))
+
+
 def smallest_singular_value(matrix: FloatArray) -> float:
-    """The smallest singular value of a matrix with no more rows than columns."""
+    """Returns the smallest singular value of a matrix with no more rows than columns."""
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 
+def equilibrated(matrix: FloatArray) -> FloatArray:
+    """Divides the rows and columns of a matrix by `equilibration`."""
+    rows, columns = equilibration(matrix)
+    return matrix / rows[:, None] / columns
+
+
 def equilibration(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Divisors of the rows and of the columns that bring all to about length one (Ruiz)."""
+    """Returns divisors of rows and columns that scale all to about length one (Ruiz)."""
     rows, columns = np.ones(matrix.shape[0]), np.ones(matrix.shape[1])
     for _ in range(10):
         scaled = matrix / rows[:, None] / columns

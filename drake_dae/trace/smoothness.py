@@ -24,7 +24,10 @@ _LARGE = 2.0**200
 
 
 def length_of(vector: ca.SX) -> ca.SX:
-    """The length of a column, with derivatives of all orders wherever it is not zero.
+    """Returns the Euclidean norm of a column vector, smooth wherever it is not zero.
+
+    For a single entry e CasADi simplifies sqrt(e^2) to fabs(e), whose higher derivatives are wrong.
+    Here that entry is split in two: e^2 = (0.6 e)^2 + (0.8 e)^2.
 
     For a column with one entry e CasADi forms sqrt(e^2) = fabs(e), whose higher derivatives it
     loses. Here that entry is split in two: e^2 = (0.6 e)^2 + (0.8 e)^2.
@@ -36,7 +39,7 @@ def length_of(vector: ca.SX) -> ca.SX:
 
 
 def as_constant(expression: ca.SX) -> ca.SX:
-    """The same numbers, to 2^-200, whose derivatives are zero.
+    """Returns the same numbers, to 2^-200, with zero derivatives.
 
     CasADi takes floor(x) for a constant, and so large a multiple of a number is a whole one.
     """
@@ -56,7 +59,7 @@ class SmoothnessFlaw:
     constant: float = 0.0
 
     def describe(self, variable: str) -> str:
-        """The text on the expression for a message, and the remedy.
+        """Returns the text for an error message: the non-smooth expression and how to repair it.
 
         Args:
             variable: The name of the variable in messages.
@@ -72,7 +75,7 @@ class SmoothnessFlaw:
 
 
 def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFlaw | None:
-    """Finds a constant that is not finite, or an operation that is not smooth.
+    """Returns a constant that is not finite, or an operation that is not smooth, if there is one.
 
     Args:
         expression: A function of the variable and of others.
@@ -99,7 +102,7 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFla
         elif operation == ca.OP_INPUT:
             moves = inputs[0] == 0
         else:
-            moves = any(moving[place] for place in inputs)
+            moves = any(moving[i] for i in inputs)
             if moves and operation in _KINKS:
                 return SmoothnessFlaw(_KINKS[operation])
         moving[function.instruction_output(i)[0]] = moves
@@ -107,7 +110,7 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFla
 
 
 def _may_have_flaw(function: ca.Function) -> bool:
-    """Whether it holds an operation or a constant of a flaw; most hold none, and this is quick."""
+    """Whether the function contains any operation or constant of a flaw. This test is quick."""
     operations = [function.instruction_id(i) for i in range(function.n_instructions())]
     if not _KINKS.keys().isdisjoint(operations):
         return True

@@ -14,6 +14,7 @@ sys.path.insert(0, str(BOOK.parent))
 
 import drake_dae  # noqa: E402
 from book.generated import generated_pages  # noqa: E402
+from book.notebooks import has_code, notebook  # noqa: E402
 from book.pages import pages, run_page  # noqa: E402
 from drake_dae.cli import main as command  # noqa: E402
 
@@ -34,6 +35,10 @@ def main() -> int:
         old.unlink()
     for page in pages():
         _run(page, source / page.relative_to(BOOK), library)
+    for page in filter(has_code, pages()):
+        name = page.relative_to(BOOK)
+        (source / name).with_suffix(".ipynb").write_text(notebook(page), "utf-8")
+        texts[name] += f"\n---\n{{download}}`This page as a notebook <{page.stem}.ipynb>`\n"
     for name, text in texts.items():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         (source / name).write_text(text, "utf-8")

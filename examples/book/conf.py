@@ -35,13 +35,21 @@ copybutton_prompt_text = "$ "
 python_use_unqualified_type_names = True
 
 
+_MATRIX = re.compile(r"<mo>&#x00028;</mo>(<mtable>.*?</mtable>)<mo>&#x00029;</mo>")
+
+
+def _mathml(node: nodes.Element, display: str) -> str:
+    """MathML; the style draws parentheses around a matrix, since few fonts have tall ones."""
+    return _MATRIX.sub(r'<mrow class="matrix">\1</mrow>', convert(node.astext(), display=display))
+
+
 def _inline(translator: Any, node: nodes.math) -> None:
-    translator.body.append(convert(node.astext()))
+    translator.body.append(_mathml(node, "inline"))
     raise nodes.SkipNode
 
 
 def _display(translator: Any, node: nodes.math_block) -> None:
-    translator.body.append(f"<p>{convert(node.astext(), display='block')}</p>")
+    translator.body.append(f"<p>{_mathml(node, 'block')}</p>")
     raise nodes.SkipNode
 
 

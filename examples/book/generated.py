@@ -13,6 +13,7 @@ import drake_dae
 from book.pages import BOOK, blocks, pages
 from drake_dae.commands.options import parse_options
 from drake_dae.scenario.manual.page import keys_page
+from drake_dae.scenario.manual.remedies import remedies_page
 
 ROOT = BOOK.parents[1]
 sys.path.append(str(ROOT / "tests" / "support"))
@@ -41,6 +42,7 @@ def generated_pages() -> dict[str, str]:
         "reference/names.md": names_page(),
         "reference/keys.md": keys_page(),
         "reference/commands.md": commands_page(),
+        "reference/error_codes.md": remedies_page(),
         "reference/equations.md": equations_page(),
     }
 

@@ -37,6 +37,8 @@ _FILE = re.compile(r"^(?:#|//|<!--)\s+([\w.-]+\.\w+)(?:\s+-->)?\n")
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _PART = re.compile(rf"\.\.\.|(?<![\w.]){_NUMBER.pattern}|\s+")
 
+_BARE = " --set write.plots=false --set write.animation=false"
+
 
 class PageError(Exception):
     """A block that fails, or prints something else than the page shows."""
@@ -73,8 +75,19 @@ def blocks(page: Path) -> list[Block]:
     return found
 
 
-def run_page(page: Path, folder: Path) -> None:
+def file_of(block: Block) -> tuple[str, str]:
+    """Name and text of the file that a block writes; the name is empty if it writes none."""
+    match = _FILE.match(block.text)
+    return (match[1], block.text[match.end() :]) if match else ("", "")
+
+
+def run_page(page: Path, folder: Path, pictures: bool = True) -> None:
     """Runs the blocks of a page in a folder.
+
+    Args:
+        page: The page.
+        folder: Where its files are written.
+        pictures: Whether runs write plots and animations, which take a fifth of the time.
 
     Raises:
         PageError: If a block fails or prints something else; the message has the block's line.
@@ -90,9 +103,9 @@ def run_page(page: Path, folder: Path) -> None:
                     if following and following.language == "text" and following.follows:
                         compare(following.text, printed)
                 elif block.language == "console":
-                    _run_commands(block)
-                elif name := _FILE.match(block.text):
-                    Path(name[1]).write_text(block.text[name.end() :], "utf-8")
+                    _run_commands(block, "" if pictures else _BARE)
+                elif (named := file_of(block))[0]:
+                    Path(named[0]).write_text(named[1], "utf-8")
             except Exception as error:
                 raise PageError(f"{page.relative_to(BOOK)}, line {block.line}: {error}") from error
 
@@ -139,11 +152,14 @@ def _run_python(block: Block, page: Path, namespace: dict[str, Any]) -> str:
     return printed.getvalue()
 
 
-def _run_commands(block: Block) -> None:
+def _run_commands(block: Block, more: str) -> None:
+    """Runs commands, and gives `simulate` more options."""
     for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
         lines = part.splitlines()
         last = next(i for i, line in enumerate(lines) if not line.endswith("\\"))
         command = " ".join(line.removesuffix("\\") for line in lines[: last + 1])
+        if command.startswith("drake-dae simulate "):
+            command += more
         code, printed = _run_command(command)
         if shown := "\n".join(lines[last + 1 :]).strip():
             compare(shown, printed)

@@ -1,16 +1,18 @@
-"""Drake's own systems, and users', as functions: against Drake, in the same context."""
+"""Compiled systems of Drake and of users, compared with Drake in the same context."""
 
 import numpy as np
 import pytest
 from alone import alone
 from blocks_of_users import Counter_
 from pydrake.common import RandomDistribution
+from pydrake.common.value import Value
 from pydrake.math import sin
 from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     BasicVector_,
     DiagramBuilder,
+    LeafSystem,
     LeafSystem_,
 )
 from pydrake.systems.primitives import (
@@ -44,7 +46,7 @@ from drake_dae.errors import ModelError
 
 @TemplateSystem.define("Pendulum_")
 def Pendulum_(T):
-    """A user's own system, that is a template on its scalar."""
+    """A user's system, templated on the scalar type."""
 
     class Impl(LeafSystem_[T]):
         def _construct(self, length=0.5, converter=None):
@@ -71,7 +73,15 @@ def Pendulum_(T):
     return Impl
 
 
-def by_symbols():
+class Poses(LeafSystem):
+    """A block whose only output is abstract."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareAbstractOutputPort("poses", lambda: Value([]), lambda context, output: None)
+
+
+def symbolic_system():
     x, u, t = Variable("x"), Variable("u"), Variable("t")
     inside = logical_and(x > -0.5, x <= 0.5)
     return SymbolicVectorSystem(
@@ -106,7 +116,7 @@ SYSTEMS = {
     "Demultiplexer": lambda: Demultiplexer(4, 2),
     "PassThrough": lambda: PassThrough(2),
     "MatrixGain": lambda: MatrixGain([[1.0, 2.0], [3.0, 4.0]]),
-    "SymbolicVectorSystem": by_symbols,
+    "SymbolicVectorSystem": symbolic_system,
     "a diagram of primitives": lambda: StateInterpolatorWithDiscreteDerivative(2, 0.1),
     "a template of the user's": lambda: Pendulum_[None](0.8),
     "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
@@ -114,35 +124,35 @@ SYSTEMS = {
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_a_system_computes_what_drake_does(name):
-    """To 1e-14: the same operations, perhaps in another order."""
+def test_a_compiled_system_has_drakes_outputs_derivatives_and_updates(name):
+    """To 1e-14: the operations are the same, possibly in another order."""
     diagram, context = alone(SYSTEMS[name]())
     compiled = compile_diagram(diagram, context=context)
-    given = context.get_time(), *compiled.start(context), compiled.values(context)
-    row, valid = compiled.row(*given)
-    wanted = [diagram.GetOutputPort(output).Eval(context) for output in compiled.outputs]
-    np.testing.assert_allclose(row.full()[:, 0], np.concatenate(wanted), rtol=1e-14, atol=1e-14)
+    arguments = context.get_time(), *compiled.start(context), compiled.values(context)
+    row, valid = compiled.row(*arguments)
+    expected = [diagram.GetOutputPort(output).Eval(context) for output in compiled.outputs]
+    np.testing.assert_allclose(row.full()[:, 0], np.concatenate(expected), rtol=1e-14, atol=1e-14)
     assert np.isfinite(float(valid))
-    rate = compiled.rate(*given)[0].full()[:, 0]
+    rate = compiled.rate(*arguments)[0].full()[:, 0]
     np.testing.assert_allclose(
         rate, diagram.EvalTimeDerivatives(context).CopyToVector(), rtol=1e-14, atol=1e-14
     )
     if not compiled.rates:
         assert diagram.GetUniquePeriodicDiscreteUpdateAttribute() is None
         return
-    (one,) = compiled.rates
+    (update,) = compiled.rates
     event = diagram.GetUniquePeriodicDiscreteUpdateAttribute()
-    assert (one.period, one.offset) == (event.period_sec(), event.offset_sec())
+    assert (update.period, update.offset) == (event.period_sec(), event.offset_sec())
     held = compiled.start(context)[1]
-    held[list(one.places)] = one.function(*given, [])[0].full()[:, 0]
-    following = diagram.EvalUniquePeriodicDiscreteUpdate(context)
-    groups = [following.value(i) for i in range(following.num_groups())]
+    held[list(update.places)] = update.function(*arguments, [])[0].full()[:, 0]
+    next_held = diagram.EvalUniquePeriodicDiscreteUpdate(context)
+    groups = [next_held.value(i) for i in range(next_held.num_groups())]
     np.testing.assert_allclose(held, np.concatenate(groups), rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", [name for name in SYSTEMS if name != "a diagram of primitives"])
 def test_feedthrough_is_drakes(name):
-    """Whether an output depends on an input in the same instant, by the expressions."""
+    """An output depends on an input in the compiled function as Drake reports it."""
     system = SYSTEMS[name]()
     diagram, context = alone(SYSTEMS[name]())
     compiled = compile_diagram(diagram, context=context)
@@ -158,7 +168,7 @@ def test_feedthrough_is_drakes(name):
             assert rows[:, part].any() == system.HasDirectFeedthrough(i, j)
 
 
-def test_what_cannot_be_traced_is_named():
+def test_a_system_that_cannot_be_traced_is_named():
     builder = DiagramBuilder()
     system = builder.AddNamedSystem("my block", WrapToSystem(1))
     builder.ExportInput(system.get_input_port(0), "in")
@@ -167,13 +177,13 @@ def test_what_cannot_be_traced_is_named():
         compile_diagram(builder.Build())
 
 
-def test_an_input_without_wire_or_value_is_named():
+def test_an_input_without_connection_or_value_is_named():
     builder = DiagramBuilder()
     gain = builder.AddNamedSystem("my gain", Gain(0.5, 2))
     builder.ExportInput(gain.get_input_port(), "in")
     builder.ExportOutput(gain.get_output_port(), "out")
     diagram = builder.Build()
-    with pytest.raises(ModelError, match="the input port 'u0' of 'my gain' has neither a wire"):
+    with pytest.raises(ModelError, match="the input port 'u0' of 'my gain' has neither"):
         compile_diagram(diagram)
     context = diagram.CreateDefaultContext()
     diagram.get_input_port().FixValue(context, [1.0, -2.0])
@@ -183,13 +193,13 @@ def test_an_input_without_wire_or_value_is_named():
         compiled.values(diagram.CreateDefaultContext())
 
 
-def test_outputs_are_chosen_by_name_and_lead_to_what_is_needed():
+def test_only_systems_behind_the_named_outputs_are_compiled():
     builder = DiagramBuilder()
     sine = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1))
     low = builder.AddSystem(FirstOrderLowPassFilter(0.1, 1))
     wrap = builder.AddSystem(WrapToSystem(1))
-    for taker in (low, wrap):
-        builder.Connect(sine.get_output_port(0), taker.get_input_port())
+    for reader in (low, wrap):
+        builder.Connect(sine.get_output_port(0), reader.get_input_port())
     builder.ExportOutput(sine.get_output_port(0), "sine")
     builder.ExportOutput(low.get_output_port(), "filtered")
     builder.ExportOutput(wrap.get_output_port(), "wrapped")
@@ -200,6 +210,15 @@ def test_outputs_are_chosen_by_name_and_lead_to_what_is_needed():
         compile_diagram(diagram)
     with pytest.raises(ModelError, match="output port of the diagram"):
         compile_diagram(diagram, ["angle"])
+
+
+def test_without_names_all_vector_valued_outputs_are_compiled():
+    """Those with abstract values, such as poses of bodies, are left out."""
+    builder = DiagramBuilder()
+    sine, poses = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1)), builder.AddSystem(Poses())
+    builder.ExportOutput(sine.get_output_port(0), "sine")
+    builder.ExportOutput(poses.get_output_port(), "poses")
+    assert compile_diagram(builder.Build()).outputs == ("sine",)
 
 
 def test_random_numbers_are_drawn_at_their_period():
@@ -214,8 +233,8 @@ def test_random_numbers_are_drawn_at_their_period():
     assert compiled.sizes["noise"] == 2
 
 
-def test_a_multirate_loop_of_primitives_is_that_of_the_simulator():
-    """To 1e-10: both integrate to about 1e-12, by other methods."""
+def test_a_compiled_multirate_loop_moves_as_in_the_simulator():
+    """To 1e-10: both integrate to about 1e-12, by different methods."""
     builder = DiagramBuilder()
     source, adder = builder.AddSystem(Sine(1.0, 2.0, 0.3, 1)), builder.AddSystem(Adder(2, 1))
     back, limits = builder.AddSystem(Gain(-1.5, 1)), builder.AddSystem(Saturation([-0.8], [0.8]))
@@ -255,7 +274,7 @@ def test_a_multirate_loop_of_primitives_is_that_of_the_simulator():
 
 
 @pytest.mark.parametrize("depth", [1, 2])
-def test_an_input_of_a_diagram_inside_feeds_all_blocks_that_take_it(depth):
+def test_an_input_of_a_nested_diagram_reaches_all_blocks_connected_to_it(depth):
     source = Sine(1.0, 2.0, 0.3, 1)
     inner = DiagramBuilder()
     gains = [inner.AddSystem(Gain(factor, 1)) for factor in (2.0, -3.0, 5.0)]

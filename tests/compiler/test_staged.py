@@ -1,4 +1,4 @@
-"""What the time alone determines, computed apart, and the rest from it."""
+"""Staged functions, where values that depend only on time and parameters are precomputed."""
 
 import casadi as ca
 import numpy as np
@@ -38,8 +38,8 @@ def _noise(compiled: CompiledDiagram) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["sine", "two_link_wall", "seven_joint_moving_plate"])
-def test_functions_in_stages_are_the_plain_ones_to_the_bit(name):
-    """The same operations in the same order, only some of them in another function."""
+def test_staged_functions_equal_the_plain_ones_to_the_bit(name):
+    """The operations are the same in the same order; some are in another function."""
     compiled = _sampled_sum() if name == "sine" else _shipped(name)
     staged, time = compiled.staged, 0.37
     state, held = compiled.start(compiled.context)
@@ -52,15 +52,15 @@ def test_functions_in_stages_are_the_plain_ones_to_the_bit(name):
     for each, function in plain.items():
         noise = [_noise(compiled)] if each.startswith("update") else []
         expected = function(time, state, held, parameters, *noise)
-        found = staged[each](time, state, held, parameters, given, *noise)
-        for a, b in zip(found, expected, strict=True):
+        values = staged[each](time, state, held, parameters, given, *noise)
+        for a, b in zip(values, expected, strict=True):
             np.testing.assert_array_equal(a.full(), b.full())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["sine", "two_link_wall", "seven_joint_moving_plate"])
-def test_what_the_time_alone_determines_is_left_to_its_own_function(name):
-    """No function of the state reads the time any more, and each has fewer operations."""
+def test_staged_functions_do_not_depend_on_time(name):
+    """They depend on the precomputed column instead, and have fewer operations."""
     compiled = _sampled_sum() if name == "sine" else _shipped(name)
     for each, plain in {"rate": compiled.rate, "row": compiled.row}.items():
         function = compiled.staged[each]

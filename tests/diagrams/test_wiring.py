@@ -58,7 +58,7 @@ def test_a_sensor_that_no_law_uses_is_refused():
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
     with pytest.raises(
         WiringError,
-        match=r"measures 2 forces, the plant 'two_link' has 1 \(wall.force\); .* ForceSensor\(1, ",
+        match=r"2 forces, .*'two_link' has 1 \(wall.force\); .* ForceSensor\(1, ",
     ):
         rigid(ForceSensor(2, time_constant=0.01))
 
@@ -73,8 +73,7 @@ def test_a_law_for_another_system_is_refused_with_both_sizes():
     found = arm("two_link")
     with pytest.raises(
         WiringError,
-        match=r"for 'seven_joint' with 14 states, 7 controls and 1 constraints, the plant "
-        r"'two_link' has 4 states, 2 controls and 1 constraints\. .*TrackingLaw\(plant.dae",
+        match=r"'seven_joint' with 14 states, 7 controls.* 'two_link' has 4 states, 2 controls",
     ):
         make_closed_loop(
             RobotPlant(found.model, structure=found.structure), law("seven_joint"), REFERENCES

@@ -1,5 +1,6 @@
 """Every page of the book runs and prints what it shows."""
 
+import json
 import os
 import re
 import subprocess
@@ -7,7 +8,10 @@ from pathlib import Path
 
 import pytest
 from book.generated import public_names, uses
-from book.pages import BOOK, PageError, compare, pages, run_page
+from book.notebooks import has_code, notebook
+from book.pages import BOOK, PageError, blocks, compare, pages, run_page
+
+MARKED = re.MULTILINE | re.DOTALL
 
 SLOW: set[str] = set()
 """Pages that take long: left to `make campaign` and to `make docs`."""
@@ -26,7 +30,7 @@ def named(page: Path) -> str:
     ],
 )
 def test_page_runs_as_shown(page, tmp_path):
-    run_page(page, tmp_path / page.stem)
+    run_page(page, tmp_path / page.stem, pictures=False)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +96,7 @@ def test_files_commands_and_code_share_a_folder(tmp_path, monkeypatch):
 
 
 def test_links_lead_to_pages_files_and_headings():
-    written = ("names", "keys", "commands", "equations")
+    written = ("names", "keys", "commands", "equations", "error_codes")
     made = {BOOK / "reference" / f"{name}.md" for name in written}
     for page in pages():
         text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
@@ -109,10 +113,30 @@ def test_links_lead_to_pages_files_and_headings():
 
 
 def test_pages_are_in_the_contents():
-    contents = (BOOK / "index.md").read_text("utf-8")
-    for page in pages()[1:]:
-        name = named(page).removesuffix(".md")
-        assert f"\n{name}\n" in contents or f"\n{page.parent.name}/*\n" in contents, name
+    listed = set()
+    for page in pages():
+        for contents in re.findall(r"```{toctree}\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
+            names = [line for line in contents.splitlines() if line and not line.startswith(":")]
+            listed |= {named((page.parent / f"{name}.md").resolve()) for name in names}
+    assert {named(page) for page in pages()[1:]} <= listed
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, id=named(p)) for p in pages() if has_code(p)])
+def test_notebook_has_what_the_page_runs_in_its_order(page):
+    cells = json.loads(notebook(page))["cells"]
+    code = iter("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    for block in blocks(page):
+        if block.language == "python":
+            assert block.text.rstrip("\n") in code  # Which goes on from there.
+        elif block.language == "console":
+            first = block.text.splitlines()[0].removeprefix("$ ")
+            assert any(cell.startswith(f"!{first}") for cell in code)
+    prose = "".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
+    titles = re.findall(
+        r"^#+ .*", re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=MARKED), re.MULTILINE
+    )
+    assert [title for title in titles if title not in prose] == []
+    assert ".md)" not in prose
 
 
 def test_every_public_name_is_used_in_a_page_or_an_example_that_runs():

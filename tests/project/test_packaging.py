@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -31,12 +32,34 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel built from the sdist: that is what `python -m build` does by default."""
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the sdist, and the wheel that `python -m build` makes of it."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
-    (path,) = folder.glob("*.whl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(dist: Path) -> Path:
+    (path,) = dist.glob("*.whl")
     return path
+
+
+@pytest.mark.slow
+def test_sdist_holds_what_is_tracked_and_what_its_readers_are_sent_to(dist: Path) -> None:
+    """The book, the tests and the Makefile work in it; the workplace of this checkout stays out."""
+    (path,) = dist.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.split("/", 1)[1] for name in archive.getnames()}
+    expected = {
+        Path(folder, file).relative_to(ROOT).as_posix()
+        for top in ("drake_dae", "tests", "examples")
+        for folder, _, files in os.walk(ROOT / top)
+        for file in files
+        if "__pycache__" not in folder and not file.startswith(".")
+    }
+    expected |= {one.name for one in ROOT.iterdir() if one.suffix in (".md", ".cff", ".toml")}
+    assert names == expected | {"LICENSE", "Makefile", "PKG-INFO", ".gitignore"}
 
 
 @pytest.mark.slow

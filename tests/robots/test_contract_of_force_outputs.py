@@ -123,7 +123,7 @@ class Pressed(ForceOutput):
         (lambda: ForceCombination({"a": 0.0}, "none"), "'none' needs at least one weight"),
         (
             lambda: ForceCombination({"grip1.fx": 1.0, "gear.moment": 1.0}, "a").signals(bound()),
-            "'a' adds what has different units: N, N m",
+            "'a' adds forces with different units: N, N m",
         ),
         (lambda: force_outputs(["grip1.fx", "grip1.fx"], bound()), "twice: grip1.fx"),
         (

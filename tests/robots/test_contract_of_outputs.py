@@ -92,7 +92,7 @@ def test_what_is_unknown_is_named(output, message):
     [
         ("q", "", "axis"),
         ("xy", "", "axis must be one of x, y, z, got 'xy'"),
-        ("z", "xz", "components must be of x and y, which are across the axis z, got 'xz'"),
+        ("z", "xz", "components must be of x and y, the axes normal to z, got 'xz'"),
         ("z", "xx", "components"),
     ],
 )

@@ -81,7 +81,7 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
 
 
 def test_a_roughness_without_use_is_refused():
-    with pytest.raises(ScenarioError, match="leave the gains out and give encoders"):
+    with pytest.raises(ScenarioError, match="leave `gains` out and give encoders"):
         chosen(two_link("largest_roughness=1.0"))
     with pytest.raises(ScenarioError, match="must be positive, got -1 N m"):
         chosen(two_link("encoders={resolution: 1.0e-5}", "largest_roughness=-1.0"))

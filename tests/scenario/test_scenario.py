@@ -88,7 +88,7 @@ def test_every_form_reads_back_equal(tmp_path):
                 PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
                 for i, surface in enumerate(surfaces)
             ],
-            written.WeldedFrames("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
+            written.WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
             CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
             FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
@@ -100,7 +100,7 @@ def test_every_form_reads_back_equal(tmp_path):
         outputs=[
             PointCoordinates("yes", "xy"),
             AxisCoordinates("b", "z", "xy"),
-            written.SurfaceCoordinates("c0"),
+            written.SurfaceCoordinatesForm("c0"),
             JointPositions(["joint1", "2"]),
         ],
         forces=[
@@ -353,7 +353,7 @@ def test_weld():
         find_scenario("two_arms"),
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
-    assert plain.constraints[0] == written.WeldedFrames("left::tool", "right::tool", Pose())
+    assert plain.constraints[0] == written.WeldedFramesForm("left::tool", "right::tool", Pose())
 
 
 def test_coincident_points():

@@ -164,7 +164,7 @@ UNTRACED = "plant=!OwnPlant {maker: 'members:SpringyPlant'}"
 def test_what_no_rollout_has_is_reported_with_a_remedy():
     base = scenario_data(scenario("two_link_wall", *SHORT, UNTRACED))
     assert Runner(base).why_not({}) is None
-    assert "runs in Drake's Simulator alone" in str(Runner(base, 1.0).why_not({}))
+    assert "only runs in Drake's Simulator" in str(Runner(base, 1.0).why_not({}))
 
 
 @pytest.mark.slow

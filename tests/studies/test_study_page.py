@@ -3,11 +3,14 @@
 import json
 import re
 import shlex
+from html import unescape
 
+import numpy as np
 import pytest
 from browser import needs_chromium, shown
+from matplotlib.figure import Figure
 
-from drake_dae import Study, load_scenario
+from drake_dae import Record, Study, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.typed_yaml import TAG
@@ -103,6 +106,62 @@ def test_a_sweep_writes_the_page_and_its_commands_run(tmp_path, monkeypatch, cap
     errors = load_scenario(tmp_path / "s" / "run1" / "scenario.yaml").start.errors
     assert errors["tool.z"] == 0.02
     capsys.readouterr()
+
+
+@pytest.mark.slow
+def test_a_sweep_in_python_says_how_its_runs_are_made_again(tmp_path):
+    """The scenario stands beside the page, with what was set before."""
+    given = load_scenario(find_scenario("two_link_wall"), ["duration=0.1", "start.errors={}"])
+    runs = sweep(given, [{"start.errors.tool.z": 0.0}, {"start.errors.tool.z": 0.02}],
+                 tmp_path / "runs.jsonl", workers=1, rollout=True)  # fmt: skip
+    runs.save(tmp_path / "s")
+    said = data((tmp_path / "s" / "study.html").read_text("utf-8"))
+    assert said["duration"] == 0.1
+    command = shlex.split(said["again"][1])
+    assert command[:4] == ["drake-dae", "simulate", str(tmp_path / "s/scenario.yaml"), "--rollout"]
+    assert main(command[1:]) == 0
+    again = Record.load(tmp_path / "s" / "run1" / "record.npz")
+    # The figure of the study is that of the run that was made again.
+    (name,) = (n for n in runs.figures if "tool.z" in n and "largest" in n)
+    error = np.abs(again["tracking_error"][:, 0]).max()
+    assert runs.values(name)[1] == pytest.approx(error, rel=1e-6)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_two_runs_stand_side_by_side_with_one_clock(tmp_path):
+    study(3).save(tmp_path, "t", duration=2.0)
+    for run in (0, 2):
+        folder = tmp_path / f"run{run}"
+        folder.mkdir()
+        Figure(figsize=(1, 1)).savefig(folder / "outputs.png")
+        tell = f"parent.postMessage({{run: {run}, after: event.data.after}}, '*')"
+        text = f"<script>window.onmessage = event => {tell};</script>"
+        (folder / "animation.html").write_text(text)
+    script = """
+      const frames = document.querySelectorAll('#picked iframe');
+      if (!window.heard) {
+        window.heard = {};
+        window.addEventListener('message', ({data: {run, after}}) =>
+          (window.heard[run] = window.heard[run] || []).push(after));
+      }
+      if (frames.length === 2 && !window.moved) {
+        window.moved = true;
+        setTimeout(() => {
+          const slider = document.querySelector('#clock input');
+          slider.value = 1.25;
+          slider.dispatchEvent(new Event('input'));
+          setTimeout(() => document.querySelector('#clock button').click(), 300);
+        }, 500);
+      }
+      return JSON.stringify(window.heard);
+    """
+    told = json.loads(unescape(shown(tmp_path / "study.html", script, "#runs=0,2")))
+    assert told["0"] == told["2"]
+    assert told["0"][0] == 1.25
+    # It plays on from there, forward.
+    assert len(told["0"]) > 3
+    assert told["0"][2] > 1.25
 
 
 @needs_chromium

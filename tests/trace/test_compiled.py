@@ -233,7 +233,7 @@ def test_large_functions_are_compiled_without_being_asked_while_it_takes_ten_sec
 
 def test_without_a_compiler(cache, monkeypatch):
     monkeypatch.setenv("CC", "/nowhere/cc")
-    runs_interpreted("no C compiler: CC names '/nowhere/cc', which is not found; install gcc")
+    runs_interpreted("CC names '/nowhere/cc', which is not found")
     monkeypatch.setenv("CC", "'")
     runs_interpreted("CC is no command")
     monkeypatch.delenv("CC")

@@ -30,13 +30,11 @@ class ChainFilter:
     Attributes:
         gain: K, shape (3, 1), or (3, 2) with a measured v.
         covariance: That of (q, v, a) after a correction, relative to sigma^2, shape (3, 3).
-        predicted: That before it.
         period: T in s.
     """
 
     gain: FloatArray
     covariance: FloatArray
-    predicted: FloatArray
     period: float
 
     @classmethod
@@ -47,7 +45,7 @@ class ChainFilter:
         period: float,
         velocity_ratio: float | None = None,
     ) -> "ChainFilter":
-        """The filter of given rates.
+        """Designs the filter for two rates.
 
         Args:
             state_rate: w in 1/s.
@@ -78,9 +76,9 @@ class ChainFilter:
         after = before - gain @ shown @ before
         both = np.outer(1.0 / size, 1.0 / size)
         units = size[: len(shown)] / size[:, None]
-        return cls(gain * units, after * both, before * both, period)
+        return cls(gain * units, after * both, period)
 
 
 def transition(period: float) -> FloatArray:
-    """The step of (q, v, a) over a sample, shape (3, 3)."""
+    """Returns the transition matrix of (q, v, a) over a sample, shape (3, 3)."""
     return np.array([[1.0, period, period**2 / 2.0], [0.0, 1.0, period], [0.0, 0.0, 1.0]])

@@ -21,18 +21,18 @@ from drake_dae.dae.tracking.constraint_damping import best_damping
 from drake_dae.errors import GainError, ModelError
 
 MASSES = (0.5, 1.0, 2.0)
-"""What a force does, over what the law believes: free directions are stable for these."""
+"""Free directions are stable if a force accelerates by these factors more than in the model."""
 
 CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
 STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
-"""The same along a contact, each with stiffnesses relative to the given one."""
+"""The same along a contact, each with these stiffnesses relative to the stated one."""
 
 DECAY = 0.05
-"""With half of the stiffness and more, all of these loops settle at least at this share of w."""
+"""The least rate at which these loops settle, relative to w, with half of the stiffness or more."""
 
 _SLOWER = (1.0, 0.5, 0.25)
-"""Shares of the integral and of the observer's rate along a contact, which both take damping: the
-first for which there are gains."""
+"""The factors by which the integral and the observer along a contact are slowed, since both reduce
+damping; the first one for which there are gains is taken."""
 
 MODEL_ERROR, EVERY = 1.0, 2.0
 """An unknown force of 1 N appears or turns every 2 s."""
@@ -42,27 +42,27 @@ RAMP = 10.0
 
 _PHASE = 0.15
 """As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
-it with an estimator, where a force along the contact that is taken for friction couples it to the
-free directions: at the full phase 1 kg that the law does not know made them swing."""
+it with an estimator: a force along the contact that it attributes to friction couples the contact
+to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class SensedContact:
-    """A robot in contact, its sampling and its sensors, as far as the choice of gains needs them.
+    """The numbers of a robot in contact, its sampling and its sensors that decide the gains.
 
     Attributes:
         period: T in s.
         delay: The delay of the control in samples.
         stiffness: k of the contact in N/m.
-        mobility: J M^-1 J^T of the contact in 1/kg, the largest on the way.
-        free_mobility: The same for the points that follow a path, in 1/kg.
-        lever, contact_lever: The distance that such a point, and the contact, move per radian of
-            noise of all joints: the length of a row of J, in m/rad.
+        mobility: J M^-1 J^T of the contact in 1/kg, the largest along the motion.
+        free_mobility: The mobility of the points that follow a path, in 1/kg.
+        lever, contact_lever: The displacement of a point that follows a path, and of the contact,
+            per radian of noise of all joints: the length of a row of J, in m/rad.
         inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
         noise: The noise of a joint's angle and velocity, in rad and rad/s, and of the force in N;
-            and whether velocities are differences.
-        estimates: Whether a `StateEstimator` has the state.
+            with a `velocity_bandwidth` if velocities are filtered finite differences.
+        estimates: Whether the state comes from a `StateEstimator`.
 
     Raises:
         ModelError: A number is not positive, or a noise is negative.
@@ -89,16 +89,16 @@ class SensedContact:
                 raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
     def free(self, mass_error: float = 1.0) -> Direction:
-        """A free direction."""
+        """Returns a free direction."""
         return Direction(self.period, self.delay, mass_error=mass_error)
 
     def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
-        """The direction of the contact, with a share of its stiffness."""
+        """Returns the direction of the contact, with a fraction of its stiffness."""
         stiffness = share * self.stiffness
         return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
 
-    def seen(self, lever: float) -> SensorNoise:
-        """The noise of a distance that angles move."""
+    def noise_of(self, lever: float) -> SensorNoise:
+        """Returns the noise of a distance that is computed from noisy angles."""
         noise = self.noise
         position, velocity = lever * noise.position, lever * noise.velocity
         return replace(noise, position=position, velocity=velocity)
@@ -110,13 +110,13 @@ class SensedContact:
 
     @property
     def quiet(self) -> SensorNoise:
-        """No noise, with the lag of differences."""
+        """Measurements without noise, with the lag of differentiated velocities."""
         return SensorNoise(velocity_bandwidth=self.noise.velocity_bandwidth)
 
 
 @dataclass(frozen=True)
 class AdvisedGains:
-    """Gains, and what they are predicted to come to.
+    """Gains, and the errors predicted for them.
 
     Attributes:
         gains: The gains.
@@ -124,7 +124,7 @@ class AdvisedGains:
         position_error: The rms error of a point in m: by noise, and by an unknown force of
             `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
         force_error: The same of the contact force in N, also by a reference that changes by `RAMP`.
-        noise_error, noise_force: The parts by noise alone.
+        noise_error, noise_force: The parts of the errors by noise.
         roughness: The rms change of the controls from sample to sample, over all joints, in N m.
     """
 
@@ -139,7 +139,7 @@ class AdvisedGains:
 
 @dataclass(frozen=True)
 class _Part:
-    """What gains come to in one direction: the rate w, error, by noise, and roughness in N m."""
+    """The prediction for one direction: the error, its part by noise, and the roughness in N m."""
 
     rate: float
     rates: DirectionGains
@@ -151,7 +151,7 @@ class _Part:
 
 @checked(ModelError)
 def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
-    """The gains with the least predicted errors, of those that are smooth and stable enough.
+    """Returns the gains with the least predicted errors that are smooth and stable enough.
 
     The gains are those of `contact_gains`, as functions of its rate w, for which free directions
     and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
@@ -161,9 +161,9 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     is least among those gains that
 
     - change the controls by at most `roughness` from sample to sample, in rms,
-    - are stable, and settle at least at the rate `DECAY` w, if a force does 1/2 to 2 times what the
-      law believes in free directions, and 2/3 to 3/2 times along a contact whose stiffness is up to
-      2 times the given one,
+    - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
+      as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
+      stiffness is up to 2 times the stated one,
     - lose at most 0.15 rad of phase to samples and delay, with an estimator half of it.
 
     Args:
@@ -178,18 +178,20 @@ def advised_gains(situation: SensedContact, roughness: float) -> AdvisedGains:
     phase = _PHASE / 2.0 if situation.estimates else _PHASE
     highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
     rates = np.geomspace(highest, highest / 30.0, 14).tolist()
-    found = []
+    candidates = []
     for fast in _state_rates(situation, highest):
         tried = ([_contact(situation, w, fast, share) for w in rates] for share in _SLOWER)
         best = (_best(situation, parts, roughness / 2.0**0.5) for parts in tried)
         if (contact := next(filter(None, best), None)) is None:
             continue
-        left = (roughness**2 - contact.roughness**2) ** 0.5
-        if (free := _best(situation, [_free(situation, w, fast) for w in rates], left)) is not None:
-            found.append((free, contact, fast))
-    if not found:
+        remaining = (roughness**2 - contact.roughness**2) ** 0.5
+        if (
+            free := _best(situation, [_free(situation, w, fast) for w in rates], remaining)
+        ) is not None:
+            candidates.append((free, contact, fast))
+    if not candidates:
         raise GainError(_reason(situation, rates, roughness / 2.0**0.5, highest))
-    free, contact, fast = min(found, key=lambda each: each[0].error * each[1].error)
+    free, contact, fast = min(candidates, key=lambda parts: parts[0].error * parts[1].error)
     w, of_contact = free.rate, contact.rates
     return AdvisedGains(
         gains=ContactGains(
@@ -228,7 +230,7 @@ def _best(situation: SensedContact, parts: list[_Part], allowed: float) -> _Part
 
 
 def _is_stable(situation: SensedContact, part: _Part) -> bool:
-    """Whether a loop settles for all masses and stiffnesses that it has to bear."""
+    """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
     cases = [(situation.free(mass), DECAY) for mass in MASSES]
     if part.is_contact:
         cases = [
@@ -256,9 +258,9 @@ def _contact_rates(
 
 def _free(situation: SensedContact, w: float, fast: float | None) -> _Part:
     rates = _free_rates(w, fast)
-    loop = sampled_loop(situation.free(), rates, situation.seen(situation.lever))
+    loop = sampled_loop(situation.free(), rates, situation.noise_of(situation.lever))
     error, _ = loop.deviations()
-    _, jump = sampled_loop(situation.free(), rates, situation.seen(1.0)).deviations()
+    _, jump = sampled_loop(situation.free(), rates, situation.noise_of(1.0)).deviations()
     step = MODEL_ERROR * situation.free_mobility * _rms(loop)
     return _Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
 
@@ -267,7 +269,7 @@ def _contact(
     situation: SensedContact, w: float, fast: float | None, share: float = _SLOWER[-1]
 ) -> _Part:
     rates = _contact_rates(situation, w, fast, share)
-    loop = sampled_loop(situation.contact(), rates, situation.seen(situation.contact_lever))
+    loop = sampled_loop(situation.contact(), rates, situation.noise_of(situation.contact_lever))
     error, jump = loop.deviations()
     step = MODEL_ERROR * situation.mobility * _rms(loop)
     ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
@@ -281,7 +283,7 @@ def _rms(loop: SampledLoop) -> float:
 
 
 def _reason(situation: SensedContact, rates: list[float], allowed: float, highest: float) -> str:
-    """Why no gains are found."""
+    """Returns why no gains are found."""
     fast = list(_state_rates(situation, highest))[-1]
     for kind, where in ((_free, "in free directions"), (_contact, "along the contact")):
         parts = [kind(situation, w, fast) for w in rates]
@@ -293,20 +295,20 @@ def _reason(situation: SensedContact, rates: list[float], allowed: float, highes
             )
     least = min(part.roughness for part in parts if _is_stable(situation, part))
     return (
-        f"the noise of the {_blamed(situation)} changes the controls by {least:.3g} N m from "
-        f"sample to sample with all gains that are stable, and {allowed:.3g} N m are allowed in "
-        "each direction: allow more roughness, or use a better sensor"
+        f"the noise of the {_roughest_sensor(situation)} changes the controls by {least:.3g} N m "
+        f"from sample to sample with all gains that are stable, and {allowed:.3g} N m are allowed "
+        "in each direction: allow more roughness, or use a better sensor"
     )
 
 
-def _blamed(situation: SensedContact) -> str:
-    """The noise without which the roughness is least."""
+def _roughest_sensor(situation: SensedContact) -> str:
+    """The measurement whose noise causes most of the roughness."""
 
     def without(name: str) -> float:
         quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
-        found = sampled_loop(
-            quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.seen(1.0)
+        loop = sampled_loop(
+            quiet.free(), _free_rates(1.0, 10.0 if quiet.estimates else None), quiet.noise_of(1.0)
         )
-        return found.deviations()[1]
+        return loop.deviations()[1]
 
     return min(("position", "velocity"), key=without)

@@ -37,7 +37,7 @@ class ContactGains:
     friction_rate: float
 
     def position_gains(self, poles: int) -> list[float]:
-        """The gains of a position output with 2 poles, or with 3: then its error is integrated.
+        """Returns the gains of a position output with 2 poles, or with 3 and an integral.
 
         As `gain_coefficients` takes them, lowest derivative first: Butterworth's polynomials,
         s^2 + sqrt(2) p s + p^2 and s^3 + 2 p s^2 + 2 p^2 s + p^3.
@@ -54,7 +54,7 @@ def contact_gains(
     delay: int = 1,
     velocity_noise: float = 1e-3,
 ) -> ContactGains:
-    """The gains of a law with integrals, damping and observer for a contact of given stiffness.
+    """Returns gains of a law with integrals, damping and observer for a contact.
 
     All gains follow from one rate w. Positions have Butterworth's poles at the distance p = 1.5 w,
     so that 3 w is the gain of the velocity where they are integrated: a triple pole at -w has the

@@ -30,7 +30,7 @@ _FLAT = 1e-9
 def with_disturbance(
     system: DaeSystem, states: Sequence[str], frictions: Sequence[str] = ()
 ) -> DaeSystem:
-    """The same system with a disturbance d(t) as an exogenous signal:
+    """Returns the same system with a disturbance d(t) as an exogenous signal:
 
         E x' = f + S d + g v + h u,
 
@@ -49,11 +49,11 @@ def with_disturbance(
         ModelError: A name is not that of a state or parameter, or occurs twice; or the system
             already has a parameter "disturbance".
     """
-    known = [signal.name for signal in system.state_signals]
+    names = [signal.name for signal in system.state_signals]
     for name in states:
-        if name not in known:
-            raise ModelError(f"{system.name}: {unknown_name('state', name, known)}")
-    rows = [known.index(name) for name in states]
+        if name not in names:
+            raise ModelError(f"{system.name}: {unknown_name('state', name, names)}")
+    rows = [names.index(name) for name in states]
     if not rows or len(set(rows)) != len(rows):
         raise ModelError(
             f"{system.name}: with_disturbance needs names of states, each once, got "
@@ -82,7 +82,7 @@ def with_disturbance(
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The functions that an observer of d evaluates for a system made by `with_disturbance`.
+    """The functions that an observer of d evaluates, for a system made by `with_disturbance`.
 
     With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
     derivative of a measurement is needed.
@@ -119,7 +119,7 @@ class Observation:
 
     @classmethod
     def of(cls, structure: Structure) -> "Observation":
-        """The observation of a system, from its structure.
+        """Derives the functions from the structure of a system.
 
         Raises:
             ModelError: The system has no disturbance, or a mass matrix that depends on the states
@@ -145,8 +145,8 @@ class Observation:
         drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
         inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
-        given = {"control": u, "constraint_input": v}
-        function = system.trace("momentum", outputs, given, often=False)
+        signals = {"control": u, "constraint_input": v}
+        function = system.trace("momentum", outputs, signals, often=False)
 
         # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
@@ -167,63 +167,67 @@ class Observation:
         moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
         slopes = [ca.jacobian(column, x[rows]) for column in columns]
         planes = ca.horzcat(ca.SX(len(rows), 0), *slopes)
-        found = {
+        directions_of_forces = {
             "metric": ca.mtimes(projector.T, moves),
             "free": projector,
             "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
         }
-        directions = system.trace("directions of friction", found, pressed, often=False)
+        directions = system.trace(
+            "directions of friction", directions_of_forces, pressed, often=False
+        )
         wanted, moving = _wanted(structure, rows)
         return cls(function, friction, directions, wanted, moving, tuple(rows), frictions)
 
 
 def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """The share of each friction force c in d, in the metric of accelerations, shape (c, 1):
+    """Returns the part of d that each friction force c explains, as a factor, shape (c, 1):
 
         (c~^T W d) / (c~^T W c),
 
-    where c~ is c less what a force on the contact across its sliding would explain as well. So a
-    payload that pulls the tool across its motion is no friction, although M^-1 couples both.
+    where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
+    So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
 
     Args:
         forces: The forces as columns, shape (k, c).
         planes: T, the reactions of each contact if it sticks, side by side, shape (k, c k).
         velocity: The velocities, shape (k, 1).
         metric: W, shape (k, k).
-        d: What is shared, shape (k, 1).
+        d: The disturbance, shape (k, 1).
     """
-    size, found = forces.shape[0], list[ca.SX]()
+    size, components = forces.shape[0], list[ca.SX]()
     for j in range(forces.shape[1]):
         force, plane = forces[:, j], planes[:, j * size : (j + 1) * size]
         # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
         power = ca.fmin(ca.mtimes(velocity.T, force), -_TINY)
         across = plane - ca.mtimes(force, ca.mtimes(velocity.T, plane)) / power
-        sizes = [ca.mmax(ca.sum1(each * ca.mtimes(metric, each))) for each in (across, plane)]
+        sizes = [
+            ca.mmax(ca.sum1(columns * ca.mtimes(metric, columns))) for columns in (across, plane)
+        ]
         across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
         matched = ca.mtimes(metric, beside(across, metric, force))
         square = ca.fmax(ca.dot(matched, force), _TINY)
-        found.append(ca.dot(matched, d) / square)
-    return ca.vertcat(ca.SX(0, 1), *found)
+        components.append(ca.dot(matched, d) / square)
+    return ca.vertcat(ca.SX(0, 1), *components)
 
 
 def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """The part of d orthogonal to all T y in the metric of accelerations, in the shape of d.
+    """Returns the part of d that is orthogonal to all T y in the metric of accelerations.
 
     Args:
         planes: T, shape (k, j), of any rank.
         metric: W, shape (k, k).
-        d: What is shared, as columns.
+        d: Disturbances, as columns.
     """
     squares = ca.sum1(planes * ca.mtimes(metric, planes))
     least = _FLAT * ca.mmax(squares) if squares.numel() else 0
-    found: list[tuple[ca.SX, ca.SX]] = []
+    basis: list[tuple[ca.SX, ca.SX]] = []
     for column in ca.horzsplit(planes):
-        for direction, matched in found:  # Modified Gram-Schmidt, in the metric W.
+        for direction, matched in basis:  # Modified Gram-Schmidt, in the metric W.
             column -= direction * ca.dot(matched, column)
         matched = ca.mtimes(metric, column)
         square = ca.dot(column, matched)
         matched = ca.if_else(square > least, 1, 0) / ca.fmax(square, _TINY) * matched
-        found.append((column, matched))
+        basis.append((column, matched))
         d -= ca.mtimes(column, ca.mtimes(matched.T, d))
     return d
 
@@ -231,28 +235,28 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 def _wanted(
     structure: Structure, rows: Sequence[int]
 ) -> tuple[TracedFunction | None, TracedFunction]:
-    """`wanted` and `moving` of an `Observation`."""
+    """Returns `wanted` and `moving` of an `Observation`."""
     system, layout = structure.system, DerivativeLayout(structure.output_degrees)
     # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
     rates = {i: structure.output_chains[i][1] for i in starts}
-    own = ca.SX.zeros(layout.reference_size)
+    at_present = ca.SX.zeros(layout.reference_size)
     for i, rate in rates.items():
-        own[starts[i] + 1] = rate
-    moving = system.trace("velocities of outputs", {"R": own}, often=False)
+        at_present[starts[i] + 1] = rate
+    moving = system.trace("velocities of outputs", {"R": at_present}, often=False)
     if len(starts) < len(steered):
         return None, moving
     reference, ahead = ca.SX.sym("R", layout.reference_size), ca.SX.sym("t")
-    kept = DerivativeLayout(structure.constraint_degrees).ends.tolist()
-    left = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
-    left += [structure.manifold.residual_expression[kept, :]]
-    slope = ca.jacobian(ca.vertcat(*left), system.state[list(rows), :])
+    velocity_rows = DerivativeLayout(structure.constraint_degrees).ends.tolist()
+    errors = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
+    errors += [structure.manifold.residual_expression[velocity_rows, :]]
+    slope = ca.jacobian(ca.vertcat(*errors), system.state[list(rows), :])
     if slope.shape[0] != slope.shape[1]:
         return None, moving
     factors = Factorization(slope)
     state = ca.SX(system.state)
-    state[list(rows), :] -= factors.solve(ca.vertcat(*left))
+    state[list(rows), :] -= factors.solve(ca.vertcat(*errors))
     inputs = {"reference": reference, "ahead": ahead}
     wanted = system.trace("wanted velocities", {"state": state}, inputs, factors.pivot, often=False)
     return wanted, moving
@@ -261,14 +265,14 @@ def _wanted(
 def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
     """The exogenous coefficients of friction, and the constraint input of each."""
     forces = [signal.name for signal in system.constraint_input_signals]
-    found = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
+    pressed_by = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
     for name in names:
-        if name not in (*found, DISTURBANCE):
+        if name not in (*pressed_by, DISTURBANCE):
             raise ModelError(
                 f"{system.name}: '{name}' varies and is not the coefficient of friction of one "
                 "contact; an observer estimates a disturbance and coefficients of friction"
             )
-    return {name: found[name] for name in names if name in found}
+    return {name: pressed_by[name] for name in names if name in pressed_by}
 
 
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
@@ -278,8 +282,10 @@ def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
     others = ca.horzcat(system.g, system.h)
     identity = ca.SX.eye(system.num_states)
     for i in np.flatnonzero(pattern.any(axis=0)).tolist():
-        own = ca.is_equal(ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2)
-        if i in rows or not own or ca.sparsify(others[i, :]).nnz():
+        is_plain = ca.is_equal(
+            ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2
+        )
+        if i in rows or not is_plain or ca.sparsify(others[i, :]).nnz():
             name = system.state_signals[i].name
             raise ModelError(
                 f"{system.name}: the mass that a disturbance accelerates depends on '{name}', "

@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Lags:
-    """n + 1 first-order lags of rate k in series, of a signal d that is held between samples:
+    """n + 1 first-order lags of rate k in series, for a signal d that is constant between samples:
 
         s_0' = k (d - s_0),    s_j' = k (s_(j-1) - s_j),    r = s_n = (k / (s + k))^(n+1) d.
 
@@ -38,7 +38,7 @@ class Lags:
 
     @classmethod
     def of(cls, rate: float, period: float, degree: int) -> "Lags":
-        """The sampled lags.
+        """Returns the sampled lags.
 
         Args:
             rate: k in 1/s.
@@ -49,17 +49,17 @@ class Lags:
         both = np.zeros((size + 1, size + 1))
         both[:size, :size] = rate * (np.eye(size, k=-1) - np.eye(size))
         both[0, size] = rate
-        found = expm(both * period)
+        transition = expm(both * period)
         slopes = np.zeros((degree, size))
         for j in range(1, size):
             for i in range(j + 1):
                 slopes[j - 1, degree - i] = rate**j * (-1) ** (j - i) * comb(j, i)
-        return cls(rate, degree, found[:size, :size], found[:size, size], slopes)
+        return cls(rate, degree, transition[:size, :size], transition[:size, size], slopes)
 
     def after(self, lags: ca.SX, signal: ca.SX) -> ca.SX:
-        """s at the next sample, one column for each, shape (k, n + 1); d is of shape (k, 1)."""
+        """Returns s at the next sample for d of shape (k, 1), one column for each, (k, n + 1)."""
         return ca.mtimes(lags, self.step.T) + ca.mtimes(signal, self.gain[None, :])
 
     def derivatives(self, lags: ca.SX) -> ca.SX:
-        """r', ..., r^(n), one column for each, shape (k, n)."""
+        """Returns r', ..., r^(n), one column for each, shape (k, n)."""
         return ca.mtimes(lags, self.slopes.T)

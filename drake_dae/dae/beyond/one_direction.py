@@ -31,14 +31,14 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class Direction:
-    """What moves in a direction, and how it is sampled.
+    """The motion in one direction, and its sampling.
 
     Attributes:
         period: T in s.
         delay: The number of samples until the control acts.
-        mobility: A in 1/kg, by which the law knows what a force does.
+        mobility: A in 1/kg, the acceleration per force in the model of the law.
         stiffness: k of a contact in N/m; 0 for a free direction.
-        mass_error: What a force does, over what the law believes; 1 if the model is right.
+        mass_error: The acceleration by a force, relative to that in the model of the law.
     """
 
     period: float
@@ -54,7 +54,7 @@ class DirectionGains:
 
     Attributes:
         gains: Of the integral of the error, of the error, and of its derivative, in 1/s^3, 1/s^2
-            and 1/s; along a contact the damping c alone is used, as the last.
+            and 1/s; along a contact only the last is used, the damping c.
         force_gain: K_i of the integral of a contact's force.
         observer_rate: k_o, or k_n along a contact.
         state_rate: w of a `StateEstimator`; None with a measured velocity.
@@ -68,13 +68,13 @@ class DirectionGains:
 
 @dataclass(frozen=True)
 class SampledLoop:
-    """x = A x + B n of the next sample, for noise n of deviation 1; rows C x + D n are looked at.
+    """A sampled linear loop: x+ = A x + B n with noise n of deviation 1, and outputs C x + D n.
 
     Attributes:
         step, noise: A and B.
         shown: The rows of the error (of a contact: of its force, in N) and of the acceleration that
-            the law asks for, over (x, n).
-        push: What a disturbing acceleration of 1 does to x during a sample.
+            the law commands, over (x, n).
+        push: The change of x during a sample by a disturbing acceleration of 1.
         period: T in s.
     """
 
@@ -90,7 +90,7 @@ class SampledLoop:
         return float(np.abs(np.linalg.eigvals(self.step)).max())
 
     def deviations(self) -> tuple[float, float]:
-        """The standard deviations of the error, and of the acceleration from sample to sample.
+        """Returns the standard deviations of the error, and of the acceleration's changes.
 
         They are infinite if the loop is not stable.
         """
@@ -98,17 +98,17 @@ class SampledLoop:
         if not self.radius < 1.0:
             return np.inf, np.inf
         spread = solve_discrete_lyapunov(self.step, self.noise @ self.noise.T, method="bilinear")
-        error, asked = self.shown
+        error, command = self.shown
         c, d = error[:size], error[size:]
         first = float(c @ spread @ c + d @ d)
         # The difference of two samples: C x+ + D n+ - (C x + D n), with x+ = A x + B n.
-        c, d = asked[:size], asked[size:]
+        c, d = command[:size], command[size:]
         change, along = c @ self.step - c, c @ self.noise - d
         second = float(change @ spread @ change + along @ along + d @ d)
         return max(first, 0.0) ** 0.5, max(second, 0.0) ** 0.5
 
     def after_step(self) -> float:
-        """sqrt(sum of squares) of the error after a disturbing acceleration rises from 0 to 1.
+        """Returns sqrt(sum of squares) of the error after a disturbing acceleration steps to 1.
 
         It is infinite if the loop is not stable.
         """
@@ -123,12 +123,12 @@ class SampledLoop:
 
 
 def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
-    """The loop of a law whose model is right, except for what `direction` says.
+    """Returns the loop of a law whose model is right, except for the `mass_error`.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
-    asks for, held for a sample after its delay, and m the mass_error. In a contact the depth moves
+    commands, held for a sample after its delay, and m the mass_error. In a contact the depth moves
     as phi'' = m (a - A k phi) + d, and the law measures the force -k phi. With the estimates
-    e, e' and d of observer or estimator the law asks for
+    e, e' and d of observer or estimator the law commands
 
         a = -K_1 sigma - K_2 e - K_3 e' - d            free,
         a = -c phi' - A K_i sigma_F - d                in a contact,
@@ -136,9 +136,9 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
     with the sums sigma of the error and sigma_F of the force's error.
 
     Args:
-        direction: What moves.
+        direction: The motion and its sampling.
         rates: The gains.
-        noise: The noise of what is measured.
+        noise: The noise of the measurements.
     """
     parts = ["e", "v", "sum", *(f"held{i}" for i in range(direction.delay))]
     parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]
@@ -161,7 +161,7 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
 
 
 _ORDERS = {"e": 0, "q": 0, "measured": 0, "v": 1, "w": 1, "before": 1, "difference": 1}
-"""How often the parts are differentiated; others are accelerations."""
+"""The order of the derivative that each part is; others are accelerations."""
 
 
 Rows = dict[str, FloatArray]
@@ -170,7 +170,7 @@ Rows = dict[str, FloatArray]
 def _step(
     direction: Direction, rates: DirectionGains, noise: SensorNoise, now: Rows
 ) -> tuple[Rows, tuple[FloatArray, FloatArray]]:
-    """What a sample makes of the quantities; and the error, and the acceleration asked for."""
+    """The quantities at the next sample; and the error, and the commanded acceleration."""
     period, mass = direction.period, direction.mass_error
     stiff = direction.mobility * direction.stiffness
     after = dict(now)
@@ -183,19 +183,19 @@ def _step(
         after |= {"difference": velocity, "measured": position}
     pressed = -stiff * now["e"] + direction.mobility * noise.force * now["force"]
 
-    known, update = (_estimated if rates.state_rate else _observed)(rates, period, noise, now)
-    error, rate, disturbance = known(position, velocity)
+    estimates, update = (_estimated if rates.state_rate else _observed)(rates, period, noise, now)
+    error, rate, disturbance = estimates(position, velocity)
     if stiff:
-        asked = -rates.gains[2] * rate - rates.force_gain * now["sum"] - disturbance
+        command = -rates.gains[2] * rate - rates.force_gain * now["sum"] - disturbance
         after["sum"] = now["sum"] - period * pressed
     else:
         gains = rates.gains
-        asked = -gains[0] * now["sum"] - gains[1] * error - gains[2] * rate - disturbance
+        command = -gains[0] * now["sum"] - gains[1] * error - gains[2] * rate - disturbance
         after["sum"] = now["sum"] + period * error
-    held = [now[f"held{i}"] for i in range(direction.delay)] + [asked]
-    acts = held[0]
+    pending = [now[f"held{i}"] for i in range(direction.delay)] + [command]
+    acts = pending[0]
     for i in range(direction.delay):
-        after[f"held{i}"] = held[i + 1]
+        after[f"held{i}"] = pending[i + 1]
 
     # The motion over the sample, exact for what is held.
     push = mass * acts + now["held"]
@@ -208,7 +208,7 @@ def _step(
     mean = mean + direction.mobility * noise.force * now["force"] * bool(stiff)
     after |= update(position, velocity, acts + mean)
     force = -direction.stiffness * now["e"] if stiff else now["e"]
-    return after, (force, asked)
+    return after, (force, command)
 
 
 _filter = lru_cache(maxsize=256)(ChainFilter.of)
@@ -221,38 +221,38 @@ Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 def _observed(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `DisturbanceObserver`: what the law reads, and what is held after the sample."""
+    """A `DisturbanceObserver`: the estimates that the law reads, and its next state."""
     gain = -np.expm1(-rates.observer_rate * period)
 
-    def known(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
+    def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
         return position, velocity, now["r"]
 
     def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
         d = (velocity - now["before"]) / period - now["acted"]
         return {"r": now["r"] + gain * (d - now["r"]), "before": velocity, "acted": acted}
 
-    return known, update
+    return estimates, update
 
 
 def _estimated(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `StateEstimator`, likewise; q, w and a are its prediction."""
+    """A `StateEstimator`: the same; q, w and a are its prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None
-    found = _filter(rates.state_rate, rates.observer_rate, period, ratio)
+    observer = _filter(rates.state_rate, rates.observer_rate, period, ratio)
     ahead = np.array([now["q"], now["w"], now["a"]])
 
     def corrected(position: FloatArray, velocity: FloatArray) -> FloatArray:
-        measured = np.array([position, velocity][: found.gain.shape[1]])
-        result: FloatArray = ahead + found.gain @ (measured - ahead[: len(measured)])
+        measured = np.array([position, velocity][: observer.gain.shape[1]])
+        result: FloatArray = ahead + observer.gain @ (measured - ahead[: len(measured)])
         return result
 
-    def known(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
+    def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
         return tuple(corrected(position, velocity))
 
     def update(position: FloatArray, velocity: FloatArray, acted: FloatArray) -> Rows:
         q, w, a = transition(period) @ corrected(position, velocity)
         return {"q": q + period**2 / 2.0 * acted, "w": w + period * acted, "a": a}
 
-    return known, update
+    return estimates, update

@@ -34,7 +34,7 @@ def sampled_poles(
     state: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
 ) -> ComplexArray:
-    """The exact poles of a robot under a sampled law, about an equilibrium.
+    """Returns the exact poles of a robot under a sampled law, about an equilibrium.
 
     The law samples at t_k = k T; its control acts from t_k + d until t_(k+1) + d. About an
     equilibrium a deviation x of the minimal states on N* has x' = A x without the law and x' = (A +
@@ -85,16 +85,16 @@ def sampled_poles(
     matrix[:size, :size] = end[0] @ begin[0]
     matrix[:size, late * size : (late + 1) * size] += end[1]
     matrix[:size, (late + 1) * size :] += end[0] @ begin[1]
-    found = np.linalg.eigvals(matrix).astype(complex)
-    return found[np.argsort(-np.abs(found), kind="stable")]
+    eigenvalues = np.linalg.eigvals(matrix).astype(complex)
+    return eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")]
 
 
 def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A t) and Gamma(t) G."""
+    """Returns exp(A t) and Gamma(t) G."""
     size = len(A)
     both = np.block([[A, G], [np.zeros((size, 2 * size))]])
-    found = scipy.linalg.expm(both * length)
-    return found[:size, :size], found[:size, size:]
+    transition = scipy.linalg.expm(both * length)
+    return transition[:size, :size], transition[:size, size:]
 
 
 @checked(ModelError)
@@ -108,7 +108,7 @@ def sampling_error(
     *,
     parameters: ArrayLike | None = None,
 ) -> FloatArray:
-    """The error that sampling adds to (30), (31), to first order in period and delay.
+    """Returns the error that sampling adds to (30), (31), to first order in period and delay.
 
     For any plant and reference, z_i^(mu_i) = a_i + B_i u gives without approximation
 
@@ -142,10 +142,10 @@ def sampling_error(
     moments = vector("times", times, None)
     if moments.size < 3 or np.any(np.diff(moments) <= 0.0):
         raise ModelError("times must be three or more, and increase")
-    sizes = (moments.size, law.system.num_states), (moments.size, law.system.num_controls)
+    count, system = moments.size, law.system
     courses = [
-        _course(name, given, size)
-        for name, given, size in zip(("states", "controls"), (states, controls), sizes, strict=True)
+        _course("states", states, (count, system.num_states)),
+        _course("controls", controls, (count, system.num_controls)),
     ]
     values = law.system.parameter_vector(parameters)
     matrix = law.system.trace("control matrix", {"B": law.structure.control_matrix}, often=False)
@@ -156,13 +156,13 @@ def sampling_error(
             for state, rate in zip(courses[0], rates, strict=True)
         ]
     )
-    found = -(delay + period) * driven
+    error = -(delay + period) * driven
     layout = law.layout
     push = np.zeros((layout.chain_size, moments.size))
     push[layout.ends] = -(delay + 0.5 * period) * driven[:, layout.dynamic].T
     chains = _response(law.gains.error_matrix, moments, push.T)
-    found[:, layout.dynamic] = chains[:, layout.heads]
-    return found
+    error[:, layout.dynamic] = chains[:, layout.heads]
+    return error
 
 
 def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatArray:
@@ -175,10 +175,10 @@ def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatA
     both[:, :size, size + 1] = np.diff(push, axis=0) / lengths[:, None]
     both[:, size + 1, size] = 1.0
     steps = scipy.linalg.expm(both * lengths[:, None, None])
-    found = np.zeros((times.size, size))
+    states = np.zeros((times.size, size))
     for index, step in enumerate(steps):
-        found[index + 1] = step[:size, :size] @ found[index] + step[:size, size]
-    return found
+        states[index + 1] = step[:size, :size] @ states[index] + step[:size, size]
+    return states
 
 
 def _check(law: TrackingLaw) -> None:
@@ -191,14 +191,14 @@ def _check(law: TrackingLaw) -> None:
 
 
 def _delay(delay: float) -> float:
-    found = number("delay", delay)
-    if found < 0.0:
+    seconds = number("delay", delay)
+    if seconds < 0.0:
         raise ModelError(f"delay must be 0 s or more, got {delay:g}")
-    return found
+    return seconds
 
 
 def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
-    """Refuses a state that is not an equilibrium."""
+    """Checks that a state is an equilibrium."""
     moves = np.abs(loop.rate) / law.system.scale
     fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
     worst = int(np.argmax(moves))
@@ -211,9 +211,9 @@ def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> No
         )
 
 
-def _course(name: str, given: ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Rows for each time."""
-    rows = numbers(name, given)
+def _course(name: str, values: ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Checks an array with a row for each time."""
+    rows = numbers(name, values)
     if rows.shape != shape or not np.isfinite(rows).all():
         raise ModelError(
             f"{name} must be finite and of shape {shape}, with a row for each of {shape[0]} times, "

@@ -1,4 +1,4 @@
-"""What a loop around springs leaves of errors, and for which springs it is stable."""
+"""The errors that a loop around springs leaves, and the springs for which it is stable."""
 
 import casadi as ca
 import numpy as np
@@ -12,7 +12,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 SCALES = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-"""The examined stiffnesses of springs, relative to those that the loop believes."""
+"""The examined stiffnesses of springs, relative to those in the model of the loop."""
 
 _HORIZON = 20.0
 """Time constants of the slowest pole for which a response is integrated."""
@@ -30,9 +30,9 @@ def spring_error_bound(
     period: float,
     delay: float = 0.0,
 ) -> FloatArray:
-    """A bound of the errors that springs add to those of a rigid law, by singular perturbation.
+    """Returns a bound of the errors that springs add to those of a rigid law.
 
-    The torque of a `TorqueLoop` differs from the wanted one by e, where
+    The torque of a `TorqueLoop` differs from the desired one by e, where
 
         e'' + 2 zeta w e' + (w^2 + K M^-1 P) e = -(1 + zeta + zeta w T) tau_d'' - K B^-1 t u',
 
@@ -69,7 +69,7 @@ def spring_error_bound(
     """
     moments = vector("times", times, None)
     x, tau = numbers("states", states), numbers("torques", torques)
-    K, B = (_square(given) for given in (stiffness, inertia))
+    K, B = (_square(value) for value in (stiffness, inertia))
     if moments.size < 5 or x.shape[0] != moments.size or tau.shape[0] != moments.size:
         raise ModelError("times, states and torques must have as many rows, five or more")
     elimination, system = law.structure.elimination, law.system
@@ -83,14 +83,14 @@ def spring_error_bound(
         },
         often=False,
     )
-    values, found, ahead = system.parameter_values, [], []
+    values, traced, ahead = system.parameter_values, [], []
     for state in x:
-        found.append([part.copy() for part in function(state, values)])
+        traced.append([part.copy() for part in function(state, values)])
     p = tau.shape[1]
-    moves = [part[0].reshape(len(rows), p) for part in found]
+    moves = [part[0].reshape(len(rows), p) for part in traced]
     # The actuated accelerations are the force's, by virtual work.
     select = np.linalg.pinv(_actuation(law, rows))
-    for (_, rate, _), matrix, torque in zip(found, moves, tau, strict=True):
+    for (_, rate, _), matrix, torque in zip(traced, moves, tau, strict=True):
         ahead.append(select @ (rate + matrix @ torque))
     control = tau + np.array(ahead) @ B.T
     bends = np.gradient(np.gradient(tau, moments, axis=0), moments, axis=0)
@@ -98,9 +98,9 @@ def spring_error_bound(
     late = (delay + period / 2.0) * np.gradient(control, moments, axis=0)
     driven = np.zeros_like(tau)
     for k, matrix in enumerate(moves):
-        left = loop.rate**2 * np.eye(p) + K @ select @ matrix
-        error = -np.linalg.solve(left, bends[k] + K @ np.linalg.solve(B, late[k]))
-        driven[k] = found[k][2].reshape(p, p) @ error
+        stiffness_of_error = loop.rate**2 * np.eye(p) + K @ select @ matrix
+        error = -np.linalg.solve(stiffness_of_error, bends[k] + K @ np.linalg.solve(B, late[k]))
+        driven[k] = traced[k][2].reshape(p, p) @ error
     # Differences at both ends are one-sided.
     inner = slice(2, -2)
     rates = np.gradient(driven, moments, axis=0)
@@ -116,7 +116,7 @@ def _actuation(law: TrackingLaw, rows: list[int]) -> FloatArray:
 def _bounds(
     law: TrackingLaw, largest: FloatArray, fastest: FloatArray, loop: SpringLoop
 ) -> FloatArray:
-    """Bounds of errors that such inputs drive."""
+    """Bounds of the errors by inputs with these largest values and rates."""
     degrees, integrated = law.degrees, law.integral.outputs
     matrix, heads = law.gains.error_matrix, law.gains.layout.starts
     result = np.zeros(len(degrees))
@@ -126,8 +126,8 @@ def _bounds(
             result[i] = largest[i]
             continue
         start = int(heads[i])
-        own = matrix[start : start + count, start : start + count]
-        at_once, summed = _sizes(own, degree, i in integrated)
+        block = matrix[start : start + count, start : start + count]
+        at_once, summed = _sizes(block, degree, i in integrated)
         result[i] = min(at_once * largest[i], summed * fastest[i])
     zeta = loop.damping
     if zeta >= 1.0:
@@ -136,7 +136,7 @@ def _bounds(
 
 
 def _sizes(matrix: FloatArray, degree: int, is_integrated: bool) -> tuple[float, float]:
-    """The integrals of |g| and of |integral of g|; infinite where an error stays."""
+    """The integrals of |g| and of |integral of g|; infinite where an error does not decay."""
     slowest = -np.max(np.linalg.eigvals(matrix).real)
     fastest = np.max(np.abs(np.linalg.eigvals(matrix)))
     step, count = 0.02 / fastest, int(_HORIZON * fastest / slowest / 0.02)
@@ -163,7 +163,7 @@ def spring_loop_radius(
     delay: int,
     scale: float = 1.0,
 ) -> float:
-    """The spectral radius of a sampled `TorqueLoop` about rest, with springs of another stiffness.
+    """Returns the spectral radius of a sampled `TorqueLoop` at rest, for other springs.
 
     The deflections d have, with the mobility L of the links and held torques u of `delay` samples
     before,
@@ -182,48 +182,30 @@ def spring_loop_radius(
     Raises:
         ModelError: A number is not positive.
     """
-    K, B, L = (_square(given) for given in (stiffness, inertia, mobility))
+    K, B, L = (_square(value) for value in (stiffness, inertia, mobility))
     T, s, p = positive("period", period), positive("scale", scale), len(K)
     one, none = np.eye(p), np.zeros((p, p))
     inverse = np.linalg.inv(B)
     # (d, d', the integral of d, u).
-    A = np.zeros((4 * p, 4 * p))
-    A[:p, p : 2 * p] = one
-    A[p : 2 * p, :p] = -s * (inverse + L) @ K
-    A[p : 2 * p, 3 * p :] = inverse
-    A[2 * p : 3 * p, :p] = one
+    stiff = -s * (inverse + L) @ K
+    A = np.block([[none, one, none, none], [stiff, none, none, inverse], [one, none, none, none]])
+    A = np.vstack([A, np.zeros((p, 4 * p))])
     step = scipy.linalg.expm(A * T)
     # The measured state gives the next control, with the observer's f_o (its sign as added).
     w, zeta, gain = loop.rate, loop.damping, -np.expm1(-loop.motor_rate * T)
-    feedback = K - w**2 * B, -2.0 * zeta * w * B
-    size = (3 + delay + 1) * p  # d, d', f_o, then the controls on their way, the next one first.
-    matrix = np.zeros((size, size))
-    at = [slice(i * p, (i + 1) * p) for i in range(3 + delay + 1)]
-    law = {0: feedback[0], 1: feedback[1], 2: one}
-    parts = [step[i * p : (i + 1) * p] for i in range(3)]
-    rows: list[dict[int, FloatArray]] = []
-    for part in parts:
-        columns = {0: part[:, :p], 1: part[:, p : 2 * p]}
-        by_control = part[:, 3 * p :]
-        acting = {3: one} if delay else law
-        for place, block in acting.items():
-            columns[place] = columns.get(place, none) + by_control @ block
-        rows.append(columns)
-    for row, columns in zip((0, 1), rows[:2], strict=True):
-        for place, block in columns.items():
-            matrix[at[row], at[place]] += block
+    # The rows that select d, d', f_o, and the delayed controls, of which the next to act is first.
+    d, rate, friction, *delayed = np.split(np.eye((3 + delay) * p), 3 + delay)
+    law = (K - w**2 * B) @ d - 2.0 * zeta * w * B @ rate + friction
+    control, *delayed = [*delayed, law]
+    next_d, next_rate, integral = (
+        part[:, :p] @ d + part[:, p : 2 * p] @ rate + part[:, 3 * p :] @ control
+        for part in np.split(step, 4)[:3]
+    )
     # The observer takes the mean of K d at both ends, and the momentum has that of s K d.
-    matrix[at[2], at[2]] += (1.0 - gain) * one
-    matrix[at[2], at[0]] -= gain * K / 2.0
-    for place, block in rows[0].items():
-        matrix[at[2], at[place]] -= gain * K @ block / 2.0
-    for place, block in rows[2].items():
-        matrix[at[2], at[place]] += gain * s * K @ block / T
-    for i in range(3, 3 + delay):
-        for place, block in ({i + 1: one} if i + 1 < 3 + delay else law).items():
-            matrix[at[i], at[place]] += block
-    used = size - p
-    return float(np.abs(np.linalg.eigvals(matrix[:used, :used])).max())
+    observed = s * K @ integral / T - K @ (d + next_d) / 2.0
+    friction = friction + gain * (observed - friction)
+    matrix = np.vstack([next_d, next_rate, friction, *delayed])
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def stable_scales(
@@ -234,7 +216,7 @@ def stable_scales(
     period: float,
     delay: int,
 ) -> tuple[float, float] | None:
-    """The range of stiffnesses, relative to the given ones, for which a `TorqueLoop` is stable.
+    """Returns the range of relative stiffnesses for which a `TorqueLoop` is stable.
 
     Args:
         mobilities: Those of the links, free and held; the other arguments are those of
@@ -259,7 +241,7 @@ def stable_scales(
     return SCALES[low], SCALES[high]
 
 
-def _square(given: ArrayLike) -> FloatArray:
-    """A diagonal or a matrix as a matrix."""
-    found = np.asarray(given, dtype=float)
-    return np.diag(found) if found.ndim == 1 else found
+def _square(value: ArrayLike) -> FloatArray:
+    """Converts a diagonal, or a matrix, to a matrix."""
+    matrix = np.asarray(value, dtype=float)
+    return np.diag(matrix) if matrix.ndim == 1 else matrix

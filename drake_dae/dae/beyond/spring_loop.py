@@ -23,7 +23,7 @@ DAMPING = 0.7
 @checked(ModelError)
 @dataclass(frozen=True)
 class SpringLoop:
-    """The numbers of a loop around springs, which makes their torque tau follow a wanted one,
+    """The parameters of a loop around springs, which makes their torque tau follow tau_d,
 
         tau'' + 2 zeta w tau' + w^2 tau = 2 zeta w tau_d' + w^2 tau_d + ...;    see `TorqueLoop`.
 
@@ -53,7 +53,7 @@ class SpringLoop:
 
 
 def spring_loop(period: float, delay: int, damping: float = DAMPING) -> SpringLoop:
-    """The recommended numbers of a loop around springs.
+    """Returns the recommended parameters of a loop around springs.
 
     The velocity of a shaft is controlled with the gain 2 zeta w, which is the crossover frequency
     of its loop. A delay t = (delay + 1/2) period costs the phase 2 zeta w t there, of which 0.2 rad
@@ -81,7 +81,7 @@ def contact_gains_behind(
     delay: int,
     velocity_noise: float,
 ) -> ContactGains:
-    """`contact_gains` of the rigid law of a cascade, for links that a loop around springs moves.
+    """Returns `contact_gains` of the rigid law of a cascade with a loop around springs.
 
     The torque of the springs follows at the rate of the loop. So the outer rate is a ninth of it at
     most, and the gain of the velocity, three times the outer rate, a third. The observer takes the
@@ -100,13 +100,13 @@ def contact_gains_behind(
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    # That of a rate of a ninth of the loop's.
+    # The noise for which `contact_gains` chooses a ninth of the loop's rate.
     least = _JITTER * _SLOWER / (14.0**0.5 * loop.rate)
     noise = max(velocity_noise, least)
-    found = contact_gains(stiffness, mobility, sample_time, delay, noise)
-    observer = min(0.8 * loop.rate, 3.75 * found.observer_rate)
+    gains = contact_gains(stiffness, mobility, sample_time, delay, noise)
+    observer = min(0.8 * loop.rate, 3.75 * gains.observer_rate)
     return replace(
-        found,
+        gains,
         observer_rate=observer,
         observer_force_rate=observer / 2.0,
         friction_rate=observer / 4.0,

@@ -50,10 +50,10 @@ def dynamic_extension(
 
     In each round the controls that act in the dependent rows of B(x) get an integrator. If more
     than q controls act in rows of rank q, a regular static feedback u = beta(x) w is applied first,
-    after which only q controls act in them; see `Extension.integrators`. A round reduces the zero
-    dynamics by the rank deficiency of B(x), so that few rounds decide: when no zero dynamics are
-    left, the outputs depend on each other. A violation of Assumption (3) is repaired on the way;
-    see `extend`.
+    after which only q controls act in them; see `Extension.integrators`. Each round reduces the
+    dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds:
+    if no zero dynamics remain and B(x) is still singular, the outputs are dependent and there is no
+    extension. A violation of Assumption (3) is repaired as well; see `extend`.
 
     Args:
         system: The system (1)-(3).
@@ -105,7 +105,7 @@ def dynamic_extension(
 
 
 class _Chain:
-    """A system on its way from the original to the extended one.
+    """A system between the original and the extended one, with the integrators added so far.
 
     Args:
         system: The original one.
@@ -130,7 +130,7 @@ class _Chain:
         self._bases = [(signal, 0) for signal in system.control_signals]
 
     def beside_nominal(self) -> DaeSystem:
-        """The system with a nominal state at which no sine is accidentally zero.
+        """Returns the system with a nominal state at which no sine is accidentally zero.
 
         Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
         """
@@ -157,13 +157,13 @@ class _Chain:
             for i in columns:
                 control = system.control_signals[i]
                 self._bases[i] = (Signal(f"{control.name}*", control.unit), 0)
-        held = [self._signal(i) for i in columns]
+        integrated_signals = [self._signal(i) for i in columns]
         for i in columns:
             self._bases[i] = (self._bases[i][0], self._bases[i][1] + 1)
             name = self._names[i]
             self.integrators[name] = self.integrators.get(name, 0) + 1
         following = [self._signal(i) for i in columns]
-        self.system = integrated(system, columns, held, following, nominal, mixing)
+        self.system = integrated(system, columns, integrated_signals, following, nominal, mixing)
         # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
         new = self.system.state[system.num_states :]
         self.offset += ca.mtimes(self.matrix[:, columns], new)
@@ -181,7 +181,7 @@ class _Chain:
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
-    """The controls that act in the dependent rows of B(x), and how they must be mixed first.
+    """Returns the controls that act in the dependent rows of B(x), and how to mix them.
 
     Returns:
         Columns and b(x) of `_Chain.integrate`; None if B(x) is regular.
@@ -221,15 +221,15 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
             5,
         )
     q = len(rows) - (p - rank)
-    heard = [j for j in range(p) if matrices[:, rows, j].any()]
-    if len(heard) == q:
-        return heard, None
+    acting = [j for j in range(p) if matrices[:, rows, j].any()]
+    if len(acting) == q:
+        return acting, None
 
     def distance(columns: list[int]) -> float:
         values = np.linalg.svd(scaled[:, rows][:, :, columns], compute_uv=False)
         return round(float(values[:, -1].min()), 9)
 
-    candidates: list[list[int]] = [list(columns) for columns in combinations(heard, q)]
+    candidates: list[list[int]] = [list(columns) for columns in combinations(acting, q)]
     columns = max(candidates, key=distance)
     others = [j for j in range(p) if j not in columns]
     # Least squares over all dependent rows, since q of them may be dependent at other states. It is
@@ -237,7 +237,7 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     part = structure.control_matrix[rows, :] / row_size[rows]
     chosen = part[:, columns]
     mixing = ca.SX(q, p - q)
-    mixed = [i for i, j in enumerate(others) if j in heard]
+    mixed = [i for i, j in enumerate(others) if j in acting]
     mixing[:, mixed] = Factorization(ca.mtimes(chosen.T, chosen)).solve(
         ca.mtimes(chosen.T, part[:, [others[i] for i in mixed]])
     )
@@ -259,28 +259,26 @@ def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
 
 
 def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
-    """The controls that act on a derivative of a constraint before any constraint input does."""
+    """Returns the controls that act on a constraint's derivative before its inputs do."""
     x, explicit = system.state, system.explicit
     manifold = Manifold(system, [[explicit.k[i]] for i in range(system.num_constraints)])
     samples = Samples(manifold, np.array([violation.state]))
-    found: set[int] = set()
+    early: set[int] = set()
     for i in range(system.num_constraints):
         last = explicit.k[i]
         for _ in range(system.num_states):
             gradient = samples.values(gradient=ca.jacobian(last, x))[0][0]
-            by_force = multiply(gradient, samples.field("g")[0], samples.scale, system.negligible)[
-                0
-            ]
-            by_control = multiply(
-                gradient, samples.field("h")[0], samples.scale, system.negligible
-            )[0]
+            by_force, by_control = (
+                multiply(gradient, samples.field(key)[0], samples.scale, system.negligible)[0]
+                for key in "gh"
+            )
             if by_force.any():
                 break
             if by_control.any():
-                found.update(int(j) for j in np.flatnonzero(by_control))
+                early.update(np.flatnonzero(by_control).tolist())
                 break
             last = lie_derivative(last, explicit.f, x)
-    return sorted(found)
+    return sorted(early)
 
 
 def _structure_at_nominal(chain: _Chain) -> Structure:
@@ -296,9 +294,9 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
             raise
         remedy = "Keep away from this state"
         if chain.integrators:
-            given = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
+            entries = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
             remedy += (
-                f", or give another nominal_control, for example nominal_control={{{given}}}; "
+                f", or give another nominal_control, for example nominal_control={{{entries}}}; "
                 f"integrators: {_in_words(chain.integrators)}"
             )
         raise AssumptionError(

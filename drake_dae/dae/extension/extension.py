@@ -49,7 +49,7 @@ class Extension:
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The control u of the original system, shape (p,).
+        """Returns the control u of the original system, shape (p,).
 
         Args:
             state: x_e, the state of the extended system.
@@ -60,16 +60,9 @@ class Extension:
 
     @cached_property
     def _control(self) -> TracedFunction:
-        control = ca.SX.sym("w", self.system.num_controls)
-        return TracedFunction(
-            f"{self.original.name} control",
-            {
-                "state": self.system.state,
-                "control": control,
-                "parameters": self.system.parameter_symbol,
-            },
-            {"control": self.control_offset + ca.mtimes(self.control_matrix, control)},
-        )
+        w = ca.SX.sym("w", self.system.num_controls)
+        outputs = {"control": self.control_offset + ca.mtimes(self.control_matrix, w)}
+        return self.system.trace("original control", outputs, {"control": w}, often=False)
 
 
 @checked(ModelError)
@@ -80,7 +73,7 @@ def extend(
 ) -> DaeSystem:
     """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
 
-    Constraints, outputs, parameters and mass matrix do not change, nor do the degrees r_i if
+    Constraints, outputs, parameters and mass matrix do not change, and the degrees r_i neither if
     Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
     any constraint input does, integrators repair it: the constraint then restricts the state u_i.
 
@@ -113,7 +106,7 @@ def extend(
         system = integrated(
             system,
             columns,
-            held=[base[i].derivative(order) for i in columns],
+            added=[base[i].derivative(order) for i in columns],
             following=[base[i].derivative(order + 1) for i in columns],
             nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
         )
@@ -121,7 +114,7 @@ def extend(
 
 
 def refuse_metric(system: DaeSystem) -> None:
-    """Refuses to put integrators before controls that a metric chooses.
+    """Checks that the system has no `control_metric`.
 
     Raises:
         ModelError: The system has a `control_metric`.
@@ -136,7 +129,7 @@ def refuse_metric(system: DaeSystem) -> None:
 def integrated(
     system: DaeSystem,
     columns: list[int],
-    held: Sequence[Signal],
+    added: Sequence[Signal],
     following: Sequence[Signal],
     nominal: FloatArray,
     mixing: ca.SX | None = None,
@@ -146,13 +139,13 @@ def integrated(
     Args:
         system: The system (1)-(3).
         columns: The columns of the q controls.
-        held, following: Names of the new states and controls.
+        added, following: Names of the new states and controls.
         nominal: Values of the new states, shape (q,).
         mixing: The matrix b(x), shape (q, p - q); zero if None.
     """
     q, n, p = len(columns), system.num_states, system.num_controls
     others = [j for j in range(p) if j not in columns]
-    new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in held])
+    new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in added])
     h = ca.SX(n + q, p)
     h[:n, others] = system.h[:, others]
     if mixing is not None:
@@ -167,7 +160,7 @@ def integrated(
         f=ca.vertcat(system.f + ca.mtimes(system.h[:, columns], new), ca.SX(q, 1)),
         g=ca.vertcat(system.g, ca.SX(q, system.num_constraints)),
         h=h,
-        state_signals=(*system.state_signals, *held),
+        state_signals=(*system.state_signals, *added),
         control_signals=tuple(controls),
         nominal_state=np.concatenate([system.nominal_state, nominal]),
         state_scale=(
@@ -181,20 +174,20 @@ def integrated(
 
 
 def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
-    """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
+    """Returns the controls at the nominal state, shape (p,), from their names; 0 for others.
 
     Raises:
         ModelError: A name is not that of a control, or a value is not finite.
     """
     values = values or {}
     _check_names(system, values, "nominal_control")
-    given = [values.get(s.name, 0.0) for s in system.control_signals]
-    return vector(f"{system.name}: nominal_control", given, system.num_controls)
+    controls = [values.get(s.name, 0.0) for s in system.control_signals]
+    return vector(f"{system.name}: nominal_control", controls, system.num_controls)
 
 
-def _check_names(system: DaeSystem, given: Mapping[str, float], what: str) -> None:
+def _check_names(system: DaeSystem, numbers: Mapping[str, float], what: str) -> None:
     names = [signal.name for signal in system.control_signals]
-    unknown = [name for name in given if name not in names]
+    unknown = [name for name in numbers if name not in names]
     if unknown:
         raise ModelError(
             f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "

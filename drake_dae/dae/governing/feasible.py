@@ -18,9 +18,9 @@ WITHIN = 1e-9
 
 
 def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFunction:
-    """A control as near as possible to a wanted one in what it does to the outputs.
+    """Builds the function that limits a control so that the outputs change least.
 
-    By (26), (27) z_i^(mu_i) = a_i + B_i u. With ubar_d = a + B u_d of the wanted control (28) it is
+    By (26), (27) z_i^(mu_i) = a_i + B_i u. With ubar_d = a + B u_d of the control (28) it is
 
         min |W (ubar - ubar_d)|^2 = |W B (u - u_d)|^2   with   |u_j| <= U_j,
         least <= v = alpha + beta u <= largest,
@@ -53,43 +53,45 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
                 f"{system.name}: each control needs a limit of its magnitude, '{signal.name}' has "
                 f"{least:g} to {most:g} {signal.unit}"
             )
-    wanted, scale = ca.SX.sym("wanted", system.num_controls), ca.DM(high)
+    desired, scale = ca.SX.sym("wanted", system.num_controls), ca.DM(high)
     matrix = ca.densify(structure.control_matrix)  # (16)
-    given = [system.state, system.parameter_symbol]
-    usual = ca.Function("B", given, [matrix])(structure.states[0], system.parameter_values).full()
+    inputs_of_matrix = [system.state, system.parameter_symbol]
+    usual = ca.Function("B", inputs_of_matrix, [matrix])(
+        structure.states[0], system.parameter_values
+    ).full()
     weights = 1.0 / np.linalg.norm(usual * high, axis=1)
     effect = ca.mtimes(ca.diag(ca.DM(weights)), matrix) @ ca.diag(scale)
     metric = ca.mtimes(effect.T, effect)
     metric /= ca.trace(metric) / high.size
     rows, bounds = _forces(structure, limits, scale)
-    goal = wanted / scale
-    found = nearest_within(metric, goal, rows, bounds, SOFTNESS)
+    goal = desired / scale
+    nearest = nearest_within(metric, goal, rows, bounds, SOFTNESS)
     over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(rows, goal) - bounds)
     is_limited = ca.mmax(over) > WITHIN
-    kept = ca.if_else(is_limited, found * scale, wanted)
-    control = ca.fmax(-scale, ca.fmin(scale, kept))
-    excess = ca.if_else(is_limited, wanted - control, 0.0)
+    limited_control = ca.if_else(is_limited, nearest * scale, desired)
+    control = ca.fmax(-scale, ca.fmin(scale, limited_control))
+    excess = ca.if_else(is_limited, desired - control, 0.0)
     outputs = {
         "control": control,
         "excess": excess,
         "departure": -ca.mtimes(matrix, excess),
         "is_limited": is_limited,
     }
-    inputs = {"state": system.state, "control": wanted, "parameters": system.parameter_symbol}
+    inputs = {"state": system.state, "control": desired, "parameters": system.parameter_symbol}
     name = f"{system.name} feasible control"
     return TracedFunction(name, inputs, outputs, compiled=system.compiled)
 
 
 def _forces(structure: Structure, limits: MotionLimits, scale: ca.DM) -> tuple[ca.SX, ca.SX]:
-    """A and b of A x <= b for u = U x, with rows of length one."""
+    """Returns A and b of A x <= b for u = U x, with rows of length one."""
     limited = LimitedSignals(structure, MotionLimits(forces=limits.forces, cones=limits.cones))
-    own, by = limited.by_control()
+    free, by = limited.by_control()
     slopes, rows, bounds = ca.mtimes(by, ca.diag(scale)), [], []
     for i, (low, high) in enumerate(zip(limited.low, limited.high, strict=True)):
         length = ca.norm_2(slopes[i, :]) + np.finfo(float).tiny
         for bound, sign in ((high, 1.0), (low, -1.0)):
             if np.isfinite(bound):
                 rows.append(sign * slopes[i, :] / length)
-                bounds.append(sign * (bound - own[i]) / length)
+                bounds.append(sign * (bound - free[i]) / length)
     columns = structure.system.num_controls
     return ca.vertcat(ca.SX(0, columns), *rows), ca.vertcat(ca.SX(0, 1), *bounds)

@@ -1,4 +1,4 @@
-"""The rate of a reference, slowed by what the present state needs."""
+"""The rate of a reference, lowered so that limits hold at the present state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.functions import TracedFunction
 
 RATE = 20.0
-"""How fast the rate of the reference returns to 1, and how fast it may fall to 0, in 1/s."""
+"""The rate in 1/s at which s' returns to 1, and the largest at which it falls to 0."""
 
 APPROACH = 100.0
-"""How fast speeds may approach their limits, in 1/s."""
+"""The largest rate at which speeds approach their limits, in 1/s."""
 
 AHEAD = 0.02
-"""How far ahead limits are met, in s."""
+"""Limits are satisfied at a time that is ahead by this, in s."""
 
 FREE = 1e6
 """The largest |s''| where nothing limits it, in 1/s."""
@@ -33,7 +33,7 @@ SMALL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Governing:
-    """A law and its references, whose time s goes as fast as limits allow at the present state.
+    """The time s of a law's references, which runs as fast as limits allow at the present state.
 
     For any s(t) the reference r(s(t)) is admissible, so that errors obey (30), (31), whatever s
     does. With
@@ -73,10 +73,7 @@ class Governing:
 
     @cached_property
     def function(self) -> TracedFunction:
-        """The function of the class."""
-        return self._traced()
-
-    def _traced(self) -> TracedFunction:
+        """The governed reference as a function; see the class."""
         law, layout = self.law, self.law.layout
         if any(degree not in (0, 2) for degree in law.degrees) or law.exogenous_degrees:
             raise ReferenceSignalError(
@@ -91,11 +88,11 @@ class Governing:
         still = ca.SX(rows)
         still[(moving + 1).tolist()] = first * rate
         still[(moving + 2).tolist()] = second * rate**2
-        wanted = law.wanted(still)
+        commanded = law.commanded_derivatives(still)
         now, ahead = ca.SX.zeros(len(law.degrees)), ca.SX.zeros(len(law.degrees))
         now[layout.dynamic.tolist()] = first
         ahead[layout.dynamic.tolist()] = first + 2.0 * AHEAD * rate * second
-        intervals = self._intervals(wanted, now, ahead)
+        intervals = self._intervals(commanded, now, ahead)
         chosen = most = RATE * (1.0 - rate)
         for low, high in intervals:
             chosen = _within(chosen, low, high)
@@ -112,10 +109,10 @@ class Governing:
         return TracedFunction(name, inputs, outputs, compiled=law.system.compiled)
 
     def _reference(self, time: ca.SX) -> ca.SX:
-        """R at a symbolic time of the reference."""
+        """Returns R at a symbolic time of the reference."""
         rows = [ca.SX(0, 1)]
-        for reference, own in with_degrees(self.references, self.law.degrees):
-            row = reference.expression(own, time)
+        for reference, degrees in with_degrees(self.references, self.law.degrees):
+            row = reference.expression(degrees, time)
             if row is None:
                 raise ReferenceSignalError(
                     f"a {type(reference).__name__} of so many pieces is no expression of time, "
@@ -124,37 +121,37 @@ class Governing:
             rows.append(row)
         return ca.vertcat(*rows)
 
-    def _intervals(self, wanted: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
-        """The least and the largest s'' by speeds, by other limits ahead of time, and now.
+    def _intervals(self, commanded: ca.SX, now: ca.SX, ahead: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+        """Returns the allowed intervals of s'' by speeds, by other limits ahead of time, and now.
 
         Args:
-            wanted: ubar of (28) for s'' = 0, shape (p, 1).
+            commanded: ubar of (28) for s'' = 0, shape (p, 1).
             now: d ubar / d s'', shape (p, 1).
             ahead: The same with its effect AHEAD of time.
         """
         structure = self.law.structure
         limited = LimitedSignals(structure, self.limits)
-        control, _ = structure.control_for(wanted)
+        control, _ = structure.control_for(commanded)
         slope_now, slope = (
-            structure.control_for(wanted + effect)[0] - control for effect in (now, ahead)
+            structure.control_for(commanded + effect)[0] - control for effect in (now, ahead)
         )
-        own, by = limited.by_control()
-        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope)
+        free, by = limited.by_control()
+        values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope)
         sizes = np.minimum(np.abs(limited.low), np.abs(limited.high))
         bounds = ca.SX(limited.low), ca.SX(limited.high)
         at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
         later = _interval(values, slopes, *bounds, sizes)
-        own, by = limited.rates_of_states()
+        free, by = limited.rates_of_states()
         speeds = self.law.system.state[limited.states]
         low = APPROACH * (limited.state_low - speeds)
         high = APPROACH * (limited.state_high - speeds)
         sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
-        values, slopes = own + ca.mtimes(by, control), ca.mtimes(by, slope_now)
+        values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope_now)
         return [_interval(values, slopes, ca.SX(low), ca.SX(high), sizes), later, at_once]
 
 
 def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
-    """A value within an interval; the middle of an empty one."""
+    """Clips a value to an interval; returns the middle of an empty interval."""
     inside = ca.fmax(low, ca.fmin(high, value))
     return ca.if_else(low <= high, inside, (low + high) / 2.0)
 
@@ -162,15 +159,15 @@ def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
 def _interval(
     values: ca.SX, slopes: ca.SX, low: ca.SX, high: ca.SX, sizes: FloatArray
 ) -> tuple[ca.SX, ca.SX]:
-    """The least and the largest a with low <= values + slopes a <= high.
+    """Returns the least and the largest a with low <= values + slopes a <= high.
 
     Args:
         values, slopes, low, high: Expressions, shape (k, 1).
         sizes: The sizes of the limits, shape (k,).
     """
     least, most = ca.SX(-FREE), ca.SX(FREE)
-    for i, known in enumerate(sizes.tolist()):
-        size = known if np.isfinite(known) and known > 0.0 else 1.0
+    for i, limit in enumerate(sizes.tolist()):
+        size = limit if np.isfinite(limit) and limit > 0.0 else 1.0
         acts = ca.fabs(slopes[i]) > SMALL * size
         inverse = ca.if_else(acts, 1.0 / slopes[i], 0.0)
         for bound, is_upper in ((low[i], False), (high[i], True)):

@@ -4,24 +4,24 @@ import casadi as ca
 
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-STEPS, LARGER = 10, 5
-"""The number of steps, and for how many unknowns there is one more: so errors of about one fall
-below 1e-6, of 14 unknowns below 1e-5."""
+INTERIOR_POINT_STEPS, UNKNOWNS_PER_STEP = 10, 5
+"""The number of steps, and the number of unknowns for which one more is taken. Errors of about one
+fall below 1e-6; with 14 unknowns below 1e-5."""
 
 CLOSEST = 1e-13
 """The least distance from a bound."""
 
 DONE = 1e-12
-"""The mean of the products of slacks and multipliers at which x does not change any more."""
+"""The mean of the products of slacks and multipliers below which x is not changed any more."""
 
 BOUNDARY = 0.995
-"""The share of the way to the nearest bound that a step goes at most."""
+"""The largest step, relative to the distance to the nearest bound."""
 
 
 def nearest_within(
     metric: ca.SX, goal: ca.SX, rows: ca.SX, bounds: ca.SX, softness: float
 ) -> ca.SX:
-    """x next to a goal: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and A x <= b + d z.
+    """Returns x close to g: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and A x <= b + d z.
 
     The last bounds are soft: each gives way by d times its multiplier z. By Mehrotra's primal-dual
     interior-point method (Nocedal and Wright, Numerical Optimization, 2006, section 16.6) from
@@ -44,11 +44,11 @@ def nearest_within(
     symbols = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
     after = _step(**symbols, softness=softness)
     step = ca.Function("step", list(symbols.values()), after, {"cse": True})
-    found = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
-    found.append(ca.SX.ones(count))
-    for _ in range(STEPS + size // LARGER):
-        found = list(step(metric, goal, rows, bounds, *found))
-    return found[0]
+    iterate = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
+    iterate.append(ca.SX.ones(count))
+    for _ in range(INTERIOR_POINT_STEPS + size // UNKNOWNS_PER_STEP):
+        iterate = list(step(metric, goal, rows, bounds, *iterate))
+    return iterate[0]
 
 
 def _step(
@@ -102,6 +102,6 @@ def _step(
     # At round-off products vanish; then nothing changes any more.
     t, goes_on = BOUNDARY * length(*step), mean > DONE
     return [
-        one + ca.if_else(goes_on, t * change, 0.0)
-        for one, change in zip((x, s, u, l, z), step, strict=True)
+        value + ca.if_else(goes_on, t * change, 0.0)
+        for value, change in zip((x, s, u, l, z), step, strict=True)
     ]

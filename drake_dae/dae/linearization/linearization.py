@@ -33,7 +33,7 @@ def linearize(
     structure: ConstraintStructure | None = None,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """The linear models of a plant from its control u to its controlled outputs z.
+    """Linearizes a plant from its control u to its controlled outputs z.
 
     Exogenous signals are at rest at their parameters' values, unless `parameters` say otherwise.
 
@@ -53,8 +53,8 @@ def linearize(
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     plant = _PlantModel(structure, state, system.parameter_vector(parameters))
     point = plant.at(u)
-    still = np.zeros((p, system.num_states + system.num_constraints))
-    return plant.linearization(point, still, np.eye(p), system.control_signals)
+    no_feedback = np.zeros((p, system.num_states + system.num_constraints))
+    return plant.linearization(point, no_feedback, np.eye(p), system.control_signals)
 
 
 @checked(ModelError)
@@ -65,7 +65,7 @@ def linearize_loop(
     *,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """The linear models of a plant under the law (28), from R to the controlled outputs z.
+    """Linearizes a plant under the law (28), from R to the controlled outputs z.
 
     All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With r_i^(j)
     = s^j r_i the transfer matrix is the identity if the plant is the model of the law.
@@ -87,7 +87,7 @@ def linearize_loop(
             f"{law.system.name}: a law with integral action has a state of its own; convert the "
             "closed loop's diagram to AutoDiffXd for Drake's Linearize instead"
         )
-    system, own = law.system, law.all_parameters()
+    system, values = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
     plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
     n, m, p = system.num_states, system.num_constraints, system.num_controls
@@ -96,8 +96,8 @@ def linearize_loop(
     slope = law.function.derivative(law.function.output_names.index("control"), moving)
     free = plant.at(np.zeros(p))
     # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
-    first = law.function(plant.state, R, *measured, own)[0].copy()
-    gains = slope(plant.state, R, *measured, own)[0].reshape(p, -1).copy()
+    first = law.function(plant.state, R, *measured, values)[0].copy()
+    gains = slope(plant.state, R, *measured, values)[0].reshape(p, -1).copy()
     by_force = gains[:, n + R.size :] if measured else np.zeros((p, m))
     around = np.eye(p) - by_force @ plant.by_control[n:]
     if smallest_singular_value(around) < SINGULAR:
@@ -108,7 +108,7 @@ def linearize_loop(
     control = np.linalg.solve(around, first + by_force @ free.constraint_input)
     point = plant.at(np.asarray(control, dtype=np.float64))
     if measured:
-        gains = slope(plant.state, R, point.constraint_input, own)[0].reshape(p, -1).copy()
+        gains = slope(plant.state, R, point.constraint_input, values)[0].reshape(p, -1).copy()
     feedback = np.hstack([gains[:, :n], by_force])
     return plant.linearization(point, feedback, gains[:, n : n + R.size], law.reference_signals)
 
@@ -227,16 +227,16 @@ class _PlantModel:
         x, v = system.state, symbols["constraint_input"]
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, symbols["control"])
         balance -= ca.mtimes(system.mass_matrix, symbols["rate"])
-        kept = ca.mtimes(structure.elimination.constraint_gradient, symbols["rate"])
-        kept += self._carried
+        constraint_rate = ca.mtimes(structure.elimination.constraint_gradient, symbols["rate"])
+        constraint_rate += self._carried
         outputs = {
             "balance": ca.jacobian(balance, x),
-            "kept": ca.jacobian(kept, x),
+            "kept": ca.jacobian(constraint_rate, x),
             "k": ca.jacobian(system.k, x),
             "z": ca.jacobian(system.outputs(v), x),
             "m": system.m,
         }
-        slope, kept_slope, k_slope, z_slope, z_force = self._values(
+        slope, constraint_slope, k_slope, z_slope, z_force = self._values(
             outputs,
             rate=point.rate,
             constraint_input=point.constraint_input,
@@ -255,7 +255,7 @@ class _PlantModel:
             E, A + B @ feedback, B @ forward, C, no_feedthrough, unknowns, *signals
         )
         # On N*: (dx', dv) = moved dx + by_control du, and dv out of du.
-        moved = self._solve(np.vstack([slope, -kept_slope]))
+        moved = self._solve(np.vstack([slope, -constraint_slope]))
         of_x, of_v = feedback[:, :n], feedback[:, n:]
         around = np.eye(p) - of_v @ self.by_control[n:]
         control_by_state = np.linalg.solve(around, of_x + of_v @ moved[n:])

@@ -15,7 +15,7 @@ ComplexArray = np.typing.NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """E x' = A x + B u, z = C x + D u, for small deviations from an operating point.
+    """A linear model E x' = A x + B u, z = C x + D u, for small deviations.
 
     Attributes:
         E: Shape (k, k); singular in a descriptor form, the identity in a minimal one.
@@ -36,7 +36,7 @@ class LinearModel:
     output_signals: tuple[Signal, ...]
 
     def response(self, s: complex) -> ComplexArray:
-        """The transfer matrix C (s E - A)^-1 B + D at a complex frequency in 1/s, shape (p, q).
+        """Returns the transfer matrix C (s E - A)^-1 B + D at a frequency s in 1/s, shape (p, q).
 
         Raises:
             ModelError: s is a pole.

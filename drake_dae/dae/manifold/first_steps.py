@@ -23,7 +23,7 @@ it is shorter than usual by this factor."""
 
 
 def trace_first_steps(residual: Residual) -> TracedFunction:
-    """The result of the first Newton steps from a state, all with the gradients at that state.
+    """Traces the first Newton steps from a state, all with the gradients at that state.
 
     The outputs are the outcome of `_followed` and the lengths of the steps (in states over their
     scale), the state that they reach, and the first step. The result is not valid where gradients
@@ -33,8 +33,8 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     usual = positive(residual.lengths)
     state, p, scale = system.state, system.parameter_symbol, ca.SX(residual.scale)
     # The steps hold them often: common subexpressions are removed once here, not from the whole.
-    left, gradient = ca.cse([residual.expression, residual.gradient])
-    function = ca.Function("residual", [state, p], [left], {"cse": False})
+    expression, gradient = ca.cse([residual.residual_expression, residual.gradient])
+    function = ca.Function("residual", [state, p], [expression], {"cse": False})
     (step_for, pivots), steps = shortest_step(gradient, scale), []
     for _ in range(NEWTON_STEPS):
         steps.append(scale * step_for(function(state, p)))
@@ -43,8 +43,8 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     unit = ca.fmax(scale, ca.fabs(start))
     lengths = [ca.norm_2(step / scale) for step in steps]
     sizes = [ca.norm_2(step / unit) for step in steps[:2]]
-    found, outcome = _followed(start, steps, lengths, *sizes)
-    outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": found, "step": steps[0]}
+    moved, outcome = _followed(start, steps, lengths, *sizes)
+    outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
     # A cheap test in place of the sines, which are computed only where this one fails.
     doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / usual[i] for i in heads])) - DOUBT
     return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
@@ -53,7 +53,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
 def _followed(
     start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """The state that `newton` reaches from a start by these first steps, and the outcome.
+    """Returns the state that `newton` reaches by these first steps, and the outcome.
 
     Args:
         start: The state, shape (n, 1).
@@ -65,15 +65,15 @@ def _followed(
     at_start = size <= ROUNDING
     after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
     goes_on = ca.logic_and(at_start, lengths[0] > 0)
-    found = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
+    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
     for number in range(1, len(steps)):
         shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
         goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
         goes_on = ca.logic_and(goes_on, lengths[number] > 0)
-        found += ca.if_else(goes_on, steps[number], 0)
+        moved += ca.if_else(goes_on, steps[number], 0)
     ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
     # A first step of length zero does not tell whether the start is consistent.
     moves = ca.logic_or(after_one, lengths[0] > 0)
     outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
     stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
-    return found, ca.if_else(stays, STAYS, outcome)
+    return moved, ca.if_else(stays, STAYS, outcome)

@@ -13,35 +13,29 @@ from drake_dae.dae.manifold.search import CONSISTENT, ConsistentStateSearch
 from drake_dae.dae.manifold.settling import Settling
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import norm
 
 FLOOR = 1e-12
 """A distance from N* that is round-off even if all states are zero."""
 
 
-class Manifold:
-    """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
+class Manifold(Residual):
+    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4).
 
     Args:
         system: The system (1)-(3).
         chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
 
     Attributes:
-        residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
-        residual_signals: Its names and units.
-        residual_function: The same as a function of state and parameters.
+        searched: `project` where `first_steps` did not converge; see `ConsistentStateSearch`. For
+            the other attributes see `Residual`.
     """
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
-        self.system = system
-        self._residual = Residual(system, chains)
-        self.residual_expression = self._residual.expression
-        self.residual_signals = self._residual.signals
-        self.residual_function = self._residual.function
-        self._first_steps = trace_first_steps(self._residual)
-        self._search = ConsistentStateSearch(self._residual, self._first_steps)
-        self._settling = Settling(system, self._residual)
+        super().__init__(system, chains)
+        self._first_steps = trace_first_steps(self)
+        self.searched = ConsistentStateSearch(self, self._first_steps).searched
+        self._settling = Settling(system, self)
 
     @property
     def dimension(self) -> int:
@@ -49,7 +43,7 @@ class Manifold:
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
+        """Returns the constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
 
         Args:
             state: x, shape (n,).
@@ -57,29 +51,17 @@ class Manifold:
         """
         return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
-    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
-        return self._residual.gradients(state, parameters)
-
-    @property
-    def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale.
-
-        A function of the state, a second state at which the gradients are taken, and parameters.
-        """
-        return self._residual.newton_step
-
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
-        """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.
+        """Returns whether a state is on N* up to round-off: whether Newton's step is short.
 
         The arguments are those of `residual`.
         """
         x, p = self._state(state), self.system.parameter_vector(parameters)
         reach = float(self._first_steps.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
-            return reach <= CONSISTENT * norm(x / self._residual.scale) + FLOOR
+            return reach <= CONSISTENT * norm(x / self.scale) + FLOOR
         # Dependent gradients, a residual of zero, or one that no state changes.
-        return self._residual.size(x, p) <= CONSISTENT
+        return self.relative_size(x, p) <= CONSISTENT
 
     def project(
         self,
@@ -87,14 +69,14 @@ class Manifold:
         parameters: ArrayLike | None = None,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """The consistent state next to a given one, to round-off, by Newton's method.
+        """Returns the consistent state next to a state, to round-off, by Newton's method.
 
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
-            crosses: A function that says whether the system passes a singular configuration near a
-                state. The directions that are lost there are then left out of the projection. None
-                if it passes none.
+            crosses: A function that returns whether the motion crosses a singular configuration
+                close to a state. The projection then ignores the directions in which the
+                constraints lose their rank. None without singular configurations.
 
         Returns:
             The consistent state, shape (n,).
@@ -112,14 +94,14 @@ class Manifold:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` without checks of its arguments; the state itself if it is consistent."""
-        found = self.first_steps(start, p)
-        if found is None:
+        """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
+        moved = self.first_steps(start, p)
+        if moved is None:
             return self.searched(start, p, crosses)
-        return found if found is start else found.copy()
+        return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """The first few Newton steps of `project`, for a simulation; the arguments are not checked.
+        """Takes the first few Newton steps of `project`, without checks of arguments.
 
         Args:
             start: The state, shape (n,).
@@ -134,29 +116,14 @@ class Manifold:
         state[...] = start
         parameters[...] = p
         is_valid = function.run()
-        sizes, found, _ = function.outputs
+        sizes, moved, _ = function.outputs
         outcome = sizes.item(0)
         if is_valid and outcome == FOUND:
-            return found
+            return moved
         return start if outcome == STAYS and function.is_finite else None
 
-    def searched(
-        self,
-        start: FloatArray,
-        p: FloatArray,
-        crosses: Callable[[FloatArray], bool] | None = None,
-    ) -> FloatArray:
-        """`project` where `first_steps` did not converge.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-            crosses: As for `project`.
-        """
-        return self._search.searched(start, p, crosses)
-
     def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The consistent state next to a start that a user gave, found level by level.
+        """Returns the consistent state next to a user's start, computed level by level.
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no
@@ -169,8 +136,8 @@ class Manifold:
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
             return near.copy()  # It was there up to round-off, which no level would move.
-        found = self._settling.settled(start, p)
-        return self.project(start if found is None else found, p)
+        settled = self._settling.settled(start, p)
+        return self.project(start if settled is None else settled, p)
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""

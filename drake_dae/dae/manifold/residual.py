@@ -16,18 +16,18 @@ from drake_dae.trace.round_off import positive
 
 
 class Residual:
-    """L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, constraint-major, and its gradients.
+    """The residual L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, and its gradients.
 
     Args:
         system: The system (1)-(3).
         chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
 
     Attributes:
-        expression: The residual, shape (sum r_i, 1).
+        residual_expression: The residual, shape (sum r_i, 1).
         gradient: Its derivative by the state, shape (sum r_i, n).
         layout: Where the derivatives of each constraint stand.
-        signals: Names and units of the residual.
-        function: The residual as a function of state and parameters.
+        residual_signals: Names and units of the residual.
+        residual_function: The residual as a function of state and parameters.
         scale: How large the states are in use, shape (n,).
         lengths: The lengths of the gradients at the nominal state, over the scale of the states; 0
             if they are not finite there. Shape (sum r_i,).
@@ -35,11 +35,13 @@ class Residual:
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         self.system = system
-        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])  # (4)
+        self.residual_expression = ca.vertcat(
+            ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains]
+        )  # (4)
         self.layout = DerivativeLayout(tuple(len(chain) for chain in chains))
-        self.signals = self.layout.chain_signals(system.constraint_output_signals)
-        self.gradient = ca.jacobian(self.expression, system.state)
-        self.function = system.trace("manifold", {"residual": self.expression})
+        self.residual_signals = self.layout.chain_signals(system.constraint_output_signals)
+        self.gradient = ca.jacobian(self.residual_expression, system.state)
+        self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
         outputs = {"gradient": self.gradient}
         self._gradient = system.trace("manifold gradient", outputs, often=False)
         self.scale = system.scale
@@ -49,27 +51,32 @@ class Residual:
         self.lengths: FloatArray = np.linalg.norm(gradients, axis=1)
 
     def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The gradients at a state, shape (sum r_i, n); with the default parameters if None."""
+        """Returns the gradients C of the residual at a state, shape (sum r_i, n).
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
         values = self._gradient(state, self.system.parameter_vector(parameters))[0]
         return values.reshape(-1, self.system.num_states)
 
     @cached_property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale.
+        """The Newton step of least norm from a state, divided by the scale of the states.
 
         A function of the state, a second state at which the gradients are taken, and parameters.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
-        gradient = ca.substitute(ca.jacobian(self.expression, state), state, other)
+        gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
         scale = ca.SX(self.scale)
-        step = shortest_step(gradient, scale)[0](self.expression)
+        step = shortest_step(gradient, scale)[0](self.residual_expression)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
-    def size(self, state: FloatArray, parameters: FloatArray) -> float:
-        """The residual divided by its gradient over the scale of the states."""
-        residual = self.function.evaluate(state, parameters)[0]
+    def relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
+        """Returns the norm of the residual, each entry divided by its scaled gradient."""
+        residual = self.residual_function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0
         length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)

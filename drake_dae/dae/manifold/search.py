@@ -38,7 +38,7 @@ ITERATIONS = 10
 
 
 class ConsistentStateSearch:
-    """Newton's method, then least squares; at singular configurations a pseudoinverse.
+    """Searches a consistent state by Newton's method, then by least squares or a pseudoinverse.
 
     Args:
         residual: What is zero on N*.
@@ -59,7 +59,7 @@ class ConsistentStateSearch:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` where `first_steps` did not converge.
+        """Acts as `project` from a state from which `first_steps` did not converge.
 
         Args:
             start: The state, shape (n,).
@@ -67,36 +67,36 @@ class ConsistentStateSearch:
             crosses: As for `project`.
         """
         function = self._first_steps
-        sizes, found, _ = function.evaluate(start, p)
+        sizes, moved, _ = function.evaluate(start, p)
         is_finite = function.is_finite
         if (
             is_finite
             and sizes.item(1) == 0.0
-            and not self._residual.function.evaluate(start, p)[0].any()
+            and not self._residual.residual_function.evaluate(start, p)[0].any()
         ):
             return start
-        known = found.copy() if is_finite and sizes.item(0) == FOUND else None
+        consistent = moved.copy() if is_finite and sizes.item(0) == FOUND else None
         if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
-            known = self._nearly(start, p)
-        return self._searched(start, p) if known is None else known
+            consistent = self._nearly(start, p)
+        return self._searched(start, p) if consistent is None else consistent
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """The consistent state next to one where the first few steps do not converge."""
+        """Returns the consistent state from Newton's method, or else from least squares."""
         scale = self._residual.scale
         z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
             # Gradients are dependent or steps diverge: least squares with decreasing residual.
             z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
-        found = scale * z
-        if converged and not np.array_equal(found, start):
-            return found
+        state = scale * z
+        if converged and not np.array_equal(state, start):
+            return state
         # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self._residual.size(found, p) <= CONSISTENT:
-            return found
-        residual = self._residual.function.evaluate(found, p)[0].copy()
-        if converged and self._first_steps.evaluate(found, p)[1].any():
-            return found
-        raise InconsistentStateError(self._why(found, p, residual), residual)
+        if self._residual.relative_size(state, p) <= CONSISTENT:
+            return state
+        residual = self._residual.residual_function.evaluate(state, p)[0].copy()
+        if converged and self._first_steps.evaluate(state, p)[1].any():
+            return state
+        raise InconsistentStateError(self._why(state, p, residual), residual)
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
@@ -109,7 +109,7 @@ class ConsistentStateSearch:
     def _is_near(
         self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
     ) -> bool:
-        """Whether the system passes a singular configuration near a state."""
+        """Returns whether the motion crosses a singular configuration close to a state."""
         return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
 
     def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
@@ -123,13 +123,13 @@ class ConsistentStateSearch:
         for _ in range(ITERATIONS):
             state = x * self._residual.scale
             gradients = self._residual.gradients(state, parameters) * self._residual.scale
-            left = self._residual.function(state, parameters)[0]
-            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(left))):
+            residual = self._residual.residual_function(state, parameters)[0]
+            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(residual))):
                 return None
             length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._residual.lengths))
-            if norm(left / length) > SMALL * size:
+            if norm(residual / length) > SMALL * size:
                 return None
-            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (left / length)
+            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (residual / length)
             x = x - step
             if norm(step) <= ROUND_OFF * size:
                 return x * self._residual.scale
@@ -142,7 +142,7 @@ class ConsistentStateSearch:
         length = positive(np.linalg.norm(gradients, axis=1))
 
         def residual(z: FloatArray) -> FloatArray:
-            return self._residual.function(scale * z, parameters)[0]
+            return self._residual.residual_function(scale * z, parameters)[0]
 
         def measure(z: FloatArray) -> float:
             return float(np.linalg.norm(residual(z) / length))
@@ -151,9 +151,9 @@ class ConsistentStateSearch:
         return None if steps is None else steps._replace(measure=measure)
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """Why a Newton iteration that ended at a state failed, in words."""
+        """Returns in words why a Newton iteration that ended at a state failed."""
         name = self._residual.system.name
-        values = zip(self._residual.signals, residual, strict=True)
+        values = zip(self._residual.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]
         if bad:
             return (
@@ -161,14 +161,14 @@ class ConsistentStateSearch:
                 "domain of the constraints"
             )
         worst = int(np.argmax(np.abs(residual)))
-        left = (
+        text = (
             f"{name}: no consistent state found near the given one; "
-            f"{self._residual.signals[worst].name} = {residual[worst]:.3g} is left where Newton's "
-            "method ends. "
+            f"{self._residual.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
+            "Newton's method ends. "
         )
         if are_dependent(self._residual.gradients(state, parameters) * self._residual.scale):
-            return left + (
+            return text + (
                 "The gradients of the constraints depend on each other there: the constraints "
                 "contradict each other, or start away from this state"
             )
-        return left + "Start nearer to the constraint, away from its singular states"
+        return text + "Start nearer to the constraint, away from its singular states"

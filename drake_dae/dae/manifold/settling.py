@@ -37,16 +37,16 @@ class Settling:
         """The consistent state next to one, to round-off; None if the method does not converge."""
         kinetic = self._kinetic
         if kinetic.does_no_work(start, parameters, self._residual.gradients(start, parameters)):
-            found = start.copy()
+            state = start.copy()
             moves = (
-                _settle_level(self._residual, found, rows, columns, parameters, (kinetic, depth))
+                _settle_level(self._residual, state, rows, columns, parameters, (kinetic, depth))
                 for rows, columns, depth in kinetic.levels
             )
             if all(moves):
-                return found
-        found = start.copy()
-        moves = (_settle_level(self._residual, found, *each, parameters) for each in self._levels)
-        return found if all(moves) else None
+                return state
+        state = start.copy()
+        moves = (_settle_level(self._residual, state, *level, parameters) for level in self._levels)
+        return state if all(moves) else None
 
 
 def _settle_level(
@@ -74,17 +74,17 @@ def _settle_level(
         x[columns] = scale * z
         return x
 
-    def left(z: FloatArray) -> FloatArray:
-        return residual.function(filled(z), parameters)[0][rows]
+    def level_residual(z: FloatArray) -> FloatArray:
+        return residual.residual_function(filled(z), parameters)[0][rows]
 
     def linearize(z: FloatArray) -> NewtonModel | None:
         x = filled(z)
         gradients = residual.gradients(x, parameters)[np.ix_(rows, columns)]
         if energy is None:
-            return shortest_steps(gradients * scale, left)
+            return shortest_steps(gradients * scale, level_residual)
         kinetic, depth = energy
         directions = kinetic.directions(x, parameters, gradients, depth)
-        return steps_along(gradients * scale, directions / scale[:, None], left)
+        return steps_along(gradients * scale, directions / scale[:, None], level_residual)
 
     z, converged = newton(state[columns] / scale, linearize)
     state[columns] = scale * z
@@ -94,11 +94,11 @@ def _settle_level(
 def _levels(layout: DerivativeLayout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
     """The rows of each order of derivatives, and the states that are new in them."""
     used = nonzeros(gradient.sparsity())
-    known = np.zeros(gradient.shape[1], dtype=bool)
+    taken = np.zeros(gradient.shape[1], dtype=bool)
     levels = []
     for order in range(max(layout.degrees, default=0)):
-        own = np.flatnonzero(layout.orders == order)
-        new = used[own].any(axis=0) & ~known
-        known |= new
-        levels.append((own, np.flatnonzero(new)))
+        rows = np.flatnonzero(layout.orders == order)
+        new = used[rows].any(axis=0) & ~taken
+        taken |= new
+        levels.append((rows, np.flatnonzero(new)))
     return levels

@@ -11,6 +11,7 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.trace.round_off import unit_rows
 from drake_dae.trace.smoothness import find_flaw
 
 TRANSVERSAL = 0.05
@@ -42,8 +43,8 @@ def check_completion(
             f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
             f"n - sum r_i - sum mu_i; got {got}"
         )
-    known = ca.vertcat(system.state, system.parameter_symbol)
-    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(known, s)]
+    allowed = ca.vertcat(system.state, system.parameter_symbol)
+    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
     if unknown:
         raise ModelError(
             f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
@@ -77,7 +78,7 @@ def check_completion(
     worst = -1 if margin.vanishing_row is None else margin.vanishing_row - chains.numel()
     if worst < 0:
         # The distance of each differential from the span of those before it.
-        rows = _unit_rows(margin.matrix * samples.scale)
+        rows = unit_rows(margin.matrix * samples.scale)
         worst = int(np.argmin(np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]))
     raise ModelError(
         f"{system.name}: the completion '{signals[worst].name}' = "
@@ -101,12 +102,12 @@ def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> 
         return check_completion(structure, chains, samples, ca.SX(0, 1))
     gradients = samples.values(gradient=ca.jacobian(chains, system.state))
     spaces = np.array(
-        [np.linalg.svd(_unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
+        [np.linalg.svd(unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
     )
     for matrix in _candidates(spaces):
         matrix = matrix / samples.scale
         # Rounded, so that ties go to the first state on every machine.
-        largest = np.argmax(np.round(_unit_rows(np.abs(matrix)), 6), axis=1)
+        largest = np.argmax(np.round(unit_rows(np.abs(matrix)), 6), axis=1)
         leading = matrix[np.arange(count), largest]
         factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
         xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
@@ -137,7 +138,7 @@ def _pivots(spaces: FloatArray) -> list[int]:
     for _ in range(spaces.shape[2]):
         # Rounded, as above.
         chosen.append(int(np.argmax(np.round(np.linalg.norm(rest, axis=2).min(axis=0), 6))))
-        direction = _unit_rows(rest[:, chosen[-1]])
+        direction = unit_rows(rest[:, chosen[-1]])
         rest -= np.einsum("kid,kd,ke->kie", rest, direction, direction)
     return sorted(chosen)
 
@@ -149,8 +150,3 @@ def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
     sign = {1.0: "", -1.0: "-"}
     name = " + ".join(sign.get(c, f"{c:.3g} ") + signal.name for c, signal in terms)
     return Signal(name.replace("+ -", "- "), units.pop() if len(units) == 1 else "")
-
-
-def _unit_rows(matrix: FloatArray) -> FloatArray:
-    length = np.linalg.norm(matrix, axis=-1, keepdims=True)
-    return matrix / np.where(length > 0.0, length, 1.0)

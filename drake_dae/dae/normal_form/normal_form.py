@@ -72,10 +72,10 @@ class NormalForm:
         chains = ca.vertcat(residual, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
-            found = choose_completion(structure, chains, samples)
+            chosen = choose_completion(structure, chains, samples)
         else:
-            found = check_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = found  # (22)
+            chosen = check_completion(structure, chains, samples, completion)
+        self.completion, self.completion_signals, self.margin = chosen  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
@@ -95,7 +95,7 @@ class NormalForm:
         return f"NormalForm('{self.system.name}', coordinates={names})"
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Phi(x) = (y, zeta, xi) of (20)-(22).
+        """Returns Phi(x) = (y, zeta, xi) of (20)-(22).
 
         Args:
             state: x, shape (n,), on N* or not.
@@ -107,7 +107,7 @@ class NormalForm:
         return self._coordinates(state, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """dPhi/dx, shape (n, n); singular where Phi is no change of coordinates, see the class.
+        """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates.
 
         Args:
             state: x, shape (n,).
@@ -121,7 +121,7 @@ class NormalForm:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
+        """Returns x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
         The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
         angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
@@ -130,7 +130,7 @@ class NormalForm:
 
         Args:
             coordinates: (y, zeta, xi), shape (n,).
-            guess: A state near the wanted one, shape (n,); the nominal consistent state if None.
+            guess: A state near the solution, shape (n,); the nominal consistent state if None.
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
@@ -144,9 +144,9 @@ class NormalForm:
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
         p = self.system.parameter_vector(parameters)
-        found = self._newton(x, target, p)  # (24)
-        if found is not None:
-            return found
+        solution = self._newton(x, target, p)  # (24)
+        if solution is not None:
+            return solution
         start, first = self._at(x, p)
         if not np.all(np.isfinite(start)):
             raise ModelError(
@@ -156,9 +156,9 @@ class NormalForm:
         reached, stride = 0.0, 0.5
         while reached < 1.0:
             share = min(1.0, reached + stride)
-            found = self._newton(x, start + share * (target - start), p)
-            if found is not None:
-                x, reached, stride = found, share, 2.0 * stride
+            solution = self._newton(x, start + share * (target - start), p)
+            if solution is not None:
+                x, reached, stride = solution, share, 2.0 * stride
             elif stride > 1e-4:
                 stride /= 2.0
             else:
@@ -172,17 +172,17 @@ class NormalForm:
         # Powers of 2, so that nothing is rounded.
         scale = np.exp2(np.ceil(np.log2(np.maximum(self._scale, np.abs(state)))))
 
-        def left(z: FloatArray) -> FloatArray:
+        def distance(z: FloatArray) -> FloatArray:
             return target - self._coordinates.evaluate(scale * z, parameters)[0]
 
         def linearize(z: FloatArray) -> NewtonModel | None:
             solve = _solver(self._at(scale * z, parameters)[1] * scale)
             if solve is None:
                 return None
-            return NewtonModel(lambda z: solve(left(z)), True)
+            return NewtonModel(lambda z: solve(distance(z)), True)
 
-        found, converged = newton(state / scale, linearize)
-        return scale * found if converged else None
+        solution, converged = newton(state / scale, linearize)
+        return scale * solution if converged else None
 
     def _out_of_reach(
         self,
@@ -192,15 +192,15 @@ class NormalForm:
         first: FloatArray,
         parameters: FloatArray,
     ) -> InconsistentStateError:
-        """Names the coordinate that weak directions of the Jacobian keep from its target."""
+        """Returns the error that names the coordinate which does not reach its target."""
         values, jacobian = self._at(state, parameters)
-        left = target - values
+        missing = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale
         rows[rows == 0.0] = 1.0
         weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
         weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
-        kept = weakest @ (weakest.T @ (left / rows))
-        worst = int(np.argmax(np.abs(kept * left / rows)))
+        blocked = weakest @ (weakest.T @ (missing / rows))
+        worst = int(np.argmax(np.abs(blocked * missing / rows)))
         message = (
             f"{self.system.name}: no way from the guess to the given coordinates: "
             f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
@@ -220,7 +220,7 @@ class NormalForm:
                 )
         else:
             message += "Start from a guess that is nearer, in the domain of the functions"
-        return InconsistentStateError(message, left)
+        return InconsistentStateError(message, missing)
 
     def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Phi and its Jacobian at a state."""

@@ -22,7 +22,7 @@ from drake_dae.errors import ReferenceSignalError
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ReferenceRows(Reference):
-    """Some rows of a reference, in any order.
+    """A reference that consists of some rows of another one, in any order.
 
     Attributes:
         reference: The reference.
@@ -36,10 +36,10 @@ class ReferenceRows(Reference):
     rows: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        known = range(self.reference.size)
-        if not self.rows or len(set(self.rows) & set(known)) != len(self.rows):
+        all_rows = range(self.reference.size)
+        if not self.rows or len(set(self.rows) & set(all_rows)) != len(self.rows):
             raise ReferenceSignalError(
-                f"rows must be distinct ones of 0 to {known[-1]}, got {self.rows}"
+                f"rows must be distinct ones of 0 to {all_rows[-1]}, got {self.rows}"
             )
 
     @property
@@ -65,18 +65,18 @@ class ReferenceRows(Reference):
 
     def _needed(self, degrees: Sequence[int]) -> list[int]:
         """The degree of each row of the whole reference."""
-        given = dict(zip(self.rows, degrees, strict=True))
-        return [given.get(row, 0) for row in range(self.reference.size)]
+        degree_of = dict(zip(self.rows, degrees, strict=True))
+        return [degree_of.get(row, 0) for row in range(self.reference.size)]
 
     def _places(self, degrees: Sequence[int]) -> list[int]:
-        """The places of the chosen rows' values among those of all."""
+        """Returns the indices of the selected rows' values among those of all rows."""
         first = np.cumsum([0, *[degree + 1 for degree in degrees]])
         return [int(first[row]) + k for row in self.rows for k in range(degrees[row] + 1)]
 
 
 @dataclass(frozen=True)
 class Assigned:
-    """A reference, and the indices of its outputs."""
+    """A reference with its name and the indices of its outputs."""
 
     name: str
     reference: Reference
@@ -86,7 +86,7 @@ class Assigned:
 def assigned(
     name: str, reference: Reference | float, outputs: Sequence[str], degrees: Sequence[int]
 ) -> Assigned:
-    """A reference and the outputs of a name; a number is a constant for each of them.
+    """Assigns a reference to the outputs of a name; a number is a constant for each of them.
 
     Args:
         name: The name.
@@ -102,41 +102,43 @@ def assigned(
     if not isinstance(reference, Reference):
         reference = ConstantReference([reference] * len(places))
     if reference.size != len(places):
-        listed = ", ".join(outputs[place] for place in places)
+        listed = ", ".join(outputs[i] for i in places)
         raise ReferenceSignalError(
             f"{reference.size} value{'s' * (reference.size > 1)} for {len(places)} "
             f"output{'s' * (len(places) > 1)}: {listed}"
         )
-    reference.derivatives([degrees[place] for place in places])
+    reference.derivatives([degrees[i] for i in places])
     return Assigned(name, reference, places)
 
 
 def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Reference]:
-    """References in the order of the outputs; each output needs one.
+    """Sorts references in the order of the outputs; each output needs one.
 
     Raises:
         ReferenceSignalError: An output has none, or two.
     """
     rows: dict[int, tuple[Assigned, int]] = {}
-    for one in references:
-        for row, place in enumerate(one.places):
-            if place in rows:
-                names = " and ".join(f"'{name}'" for name in (rows[place][0].name, one.name))
-                raise ReferenceSignalError(f"'{outputs[place]}' has two, by {names}")
-            rows[place] = one, row
-    left = [name for place, name in enumerate(outputs) if place not in rows]
-    if left:
+    for entry in references:
+        for row, i in enumerate(entry.places):
+            if i in rows:
+                first = rows[i][0].name
+                raise ReferenceSignalError(
+                    f"'{outputs[i]}' has two, by '{first}' and '{entry.name}'"
+                )
+            rows[i] = entry, row
+    missing = [name for i, name in enumerate(outputs) if i not in rows]
+    if missing:
         raise ReferenceSignalError(
-            f"missing: {', '.join(left)}; references are needed for {', '.join(outputs)}"
+            f"missing: {', '.join(missing)}; references are needed for {', '.join(outputs)}"
         )
-    return list(_runs([rows[place] for place in range(len(outputs))]))
+    return list(_runs([rows[i] for i in range(len(outputs))]))
 
 
 @checked(ReferenceSignalError)
 def references_by_name(
     references: Mapping[str, Reference | float], outputs: Sequence[str], degrees: Sequence[int]
 ) -> list[Reference]:
-    """References in the order of the outputs.
+    """Returns references in the order of the outputs.
 
     Args:
         references: Name -> reference, or a number for a constant.
@@ -147,50 +149,50 @@ def references_by_name(
         ReferenceSignalError: A name has no output, an output has no reference or two, or a
             reference does not fit or is not smooth enough.
     """
-    found = []
+    assignments = []
     for name, reference in references.items():
         try:
-            found.append(assigned(name, reference, outputs, degrees))
+            assignments.append(assigned(name, reference, outputs, degrees))
         except ReferenceSignalError as error:
             raise ReferenceSignalError(f"reference '{name}': {error}") from error
-    return in_order(found, outputs)
+    return in_order(assignments, outputs)
 
 
 def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The indices of the outputs of a name, shape (k,).
+    """Returns the indices of the outputs that a name denotes, shape (k,).
 
     Raises:
         ReferenceSignalError: It has none.
     """
     parts = [part.strip() for part in name.split(",")]
-    return [place for part in parts for place in _meant(part, outputs, degrees)]
+    return [i for part in parts for i in _meant(part, outputs, degrees)]
 
 
 def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The same for a single name."""
-    places = {output: place for place, output in enumerate(outputs)}
-    if name in places:
-        return [places[name]]
+    """Returns the indices of the outputs that a name without commas denotes."""
+    index = {output: i for i, output in enumerate(outputs)}
+    if name in index:
+        return [index[name]]
     group, _, letters = name.rpartition(".")
     chosen = [f"{group}.{letter}" for letter in letters]
-    if len(set(chosen)) == len(chosen) > 1 and all(one in places for one in chosen):
-        return [places[one] for one in chosen]
-    members = [place for output, place in places.items() if output.rpartition(".")[0] == name]
+    if len(set(chosen)) == len(chosen) > 1 and index.keys() >= set(chosen):
+        return [index[output] for output in chosen]
+    members = [i for output, i in index.items() if output.rpartition(".")[0] == name]
     if not name or not members:
         raise ReferenceSignalError(unknown_name("output", name, outputs))
-    highest = max(degrees[place] for place in members)
-    return [place for place in members if degrees[place] == highest]
+    highest = max(degrees[i] for i in members)
+    return [i for i in members if degrees[i] == highest]
 
 
 def _runs(rows: Sequence[tuple[Assigned, int]]) -> Iterator[Reference]:
-    """The references of rows, as few as possible."""
+    """Generates references for rows; successive rows of one reference are joined."""
     first = 0
     while first < len(rows):
-        one, row = rows[first]
+        entry, row = rows[first]
         last = first + 1
-        while last < len(rows) and rows[last] == (one, row + last - first):
+        while last < len(rows) and rows[last] == (entry, row + last - first):
             last += 1
-        is_whole = last - first == one.reference.size
+        is_whole = last - first == entry.reference.size
         chosen = tuple(range(row, row + last - first))
-        yield one.reference if is_whole else ReferenceRows(one.reference, chosen)
+        yield entry.reference if is_whole else ReferenceRows(entry.reference, chosen)
         first = last

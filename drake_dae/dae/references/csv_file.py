@@ -29,7 +29,7 @@ MOST = 1e15
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class CsvReference(SplineReference):
-    """Columns of a CSV file over its column of times, smoothed; held before and after.
+    """A smooth reference from columns of a CSV file; constant before the first and after the last.
 
     Between rows the columns go straight. The reference is that motion q, averaged over a window: a
     uniform B-spline over q at times that are `smoothing` apart, with order + 2 of them in a window.
@@ -81,7 +81,7 @@ class CsvReference(SplineReference):
 
     @cached_property
     def table(self) -> FloatArray:
-        """Times after the first one and the columns, shape (k, 1 + size)."""
+        """The times since the first row, and the columns, shape (k, 1 + size)."""
         return _read(Path(self.file), [self.time, *self.columns])
 
     @cached_property
@@ -106,7 +106,7 @@ class CsvReference(SplineReference):
         return spline
 
     def _smoothed(self, step: float) -> TimeSpline:
-        """The spline with a given spacing of its points in s."""
+        """Returns the spline with a spacing of its points in s."""
         times = self.table[:, 0]
         count = float(np.ceil(times[-1] / step - 1e-9)) + 1
         if count > MOST_POINTS + 1:
@@ -137,8 +137,8 @@ class CsvReference(SplineReference):
 
     def _off(self, spline: TimeSpline) -> FloatArray:
         """The largest deviation of a spline from the rows, shape (size,)."""
-        found = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
-        return np.abs(found - self.table[:, 1:]).max(axis=0)
+        fitted = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
+        return np.abs(fitted - self.table[:, 1:]).max(axis=0)
 
     def _excess(self, spline: TimeSpline) -> float:
         """The largest ratio of deviation to tolerance."""
@@ -154,7 +154,7 @@ class CsvReference(SplineReference):
 
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:
-    """Columns of a file, the first one increasing from 0, shape (k, len(names))."""
+    """Reads columns of a file, the first one increasing from 0, shape (k, len(names))."""
     header, cells = read_cells(file)
     for name in names:
         if name not in header:
@@ -162,17 +162,17 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
     values = numbers_of(file, header, cells, names)
     steps = np.diff(values[:, 0])
     if not np.all(steps > 0):
-        place = int(np.argmin(steps > 0))
+        row = int(np.argmin(steps > 0))
         raise ReferenceSignalError(
-            f"'{file}': {names[0]} must increase, row {place + 3} has {values[place + 1, 0]:g} "
-            f"after {values[place, 0]:g}"
+            f"'{file}': {names[0]} must increase, row {row + 3} has {values[row + 1, 0]:g} "
+            f"after {values[row, 0]:g}"
         )
     values[:, 0] -= values[0, 0]
     return values
 
 
 def read_cells(file: Path) -> tuple[list[str], list[list[str]]]:
-    """The names of the columns of a file, and its other rows that are not empty.
+    """Reads the names of the columns of a file, and its other rows that are not empty.
 
     Raises:
         ReferenceSignalError: It cannot be read.
@@ -190,7 +190,7 @@ def read_cells(file: Path) -> tuple[list[str], list[list[str]]]:
 def numbers_of(
     file: Path, header: Sequence[str], cells: Sequence[Sequence[str]], names: Sequence[str]
 ) -> FloatArray:
-    """Columns as numbers, shape (k, len(names)) with k >= 2.
+    """Converts columns to numbers, shape (k, len(names)) with k >= 2.
 
     Raises:
         ReferenceSignalError: A cell is no number, or there are too few rows.
@@ -198,8 +198,8 @@ def numbers_of(
     places = [header.index(name) for name in names]
     values = np.empty((len(cells), len(names)))
     for index, row in enumerate(cells):
-        for column, place in enumerate(places):
-            cell = row[place] if place < len(row) else ""
+        for column, index_in_row in enumerate(places):
+            cell = row[index_in_row] if index_in_row < len(row) else ""
             values[index, column] = _number(cell, f"'{file}', row {index + 2}, {names[column]}")
     if len(values) < 2:
         raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")
@@ -207,9 +207,9 @@ def numbers_of(
 
 
 def _number(cell: str, where: str) -> float:
-    """A cell of the table as a finite number."""
+    """Converts a cell of the table to a finite number."""
     value = number_in(cell)
     if value is None or abs(value) > MOST:
-        wanted = "a number" if value is None else f"a number of at most {MOST:g}"
-        raise ReferenceSignalError(f"{where}: expected {wanted}, got '{cell[:40]}'")
+        expected = "a number" if value is None else f"a number of at most {MOST:g}"
+        raise ReferenceSignalError(f"{where}: expected {expected}, got '{cell[:40]}'")
     return value

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import vector
-from drake_dae.dae.references.reference import FormulaReference, Reference
+from drake_dae.dae.references.reference import FormulaReference, Reference, check_continuity
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.given import result_of
 
@@ -21,7 +21,7 @@ from drake_dae.trace.given import result_of
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class ConstantReference(FormulaReference):
-    """A reference that stays at given values.
+    """A reference with constant values.
 
     Attributes:
         values: The values in the outputs' units, shape (k,), or one number.
@@ -63,12 +63,10 @@ class SinusoidReference(FormulaReference):
     frequencies: ArrayLike
     phases: ArrayLike = 0.0
 
+    size = 1
+
     def __post_init__(self) -> None:
         settle(self, "amplitudes", "frequencies", "phases")
-
-    @property
-    def size(self) -> int:
-        return 1
 
     def rows(self, time: ca.SX) -> ca.SX:
         terms = np.transpose([self.amplitudes, self.frequencies, self.phases])
@@ -78,7 +76,7 @@ class SinusoidReference(FormulaReference):
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PointToPointReference(FormulaReference):
-    """A smooth move from rest at `start` to rest at `end`, held before and after.
+    """A smooth move from rest at `start` to rest at `end`; constant before and after.
 
     It is the polynomial of degree 2 order + 1 whose derivatives 1, ..., order vanish at both ends:
     order 2 is the quintic.
@@ -124,11 +122,7 @@ class PointToPointReference(FormulaReference):
         return ca.vertcat(*[a + (b - a) * blend for a, b in zip(first, last, strict=True)])
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this PointToPointReference has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        check_continuity(self, self.order, degrees)
 
 
 @checked(ReferenceSignalError)
@@ -155,18 +149,18 @@ class ExpressionReference(FormulaReference):
     parameters: Mapping[str, ArrayLike | ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = {}
+        parameters = {}
         for name, value in self.parameters.items():
             if not isinstance(value, ca.SX):
                 what = f"parameter '{name}'"
                 value = vector(what, np.atleast_1d(value), None, ReferenceSignalError)
-            known[name] = value
-        object.__setattr__(self, "parameters", MappingProxyType(known))
+            parameters[name] = value
+        object.__setattr__(self, "parameters", MappingProxyType(parameters))
         time = ca.SX.sym("t")
         rows = self.rows(time)
-        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in known.values())))
-        own = {symbol.element_hash() for symbol in symbols}
-        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in own]
+        symbols = ca.symvar(ca.vertcat(time, *(ca.SX(v) for v in parameters.values())))
+        allowed = {symbol.element_hash() for symbol in symbols}
+        unknown = [s.name() for s in ca.symvar(rows) if s.element_hash() not in allowed]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
                 "a reference must be a column of expressions of the time and its parameters "
@@ -178,12 +172,12 @@ class ExpressionReference(FormulaReference):
         return int(self.rows(ca.SX.sym("t")).numel())
 
     def with_parameters(self, values: Mapping[str, ArrayLike | ca.SX]) -> "ExpressionReference":
-        own = {name: values.get(name, value) for name, value in self.parameters.items()}
-        return ExpressionReference(self.function, own)
+        changed = {name: values.get(name, value) for name, value in self.parameters.items()}
+        return ExpressionReference(self.function, changed)
 
     def rows(self, time: ca.SX) -> ca.SX:
-        given = {name: ca.SX(value) for name, value in self.parameters.items()}
-        function = partial(self.function, **given)
+        symbols = {name: ca.SX(value) for name, value in self.parameters.items()}
+        function = partial(self.function, **symbols)
         value = result_of("function", function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
@@ -194,32 +188,31 @@ class ExpressionReference(FormulaReference):
 
 
 def settle(reference: Reference, *names: str) -> None:
-    """Makes fields tuples of the same length; a single number serves all.
+    """Converts fields to tuples of the same length; a single number is repeated.
 
     Raises:
         ReferenceSignalError: They are not finite numbers, are empty, or have different lengths.
     """
     listed = ", ".join(names)
-    given = {name: getattr(reference, name) for name in names}
+    values = {name: getattr(reference, name) for name in names}
     try:
-        arrays = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
     except (TypeError, ValueError):
-        shown = next(iter(given.values())) if len(given) == 1 else given
+        shown = next(iter(values.values())) if len(values) == 1 else values
         raise ReferenceSignalError(f"{listed}: must be numbers, got {shown!r}") from None
     for name, array in arrays.items():
         if not array.size:
             raise ReferenceSignalError(f"{name}: empty, at least one number is needed")
         if array.ndim > 1 or not np.isfinite(array).all():
             raise ReferenceSignalError(
-                f"{name} must be finite numbers, shape (k,), got {given[name]!r}"
+                f"{name} must be finite numbers, shape (k,), got {values[name]!r}"
             )
     lengths = {name: array.size for name, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
-        found = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ReferenceSignalError(
-            f"{listed} need as many entries as each other, or one number for all: {found}"
+            f"{listed} need as many entries as each other, or one number for all: {counts}"
         )
     length = next(iter(lengths.values()), 1)
     for name, array in arrays.items():
-        values = tuple(float(value) for value in np.broadcast_to(array, length))
-        object.__setattr__(reference, name, values)
+        object.__setattr__(reference, name, tuple(np.broadcast_to(array, length).tolist()))

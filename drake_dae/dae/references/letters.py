@@ -64,7 +64,7 @@ _GLYPHS = {
 
 
 def strokes(text: str) -> Iterator[FloatArray]:
-    """The strokes of a text from left to right, shape (k, 2), in cells of the grid.
+    """Generates the strokes of a text from left to right, shape (k, 2), in cells of the grid.
 
     Small letters are written as capital ones.
 
@@ -73,10 +73,10 @@ def strokes(text: str) -> Iterator[FloatArray]:
     """
     if not text.strip():
         raise ReferenceSignalError("text: empty, at least one letter is needed")
-    left = 0.0
+    offset = 0.0
     for letter in text.upper():
         if letter == " ":
-            left += _SPACE + _GAP
+            offset += _SPACE + _GAP
             continue
         if letter not in _GLYPHS:
             raise ReferenceSignalError(
@@ -87,5 +87,5 @@ def strokes(text: str) -> Iterator[FloatArray]:
             for part in _GLYPHS[letter].split("/")
         ]
         for part in parts:
-            yield part + np.array([left, 0.0])
-        left += max(part[:, 0].max() for part in parts) + _GAP
+            yield part + np.array([offset, 0.0])
+        offset += max(part[:, 0].max() for part in parts) + _GAP

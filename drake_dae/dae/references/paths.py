@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive, vector
 from drake_dae.dae.references.formulas import settle
-from drake_dae.dae.references.reference import FormulaReference
+from drake_dae.dae.references.reference import FormulaReference, check_continuity
 from drake_dae.dae.references.travel import PathLimits, Travel, rest_to_rest
 from drake_dae.errors import ReferenceSignalError
 
@@ -40,7 +40,7 @@ class PathReference(FormulaReference):
 
     @abstractmethod
     def point(self, distance: ca.SX) -> ca.SX:
-        """p(s), shape (size, 1)."""
+        """Returns the point p(s) of the path, shape (size, 1)."""
 
     @cached_property
     def travel(self) -> Travel:
@@ -54,14 +54,14 @@ class PathReference(FormulaReference):
         travel = rest_to_rest(self.length, self.limits, self.order)
         time = ca.SX.sym("t")
         _, *derivatives = self._derivatives(travel.derivatives(time, 3))
-        peaks = ca.Function("peaks", [time], [ca.norm_2(one) for one in derivatives])
+        peaks = ca.Function("peaks", [time], [ca.norm_2(derivative) for derivative in derivatives])
         end, ramp = travel.duration, travel.ramp
         shares = np.linspace(0.0, 1.0, 401)
         moments = np.concatenate(
             [ramp * shares, ramp + (end - 2 * ramp) * shares, end - ramp * shares]
         )
-        found = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
-        excess = [peak / limit for peak, limit in zip(found, self.limits.values, strict=True)]
+        largest = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
+        excess = [peak / limit for peak, limit in zip(largest, self.limits.values, strict=True)]
         slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
         # The error between the samples is below 0.1 %.
         return travel if slower <= 1.0 + 1e-9 else travel.slower(1.001 * slower)
@@ -84,15 +84,12 @@ class PathReference(FormulaReference):
         return [ca.substitute(value, s, ca.vertcat(*along)) for value in values]
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if self.limits is not None and max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        if self.limits is not None:
+            check_continuity(self, self.order, degrees)
 
 
 def check_order(order: int, most: int = 12) -> None:
-    """Refuses an order that a path cannot have.
+    """Checks the number of continuous derivatives of a path.
 
     Raises:
         ReferenceSignalError: It is not from 2 to `most`.
@@ -174,6 +171,8 @@ class CircleReference(PathReference):
     start_time: float = 0.0
     order: int = 4
 
+    size = 2
+
     def __post_init__(self) -> None:
         _settle_center(self)
         positive("radius", self.radius, ReferenceSignalError)
@@ -185,10 +184,6 @@ class CircleReference(PathReference):
             )
         if self.period == 0.0 or self.turns == 0.0:
             raise ReferenceSignalError("period and turns must not be zero")
-
-    @property
-    def size(self) -> int:
-        return 2
 
     @property
     def length(self) -> float:
@@ -246,6 +241,8 @@ class SpiralReference(PathReference):
     start_time: float = 0.0
     order: int = 4
 
+    size = 2
+
     def __post_init__(self) -> None:
         _settle_center(self)
         positive("pitch", self.pitch, ReferenceSignalError)
@@ -257,10 +254,6 @@ class SpiralReference(PathReference):
             )
 
     @property
-    def size(self) -> int:
-        return 2
-
-    @property
     def length(self) -> float:
         low, high = sorted((self.start_radius, self.end_radius))
         b = self.pitch / tau
@@ -268,15 +261,14 @@ class SpiralReference(PathReference):
 
     def point(self, distance: ca.SX) -> ca.SX:
         b = self.pitch / tau
-        first = self.start_radius / b
         is_outward = self.start_radius < self.end_radius
         outward = distance if is_outward else self.length - distance
         low = min(self.start_radius, self.end_radius) / b
         a = ca.sqrt((low + 1) ** 2 + 2 * outward / b) - 1
-        angle = self.phase + a - first
+        angle = self.phase + a - self.start_radius / b
         return ca.DM(self.center) + b * a * ca.vertcat(ca.cos(angle), ca.sin(angle))
 
 
 def _settle_center(reference: CircleReference | SpiralReference) -> None:
     center = vector("center", reference.center, 2, ReferenceSignalError)
-    object.__setattr__(reference, "center", tuple(float(value) for value in center))
+    object.__setattr__(reference, "center", tuple(center.tolist()))

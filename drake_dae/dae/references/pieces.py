@@ -5,17 +5,18 @@ from bisect import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.reference import Reference, check_continuity
 from drake_dae.errors import ReferenceSignalError
 
 MOST_IN_EXPRESSION = 200
-"""The largest number of polynomials in a symbolic expression; longer references are tables."""
+"""The largest number of polynomials in the expression of most references."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,26 +35,26 @@ class PiecewisePolynomials:
 
     @cached_property
     def at(self) -> Callable[[float], FloatArray]:
-        """The function of the time in s, shape (rows,)."""
+        """The function that maps a time in s to the values, shape (rows,)."""
         breaks, factors, powers = self.breaks.tolist(), self.factors, self._powers
         first, last = breaks[0], breaks[-1]
 
         def evaluate(time: float) -> FloatArray:
-            place = bisect(breaks, time, 1, len(factors)) - 1
-            x = (min(max(time, first), last) - breaks[place]) / (breaks[place + 1] - breaks[place])
-            return factors[place] @ x**powers
+            piece = bisect(breaks, time, 1, len(factors)) - 1
+            x = (min(max(time, first), last) - breaks[piece]) / (breaks[piece + 1] - breaks[piece])
+            return factors[piece] @ x**powers
 
         return evaluate
 
     def at_all(self, times: FloatArray) -> FloatArray:
-        """The values at times in s, shape (len(times), rows)."""
+        """Returns the values at times in s, shape (len(times), rows)."""
         inside = np.clip(times, self.breaks[0], self.breaks[-1])
-        place = np.searchsorted(self.breaks[1:-1], inside, "right")
-        x = (inside - self.breaks[place]) / np.diff(self.breaks)[place]
-        return np.einsum("trp,tp->tr", self.factors[place], x[:, None] ** self._powers)
+        piece = np.searchsorted(self.breaks[1:-1], inside, "right")
+        x = (inside - self.breaks[piece]) / np.diff(self.breaks)[piece]
+        return np.einsum("trp,tp->tr", self.factors[piece], x[:, None] ** self._powers)
 
     def expression(self, time: ca.SX) -> ca.SX:
-        """The values at a symbolic time, shape (rows, 1)."""
+        """Returns the values at a symbolic time, shape (rows, 1)."""
         count, rows, size = self.factors.shape
         passed = [time >= moment for moment in self.breaks[1:-1]]
         chosen = ca.vertcat(1, *passed) - ca.vertcat(*passed, 0)
@@ -79,9 +80,12 @@ class PiecewiseReference(Reference):
 
     order: int
 
+    most_in_expression: ClassVar[int] = MOST_IN_EXPRESSION
+    """The largest number of polynomials in a symbolic expression; longer references are tables."""
+
     @abstractmethod
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         self._check(degrees)
@@ -90,11 +94,7 @@ class PiecewiseReference(Reference):
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
         self._check(degrees)
         pieces = self.pieces(degrees)
-        return pieces.expression(time) if len(pieces.factors) <= MOST_IN_EXPRESSION else None
+        return pieces.expression(time) if len(pieces.factors) <= self.most_in_expression else None
 
     def _check(self, degrees: Sequence[int]) -> None:
-        if max(degrees) > self.order:
-            raise ReferenceSignalError(
-                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
-                f"needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+        check_continuity(self, self.order, degrees)

@@ -52,7 +52,7 @@ class Reference(ABC):
 
     @abstractmethod
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        """Prepares r_1, r_1', ..., r_1^(mu_1), r_2, ... as a function of the time in s.
+        """Returns the function t -> (r_1, r_1', ..., r_1^(mu_1), r_2, ...), with t in s.
 
         Args:
             degrees: The degree mu of each covered output.
@@ -62,7 +62,7 @@ class Reference(ABC):
         """
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None without an expression.
+        """Returns the values at a symbolic time, shape (sum (mu_i + 1), 1), or None.
 
         Raises:
             ReferenceSignalError: The reference is not smooth enough for these degrees.
@@ -70,16 +70,16 @@ class Reference(ABC):
         return None
 
     def with_parameters(self, values: Mapping[str, Any]) -> "Reference":
-        """The same reference with other values of its parameters, or with columns of symbols."""
+        """Returns the same reference with other values of its parameters, or columns of symbols."""
         return self
 
     def beside(self, folder: Path) -> Self:
-        """The same reference with its file relative to a folder."""
+        """Returns the same reference with its file relative to a folder."""
         return self
 
     @property
     def remark(self) -> str:
-        """The approximations of its data, as text; empty if there are none."""
+        """A text on approximations of its data; empty if there are none."""
         return ""
 
 
@@ -89,10 +89,10 @@ class FormulaReference(Reference):
 
     @abstractmethod
     def rows(self, time: ca.SX) -> ca.SX:
-        """r(t), shape (size, 1)."""
+        """Returns r(t), shape (size, 1)."""
 
     def _check(self, degrees: Sequence[int]) -> None:
-        """Refuses references without derivatives up to the degrees."""
+        """Checks that the reference has derivatives up to the degrees."""
         time = ca.SX.sym("t")
         rows = self.rows(time)
         others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
@@ -119,10 +119,23 @@ class FormulaReference(Reference):
         return lambda time: value(time).copy()
 
 
+def check_continuity(reference: Reference, order: int, degrees: Sequence[int]) -> None:
+    """Checks that degrees do not exceed the number of continuous derivatives.
+
+    Raises:
+        ReferenceSignalError: A degree is above `order`.
+    """
+    if max(degrees) > order:
+        raise ReferenceSignalError(
+            f"this {type(reference).__name__} has {order} continuous derivatives, the law "
+            f"needs {max(degrees)}: pass order={max(degrees)} or more"
+        )
+
+
 def with_degrees(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> list[tuple[Reference, Sequence[int]]]:
-    """Each reference with the degrees of its outputs.
+    """Returns each reference with the degrees of its outputs.
 
     Args:
         references: The references, in the order of the outputs.
@@ -135,7 +148,7 @@ def with_degrees(
 def stack_references(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> Callable[[float], FloatArray]:
-    """All references as one function of the time in s; expressions are traced together.
+    """Combines references to one function of the time in s; expressions are traced together.
 
     Args:
         references: The references, in the order of the outputs.
@@ -162,7 +175,10 @@ def stack_references(
 
 
 def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
-    """An expression of time as a function of a float; the next call overwrites its value."""
+    """Compiles an expression of time to a function of a float.
+
+    The function reuses its result array: copy it to keep it.
+    """
     function = TracedFunction("reference", {"time": time}, {"R": rows})
     (moment,), (value,) = function.arguments, function.outputs
 
@@ -176,5 +192,5 @@ def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
 
 
 def not_finite(time: float, value: FloatArray) -> NonFiniteError:
-    """The error of a reference without a value at a time in s."""
+    """Returns the error of a reference that is not finite at a time in s."""
     return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)

@@ -59,14 +59,14 @@ class TimeSpline:
     @cached_property
     def differences(self) -> list[FloatArray]:
         """Delta^j c / step^j for j = 0, ..., order; the first and the last point repeated."""
-        rest = self.degree - 1
-        found = [np.pad(self.points, ((rest, rest), (0, 0)), mode="edge")]
-        while len(found) <= self.order:
-            found.append(np.diff(found[-1], axis=0) / self.step)
-        return found
+        repeated = self.degree - 1
+        orders = [np.pad(self.points, ((repeated, repeated), (0, 0)), mode="edge")]
+        while len(orders) <= self.order:
+            orders.append(np.diff(orders[-1], axis=0) / self.step)
+        return orders
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
-        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
         rows = {
             j: sliding_window_view(self.differences[j], self.degree - j + 1, axis=0)
             @ basis_pieces(self.degree - j).T
@@ -81,7 +81,7 @@ class TimeSpline:
 
 
 def basis_pieces(degree: int) -> FloatArray:
-    """The uniform B-splines on a span: entry (i, k) is the factor of x^i for its k-th point.
+    """Returns the uniform B-splines on a span: entry (i, k) is the factor of x^i for point k.
 
     By the recursion of Cox and de Boor, shape (degree + 1, degree + 1).
     """
@@ -117,7 +117,7 @@ class SplineReference(PiecewiseReference):
 def spline_within(
     points: FloatArray, limits: PathLimits, start_time: float, order: int, among: int | None = None
 ) -> TimeSpline:
-    """The fastest spline over points with derivatives within limits.
+    """Returns the fastest spline over points with derivatives within limits.
 
     Args:
         points: The points, shape (n, k).
@@ -126,32 +126,32 @@ def spline_within(
         order: How many derivatives are continuous.
         among: The number of columns with limits; None for all.
     """
-    rest = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
+    padded = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
     steps = [
-        (np.linalg.norm(np.diff(rest, j, axis=0), axis=1).max() / limit) ** (1 / j)
+        (np.linalg.norm(np.diff(padded, j, axis=0), axis=1).max() / limit) ** (1 / j)
         for j, limit in enumerate(limits.values, start=1)
     ]
     return TimeSpline(points, float(max(steps)), start_time, order)
 
 
 def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[int]]:
-    """Points along straight edges, no farther apart than a spacing, with the corners among them.
+    """Returns points along straight edges, no farther apart than a spacing, with all corners.
 
     Returns:
         The points, shape (n, k), and the edge of each; a corner belongs to the edge before it.
     """
-    found, edges = [corners[:1]], [0]
+    points, edges = [corners[:1]], [0]
     for edge, (first, last) in enumerate(pairwise(corners)):
         count = int(np.ceil(np.linalg.norm(last - first) / spacing - 1e-9))
-        found.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
+        points.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
         edges += [edge] * count
-    return np.concatenate(found), edges
+    return np.concatenate(points), edges
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PolylineReference(SplineReference):
-    """Straight edges between points, with rounded corners, from rest to rest.
+    """A path of straight edges between points, with rounded corners, from rest to rest.
 
     It leaves an edge at the distance `corner` before its end, and joins the next one at the same
     distance. It is a uniform B-spline over points on the edges, 2 corner / order apart: the speed
@@ -188,7 +188,7 @@ class PolylineReference(SplineReference):
 
 
 def settle_points(reference: Any) -> FloatArray:
-    """Makes the field `points` a tuple of rows, and returns it as an array, shape (n, k).
+    """Converts the field `points` to a tuple of rows, and returns it as an array, shape (n, k).
 
     Raises:
         ReferenceSignalError: They are not rows of finite numbers, fewer than two, or two in
@@ -200,17 +200,17 @@ def settle_points(reference: Any) -> FloatArray:
             "points must be two or more, as a list of rows of finite numbers, got shape "
             f"{points.shape}"
         )
-    rows = tuple(tuple(map(float, row)) for row in points)
+    rows = tuple(map(tuple, points.tolist()))
     object.__setattr__(reference, "points", rows)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     if not lengths.all():
-        place = int(np.argmin(lengths))
-        raise ReferenceSignalError(f"points {place} and {place + 1} are the same, {rows[place]}")
+        i = int(np.argmin(lengths))
+        raise ReferenceSignalError(f"points {i} and {i + 1} are the same, {rows[i]}")
     return points
 
 
 def settle_axes(reference: Any) -> None:
-    """Makes the fields of a drawing in a plane, and its two forces, pairs of numbers.
+    """Converts the vector fields of a drawing in a plane to pairs of numbers.
 
     Raises:
         ReferenceSignalError: They are none, or `along` and `up` are not two directions.
@@ -218,7 +218,7 @@ def settle_axes(reference: Any) -> None:
     names = ["origin", "along", "up"] + ["press"] * (reference.press is not None)
     for name in names:
         value = vector(name, getattr(reference, name), 2, ReferenceSignalError)
-        object.__setattr__(reference, name, tuple(float(number) for number in value))
+        object.__setattr__(reference, name, tuple(value.tolist()))
     if np.linalg.matrix_rank(np.array([reference.along, reference.up])) < 2:
         raise ReferenceSignalError(
             f"along and up must be two directions, got {reference.along!r} and {reference.up!r}"
@@ -226,7 +226,7 @@ def settle_axes(reference: Any) -> None:
 
 
 def check_spline(corner: float, order: int, length: float) -> None:
-    """Refuses invalid roundings.
+    """Checks the rounding of corners.
 
     Raises:
         ReferenceSignalError: The corner is not positive or very small, or the order out of range.
@@ -242,6 +242,6 @@ def check_spline(corner: float, order: int, length: float) -> None:
 
 
 def rounded_up(value: float) -> str:
-    """A positive number as text with three digits, rounded up."""
+    """Formats a positive number with three digits, rounded up."""
     text = f"{value:.3g}"
     return text if float(text) >= value else f"{1.01 * value:.3g}"

@@ -14,7 +14,7 @@ from drake_dae.errors import ReferenceSignalError
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PathLimits:
-    """The largest derivatives along a path: Euclidean norms over its outputs.
+    """The largest speed, acceleration and jerk along a path: Euclidean norms over its outputs.
 
     They limit the whole motion, so that a curve is slower than a line. The outputs must have one
     unit.
@@ -45,7 +45,7 @@ class PathLimits:
 
 @dataclass(frozen=True)
 class Travel:
-    """A distance from rest at 0 to rest at `length`.
+    """The distance along a path over time, from rest at 0 to rest at `length`.
 
     The speed rises during `ramp`, is constant, and falls in the same way:
 
@@ -72,7 +72,7 @@ class Travel:
         return self.length / self.speed + self.ramp
 
     def derivatives(self, time: ca.SX, degree: int) -> list[ca.SX]:
-        """s, s', ..., s^(degree) at a symbolic time in s after the start, for degree <= order.
+        """Returns s, s', ..., s^(degree) at a symbolic time in s since the start, degree <= order.
 
         The second half is the first one reversed: s^(k) has the sign (-1)^(k - 1) there.
         """
@@ -91,12 +91,12 @@ class Travel:
         return values
 
     def slower(self, factor: float) -> "Travel":
-        """The same with all times longer by a factor."""
+        """Returns the same travel with all times longer by a factor."""
         return replace(self, speed=self.speed / factor, ramp=self.ramp * factor)
 
 
 def rest_to_rest(length: float, limits: PathLimits, order: int) -> Travel:
-    """The shortest such travel along a straight line within limits.
+    """Returns the shortest such travel along a straight line within limits.
 
     With the peaks c1 and c2 of S' and S'' the ramp takes max(c1 v / a, sqrt(c2 v / j)), and the
     speed v is the largest with which both ramps fit into the length.

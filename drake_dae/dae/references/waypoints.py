@@ -63,7 +63,7 @@ class WaypointsReference(PiecewiseReference):
                 raise ReferenceSignalError(
                     f"times must increase from 0 or later, got {self.times!r}"
                 )
-            object.__setattr__(self, "times", tuple(float(time) for time in times))
+            object.__setattr__(self, "times", tuple(times.tolist()))
 
     @property
     def size(self) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,7 @@ CLOSER = (0.9, 0.99)
 
 @dataclass(frozen=True, eq=False)
 class ContactMargin:
-    """The distance of contacts from the Painleve paradox, over some states.
+    """The distance of frictional contacts from the Painleve paradox, over some states.
 
     Attributes:
         reserve: The smallest principal minor of A(x) over the contacts, each divided by its value
@@ -46,7 +47,7 @@ class ContactMargin:
 
 
 class ContactMargins:
-    """The margins of a system with frictional contacts at given states.
+    """Computes the contact margins of a system at states.
 
     Args:
         system: The system.
@@ -68,7 +69,7 @@ class ContactMargins:
     def at(
         self, state: FloatArray, parameters: FloatArray, time: float | None = None
     ) -> ContactMargin:
-        """The margin at one state, with values of all parameters."""
+        """Returns the margin at one state, for values of all parameters."""
         without = self._with_friction(parameters, 0.0)
         unit = self._direction(parameters)
         reserve = self._values(state, parameters)[1]
@@ -84,52 +85,50 @@ class ContactMargins:
         return ContactMargin(float(reserve.item()), critical, state, time)
 
     def over(self, samples: Samples, search: bool) -> ContactMargin:
-        """The smallest margin at sampled states and, downhill from the worst, between them."""
+        """Returns the smallest margin at samples and, downhill from the worst, between them."""
         p = self._system.parameter_values
-        found = sorted((self.at(state, p) for state in samples.states), key=_first)
-        worst = found[0]
+        margins = sorted((self.at(state, p) for state in samples.states), key=_first)
+        worst = margins[0]
         if not search:
             return worst
         box = ConsistentRegion(samples.manifold, surroundings(samples))
-        for start in found[:3]:
+        for start in margins[:3]:
             for better in self._downhill(box, start, p):
                 worst = min(worst, better, key=_first)
         return worst
 
     def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:
-        """The smallest margin along a motion, of which there is at least one state."""
+        """Returns the smallest margin along a motion of at least one state."""
         rows = zip(states, parameters, times.tolist(), strict=True)
         return min((self.at(*row) for row in rows), key=_first)
 
     def _downhill(
         self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray
     ) -> Iterator[ContactMargin]:
-        """States in the Painleve paradox with decreasing friction."""
+        """Generates states in the Painleve paradox with decreasing friction."""
         unit, best = self._direction(parameters), start
         for part in CLOSER:
             for _ in range(20):
                 factor = _first(best)
-                wanted = part * factor if np.isfinite(factor) else 1e3
-                values = self._with_friction(parameters, wanted * unit / max(unit))
-
-                def slope(
-                    state: FloatArray, values: FloatArray = values
-                ) -> tuple[float, FloatArray]:
-                    reserve, gradient = self._slope(state, values)
-                    if not self._slope.is_finite:
-                        return np.inf, np.zeros(state.size)
-                    return max(float(reserve.item()), 0.0), gradient
-
-                found = self.at(box.descend(slope, best.state), parameters)
-                if not _first(found) < factor:
+                size = part * factor if np.isfinite(factor) else 1e3
+                values = self._with_friction(parameters, size * unit / max(unit))
+                lower = self.at(box.descend(partial(self._reserve, values), best.state), parameters)
+                if not _first(lower) < factor:
                     break
-                best = found
+                best = lower
                 yield best
+
+    def _reserve(self, parameters: FloatArray, state: FloatArray) -> tuple[float, FloatArray]:
+        """The margin as far as it is positive, and its gradient."""
+        margin, gradient = self._slope(state, parameters)
+        if not self._slope.is_finite:
+            return np.inf, np.zeros(state.size)
+        return max(float(margin.item()), 0.0), gradient
 
     def _direction(self, parameters: FloatArray) -> FloatArray:
         """The coefficients of friction, or ones if all are zero."""
-        own = parameters[self._places]
-        return own if np.any(own) else np.ones(len(self._places))
+        friction = parameters[self._places]
+        return friction if np.any(friction) else np.ones(len(self._places))
 
     def _with_friction(self, parameters: FloatArray, friction: FloatArray | float) -> FloatArray:
         values = parameters.copy()

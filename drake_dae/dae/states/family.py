@@ -27,7 +27,7 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Deciding:
-    """Parameters for which an expression is zero at the defaults and not for other values.
+    """Parameters for which an expression is not zero, although it is zero at the defaults.
 
     Attributes:
         names: The parameters and derivatives of exogenous signals that decide alone; or, if only
@@ -54,7 +54,7 @@ class Deciding:
 
 
 class Family:
-    """Random members of a system, each a consistent state with its own parameters.
+    """Random members of a system: consistent states, each with parameters of its own.
 
     A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
     from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
@@ -69,7 +69,7 @@ class Family:
         self._system = manifold.system
 
     def deciding(self, acts: Callable[[FloatArray, FloatArray], bool]) -> Deciding | None:
-        """The parameters that decide whether an input acts that does not at the defaults.
+        """Returns the parameters for which an input acts that does not act at the defaults.
 
         Args:
             acts: (state, values of all parameters) -> whether it acts.
@@ -91,12 +91,14 @@ class Family:
             return member is not None and acts(*member)
 
         numbers = self._numbers
-        found = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
+        candidates = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
         # No parameter alone decides: those without which it does not act.
-        found = found or [n for n in numbers if not acts_with(n[1], others=values, those=defaults)]
+        candidates = candidates or [
+            n for n in numbers if not acts_with(n[1], others=values, those=defaults)
+        ]
         largest = [
             (name, places[int(np.argmax(np.abs(values[places] - defaults[places])))])
-            for name, places in found or numbers
+            for name, places in candidates or numbers
         ]
         return Deciding(
             tuple(name for name, _ in largest),
@@ -105,7 +107,7 @@ class Family:
         )
 
     def lost(self, determinant: Callable[[FloatArray, FloatArray], float]) -> Deciding | None:
-        """A parameter for which a determinant vanishes within given bounds, if there is one.
+        """Returns a parameter for which a determinant vanishes within the bounds, if there is one.
 
         Args:
             determinant: (state, values of all parameters) -> its sign; 0 if it vanishes.
@@ -133,21 +135,21 @@ class Family:
 
     @cached_property
     def _numbers(self) -> list[tuple[str, list[int]]]:
-        """The numbers to draw: parameters and derivatives of signals, with their places."""
+        """The parameters and derivatives of signals to draw, with their indices."""
         system = self._system
-        found, start, following = [], 0, sum(p.value.size for p in system.parameters)
+        entries, start, following = [], 0, sum(p.value.size for p in system.parameters)
         rates = []
         for p in system.parameters:
             size = p.value.size
             free = [start + i for i in range(size) if p.low[i] < p.high[i]]
             if free:
-                found.append((p.name, free))
+                entries.append((p.name, free))
             for order in range(1, len(p.derivatives) + 1):
                 if free:
                     rates.append((p.name + "'" * order, [following + i - start for i in free]))
                 following += size
             start += size
-        return found + rates
+        return entries + rates
 
     @cached_property
     def _members(self) -> list[tuple[FloatArray, FloatArray]]:
@@ -155,25 +157,26 @@ class Family:
             return []
         system, random = self._system, np.random.default_rng(0)
         low, high = system.parameter_box
-        defaults, found = system.parameter_values, []
+        defaults, members = system.parameter_values, []
         for number in range(MEMBERS):
             away = random.uniform(low, high) - defaults
             state = self._states[number % len(self._states)]
             for _ in range(_TRIES):
                 member = self._consistent(state, defaults + away)
                 if member is not None:
-                    found.append(member)
+                    members.append(member)
                     break
                 away *= _NEARER
-        return found
+        return members
 
     def _consistent(
         self, state: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """A consistent state near one for other numbers; None if there is none in the domain."""
+        """Returns a consistent state near a state for other parameters; None if there is none."""
         try:
-            found = self._manifold.project(state, parameters)
+            consistent = self._manifold.project(state, parameters)
         except InconsistentStateError:
             return None
-        fields = fields_at(self._system, found, parameters)
-        return (found, parameters) if all(np.all(np.isfinite(f)) for f in fields.values()) else None
+        fields = fields_at(self._system, consistent, parameters)
+        is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
+        return (consistent, parameters) if is_finite else None

@@ -44,7 +44,7 @@ class RankMargin:
 def find_margin(
     samples: Samples, matrix: ca.SX, round_off: Booleans | None = None, search: bool = False
 ) -> RankMargin:
-    """The smallest singular values of a matrix at sampled states and between them.
+    """Finds the smallest singular values of a matrix at sampled states and between them.
 
     If the determinant of a square matrix changes its sign on the way from the first state, it is
     zero on that way, unless N* is not connected or the determinant is infinite.
@@ -79,26 +79,26 @@ def find_margin(
 
 
 def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
-    """Whether a square matrix is regular at every sampled state."""
+    """Returns whether a square matrix is regular at every sampled state."""
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
     least = samples.system.least_margin
     return all(scaled.distance(state) >= least for state in samples.states)
 
 
 def surroundings(samples: Samples) -> Region:
-    """The box that the states span, within the region that they were drawn from."""
+    """Returns the box that the states span, within the region from which they were drawn."""
     low, high = samples.states.min(axis=0), samples.states.max(axis=0)
-    given = samples.consistent.region
-    if given is not None:
+    region = samples.consistent.region
+    if region is not None:
         # States without bounds may lie slightly beyond the random ones.
         more = 0.5 * (high - low)
-        low = np.where(np.isfinite(given.low), given.low, low - more)
-        high = np.where(np.isfinite(given.high), given.high, high + more)
+        low = np.where(np.isfinite(region.low), region.low, low - more)
+        high = np.where(np.isfinite(region.high), region.high, high + more)
     return Region(low, high)
 
 
 def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> FloatArray | None:
-    """The place where the determinant changes its sign on the way from the first state, if any."""
+    """Returns a state where the determinant changes its sign on the way from the first state."""
     here = samples.states[0]
 
     def sign(state: FloatArray) -> float:

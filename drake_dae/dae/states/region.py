@@ -20,7 +20,7 @@ _FLAT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The states low <= x <= high.
+    """The states x with low <= x <= high.
 
     Attributes:
         low: The lower bounds, shape (n,); -inf where there is none.
@@ -31,7 +31,7 @@ class Region:
     high: FloatArray
 
     def holds(self, state: FloatArray) -> bool:
-        """Whether a state is in the box."""
+        """Returns whether a state is in the region."""
         bounds = np.where(np.isfinite([self.low, self.high]), [self.low, self.high], 0.0)
         slack = _SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
         return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
@@ -41,7 +41,7 @@ class ConsistentRegion:
     """The consistent states in a region, with the default parameters.
 
     Args:
-        manifold: N*, or what is known of it.
+        manifold: N*, or the constraints known so far.
         region: The region; None for the whole of N*.
     """
 
@@ -50,7 +50,7 @@ class ConsistentRegion:
         self.region = region
 
     def project(self, guess: FloatArray) -> FloatArray:
-        """A consistent state in the region, near a guess.
+        """Returns a consistent state in the region, near a guess.
 
         Raises:
             InconsistentStateError: No consistent state is found in the region.
@@ -73,9 +73,9 @@ class ConsistentRegion:
         return state
 
     def draw(self, guess: FloatArray) -> FloatArray:
-        """A consistent state with the bounded states of a guess, if there is one.
+        """Returns a consistent state with the bounded states of a guess, if there is one.
 
-        So random values cover the bounds, whatever the constraints change.
+        So random values cover the region, although the projection changes other states.
 
         Raises:
             InconsistentStateError: No consistent state is found in the region.
@@ -84,9 +84,9 @@ class ConsistentRegion:
         if region is None:
             return self.project(guess)
         bounded = np.isfinite(region.low)
-        held = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
+        bounded_region = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
         try:
-            state = self.manifold.project(self._newton(held, guess))
+            state = self.manifold.project(self._newton(bounded_region, guess))
         except InconsistentStateError:
             return self.project(guess)
         return state if region.holds(state) else self.project(guess)
@@ -137,25 +137,25 @@ class ConsistentRegion:
     def _downhill(
         self, region: Region, state: FloatArray, gradient: FloatArray, width: FloatArray
     ) -> FloatArray:
-        """Against the gradient, along N* and not out of the box, in units of the box."""
+        """Returns the descent direction along N* that stays in the box, in units of the box."""
         rows = self.manifold.gradients(state) * width
         slope = gradient * width
-        held = np.zeros(state.size, dtype=bool)
+        fixed = np.zeros(state.size, dtype=bool)
         while True:
-            normal = np.vstack([rows, np.eye(state.size)[held]])
+            normal = np.vstack([rows, np.eye(state.size)[fixed]])
             length = np.linalg.norm(normal, axis=1)
             normal = normal[length > 0.0] / length[length > 0.0, None]
             direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
             edge = _SLACK * width
             blocked = (direction < 0.0) & (state <= region.low + edge)
             blocked |= (direction > 0.0) & (state >= region.high - edge)
-            if not np.any(blocked & ~held):
-                return np.where(held, 0.0, direction)
-            held |= blocked
+            if not np.any(blocked & ~fixed):
+                return np.where(fixed, 0.0, direction)
+            fixed |= blocked
 
     @staticmethod
     def _room(region: Region, state: FloatArray, step: FloatArray) -> float:
-        """The factor by which a step reaches the edge of the box."""
+        """Returns the factor by which a step reaches the boundary of the box."""
         edge = np.where(step < 0.0, region.low, region.high)
         moving = step != 0.0
         with np.errstate(over="ignore"):
@@ -186,8 +186,8 @@ def _bounded_step(
     """A short dx with C dx + r = 0; components are limited by the bounds."""
     step, free = np.zeros(low.size), low < high
     while free.any():
-        left = residual + gradient[:, ~free] @ step[~free]
-        step[free] = -np.linalg.lstsq(gradient[:, free], left)[0]
+        remaining = residual + gradient[:, ~free] @ step[~free]
+        step[free] = -np.linalg.lstsq(gradient[:, free], remaining)[0]
         past = free & ((step < low) | (step > high))
         if not past.any():
             break

@@ -16,7 +16,7 @@ from drake_dae.trace.round_off import Sized, multiply
 
 
 class Samples:
-    """Consistent states near given ones, with the default parameters.
+    """Consistent states near guesses, with the default parameters.
 
     States that cannot be projected onto N*, or are outside the domain of (1)-(3), are left out.
 
@@ -67,7 +67,7 @@ class Samples:
         self.scale = np.where(largest > 0.0, largest, manifold.system.scale)
 
     def values(self, **expressions: ca.SX) -> list[tuple[FloatArray, ...]]:
-        """Expressions of the state, as matrices, at each state.
+        """Evaluates expressions of the state, as matrices, at each state.
 
         Raises:
             ModelError: An expression is not finite at a state.
@@ -86,11 +86,11 @@ class Samples:
         return result
 
     def field(self, key: str) -> list[Sized]:
-        """The field g or h at each state, with the sizes of its entries."""
+        """Returns the field g or h at each state, with the sizes of its entries."""
         return [(values[key], np.abs(values[key])) for values in self.fields]
 
     def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
-        """The derivatives of functions along fields; entries that are only round-off are zero.
+        """Returns the derivatives of functions along fields; round-off is set to zero.
 
         Args:
             rows: The symbolic derivatives, shape (a, k), with their structural zeros.
@@ -111,7 +111,7 @@ class Samples:
         )
 
     def dependent(self, functions: ca.SX) -> bool:
-        """Whether the differentials of functions are linearly dependent at every state."""
+        """Returns whether the differentials of functions are linearly dependent at every state."""
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
 
@@ -119,14 +119,14 @@ class Samples:
 def fields_at(
     system: DaeSystem, state: FloatArray, parameters: FloatArray | None = None
 ) -> dict[str, FloatArray]:
-    """f, g, h, l and m of (1)-(3), with E = 1, as matrices; with the default parameters if None."""
+    """Returns f, g, h, l and m of (1)-(3), with E = 1, as matrices."""
     function = system.fields
     values = function(state, system.parameter_vector(parameters))
     return dict(zip(function.output_names, map(as_matrix, values), strict=True))
 
 
 def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """The nominal state and random ones around it, shape (count + 1, n); not yet consistent.
+    """Draws states around the nominal state, which comes first; they are not yet consistent.
 
     Args:
         system: The system (1)-(3).
@@ -142,24 +142,24 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
 
 
 def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
-    """A spread as shape (n,): one that is given, a number for all, or the system's own if None.
+    """Converts a spread to shape (n,); the default of the system if None.
 
     Raises:
         ModelError: The shape is wrong, or a number is not finite.
     """
     if spread is None:
         return system.nominal_spread
-    given = numbers(f"{system.name}: spread", spread)
-    if given.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(given)):
+    deviations = numbers(f"{system.name}: spread", spread)
+    if deviations.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviations)):
         raise ModelError(
             f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
             f"{spread!r}"
         )
-    if np.any(given < 0.0):
+    if np.any(deviations < 0.0):
         raise ModelError(f"{system.name}: spread must not be negative, got {brief(spread)}")
-    return np.full(system.num_states, given)
+    return np.full(system.num_states, deviations)
 
 
 def as_matrix(value: FloatArray) -> FloatArray:
-    """A value of a TracedFunction as a matrix: columns come back as vectors."""
+    """Converts a result of a TracedFunction to a matrix; columns are returned as vectors there."""
     return value[:, None].copy() if value.ndim == 1 else value

@@ -13,7 +13,7 @@ from drake_dae.errors import AssumptionError
 
 
 class ViolationKind(Enum):
-    """The kind of a violation; the value is the remedy."""
+    """The kinds of violations; the enum value is the remedy."""
 
     COUNT = "Remove the redundant ones"
     CONSTRAINT_DEGREE = (
@@ -63,7 +63,7 @@ class ViolationKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """How a system violates one of Assumptions (1)-(5).
+    """A violation of one of Assumptions (1)-(5) by a system.
 
     Attributes:
         assumption: Its number in the paper.
@@ -91,7 +91,7 @@ class Violation:
     least: float | None = None
 
     def __str__(self) -> str:
-        text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
+        text = f"Assumption ({self.assumption}): {self._statement()}. {self.cause.value}"
         if self.deciding is None or self.cause in (ViolationKind.NUMBERS, ViolationKind.BOUNDS):
             return text
         acts = {
@@ -105,10 +105,10 @@ class Violation:
         )
 
     def error(self) -> AssumptionError:
-        """The exception for this violation."""
+        """Returns the exception for this violation."""
         return AssumptionError(str(self), self.assumption, self.state, self)
 
-    def _found(self) -> str:
+    def _statement(self) -> str:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
@@ -165,10 +165,10 @@ class Violation:
                 what = "gradients of constraints"
                 if self.cause in (ViolationKind.CONSTRAINT_RANK, ViolationKind.HIDDEN_DEGREE):
                     what = "rows of A(x)"
-                found = [f"{what}: {rows}"] if rows else []
+                statements = [f"{what}: {rows}"] if rows else []
                 if value:
-                    found.insert(0, f"smallest singular value {value} ({scaled})")
-                return f"A(x) loses rank{where}: {'; '.join(found)}"
+                    statements.insert(0, f"smallest singular value {value} ({scaled})")
+                return f"A(x) loses rank{where}: {'; '.join(statements)}"
             case ViolationKind.NUMBERS:
                 kind = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
@@ -178,11 +178,11 @@ class Violation:
                 )
             case ViolationKind.BOUNDS:
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                found = [
+                statements = [
                     f" of '{name}', between its default {default:.6g} and {bound:.6g}"
                     for name, bound, default in (self.deciding.pairs if self.deciding else ())
                 ]
-                return f"{matrix} loses rank within the bounds{','.join(found)}"
+                return f"{matrix} loses rank within the bounds{','.join(statements)}"
             case ViolationKind.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
@@ -199,7 +199,7 @@ def rank_violation(
     vanishing: tuple[int, ViolationKind],
     dependent: tuple[int, ViolationKind],
 ) -> Violation | None:
-    """The violation by a singular matrix: one assumption if a whole row vanishes, else another.
+    """Returns the violation by a singular matrix: one kind if a whole row vanishes, else another.
 
     Args:
         margin: The margin of the matrix; None if there is no matrix.

@@ -24,7 +24,7 @@ from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminat
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -70,7 +70,7 @@ class ConstraintStructure:
     def constraint_matrix(
         self, state: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
+        """Returns A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
 
         Args:
             state: x, shape (n,).
@@ -84,7 +84,7 @@ class ConstraintStructure:
     def trace(
         self, name: str, value: ca.SX, needs_control: bool, doubt: ca.SX | None = None
     ) -> TracedFunction:
-        """An expression on N* as a function of state, control and parameters.
+        """Compiles an expression on N* to a function of state, control and parameters.
 
         Args:
             name: Its name in messages.
@@ -121,22 +121,22 @@ def find_constraint_structure(
         ModelError: A function is not finite at the nominal state, the mass matrix is not symmetric
             and positive definite, or count or spread make no sense.
     """
-    found, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(found)
+    structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(structure)
     if violation:
         raise violation.error()
     # Rows of n* that are only round-off are no feedthrough.
-    _, n_star = eliminated_at(samples, found.elimination)
+    _, n_star = eliminated_at(samples, structure.elimination)
     acts = np.any([value for value, _ in n_star], axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
-    feedthrough = ca.sparsify(ca.mtimes(rows, found.elimination.n_star))
-    return replace(found, elimination=replace(found.elimination, n_star=feedthrough))
+    feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
+    return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
 
 
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """The given constraint structure of a system, or that found if none is given.
+    """Returns the constraint structure of a system: the argument, or a new one if None.
 
     Args:
         owner: The caller's name in messages.
@@ -147,23 +147,16 @@ def constraint_structure_of(
         AssumptionError, InconsistentStateError: It has none; see `find_constraint_structure`.
         ModelError: It is not a structure, or that of another system.
     """
-    return (
-        find_constraint_structure(system)
-        if structure is None
-        else checked_structure(
-            owner,
-            system,
-            structure,
-            ConstraintStructure,
-            "find_structure or find_constraint_structure",
-        )
-    )
+    if structure is None:
+        return find_constraint_structure(system)
+    makers = "find_structure or find_constraint_structure"
+    return checked_structure(owner, system, structure, ConstraintStructure, makers)
 
 
 def checked_structure(
     owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
 ) -> Kind:
-    """The given structure of a system.
+    """Checks that a structure belongs to a system, and returns it.
 
     Raises:
         ModelError: It is not a structure of this kind, or that of another system.
@@ -181,7 +174,7 @@ def checked_structure(
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """The states near which consistent ones are sought, shape (count + 1, n).
+    """Returns initial guesses of consistent states, shape (count + 1, n).
 
     Raises:
         AssumptionError, ModelError: The system or an argument makes no sense.
@@ -195,7 +188,7 @@ def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) 
 def examine_constraints(
     system: DaeSystem, guesses: FloatArray, region: Region | None = None
 ) -> tuple[ConstraintStructure, Samples]:
-    """Finds r_1, ..., r_m and A(x) of a system that `check_system` takes.
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts.
 
     Args:
         system: The system (1)-(3).
@@ -222,7 +215,7 @@ def examine_constraints(
     elimination = eliminate(derivatives)
     # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
     matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
-    found = ConstraintStructure(
+    structure = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
         manifold=samples.manifold,
@@ -232,11 +225,11 @@ def examine_constraints(
         scale=samples.scale,
         constraint_margin=find_margin(samples, matrix) if chains else None,
     )
-    return found, samples
+    return structure, samples
 
 
 def check_system(system: DaeSystem) -> None:
-    """Refuses a system with too many constraints, or with an invalid mass matrix.
+    """Checks the number of constraints and the mass matrix of a system.
 
     Raises:
         AssumptionError: There are more constraints than states.
@@ -248,31 +241,29 @@ def check_system(system: DaeSystem) -> None:
         raise Violation(2, ViolationKind.COUNT, names).error()
 
 
-def constraint_violation(found: ConstraintStructure) -> Violation | None:
-    """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
+def constraint_violation(structure: ConstraintStructure) -> Violation | None:
+    """Returns the violation of Assumption (1) or (2) by a singular A(x); None if it is regular."""
     causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
-    signals, margin = found.system.constraint_output_signals, found.constraint_margin
-    violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
+    signals, margin = structure.system.constraint_output_signals, structure.constraint_margin
+    violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
     if margin is None:
         return None
-    matrix = found.system.frictional_contacts.without_friction(found.elimination.constraint_matrix)
-    violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
+    system, elimination = structure.system, structure.elimination
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
+    violation = with_numbers(violation, 2, structure.manifold, structure.states, matrix)
     if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
     if violation.cause is not ViolationKind.CONSTRAINT_RANK:
-        return _as_redundant(found.system, violation)
-    dependence = find_dependence(found.manifold, found.elimination, found.states, margin.state)
-    cause = ViolationKind.CONSTRAINT_RANK
-    if dependence.in_gradients:
-        cause = (
-            ViolationKind.REDUNDANT
-            if dependence.everywhere
-            else ViolationKind.SINGULAR_CONFIGURATION
-        )
-    elif dependence.everywhere:
-        cause = ViolationKind.HIDDEN_DEGREE
-    found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
-    return _as_redundant(found.system, found_cause)
+        return _as_redundant(system, violation)
+    dependence = find_dependence(structure.manifold, elimination, structure.states, margin.state)
+    cause = {  # By whether it is singular everywhere, and by its gradients.
+        (True, True): ViolationKind.REDUNDANT,
+        (False, True): ViolationKind.SINGULAR_CONFIGURATION,
+        (True, False): ViolationKind.HIDDEN_DEGREE,
+        (False, False): ViolationKind.CONSTRAINT_RANK,
+    }[dependence.everywhere, dependence.in_gradients]
+    violation = replace(violation, cause=cause, combinations=dependence.combinations)
+    return _as_redundant(system, violation)
 
 
 def with_numbers(
@@ -282,7 +273,7 @@ def with_numbers(
     states: FloatArray,
     matrix: ca.SX,
 ) -> Violation | None:
-    """The violation by a matrix, including parameters other than the defaults.
+    """Returns the violation by a matrix, also for other parameters than the defaults.
 
     Args:
         violation: The violation with the defaults; None if there is none.
@@ -307,8 +298,7 @@ def with_numbers(
         value = function(state, parameters)[0].reshape(matrix.shape)
         if not np.all(np.isfinite(value)):
             return 0.0
-        rows, columns = equilibration(value)
-        scaled = value / rows[:, None] / columns
+        scaled = equilibrated(value)
         if smallest_singular_value(scaled) <= system.least_margin:
             return 0.0
         return float(np.linalg.slogdet(scaled)[0]) if matrix.is_square() else 1.0
@@ -323,14 +313,12 @@ def with_numbers(
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
-    """The actual violation if redundant constraints led to a singular configuration.
+    """Returns the actual violation if redundant constraints led to a singular configuration.
 
     Off N* they are overdetermined, and only singular configurations satisfy them.
     """
-    if violation.cause not in (
-        ViolationKind.CONSTRAINT_DEGREE,
-        ViolationKind.SINGULAR_CONFIGURATION,
-    ):
+    possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
+    if violation.cause not in possible:
         return violation
     combinations = find_redundant(system)
     # A gradient that vanishes wherever its constraint holds does not depend on others.

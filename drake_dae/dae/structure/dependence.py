@@ -21,7 +21,7 @@ that is a constraint times a factor."""
 
 @dataclass(frozen=True)
 class Combination:
-    """A row that is a combination of others: row = sum factors_j row_j.
+    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j.
 
     Attributes:
         name: The constraint or the output whose row it is.
@@ -45,7 +45,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Dependence:
-    """How the constraints depend on each other where A(x) is singular.
+    """The linear dependence of the constraints where A(x) is singular.
 
     Attributes:
         combinations: The rows that follow from those before them: of the gradients of the
@@ -63,7 +63,7 @@ class Dependence:
 def find_dependence(
     manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
 ) -> Dependence:
-    """How the constraints depend on each other at a state where A(x) is singular.
+    """Finds how the constraints depend on each other at a state where A(x) is singular.
 
     Args:
         manifold: N*.
@@ -97,7 +97,7 @@ def find_dependence(
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
-    """The constraints k_i whose gradients follow from those before them, at all of some states."""
+    """Returns the constraints whose gradients depend on those of earlier ones at all samples."""
     system = samples.system
     if not samples.dependent(system.k):
         return ()
@@ -107,16 +107,16 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
 
 
 def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
-    """Which of some outputs follow from the constraints, by their gradients."""
+    """Generates the outputs that are functions of the constraints, by their gradients."""
     system, manifold = samples.system, samples.manifold
-    known = [signal.name for signal in manifold.residual_signals]
+    constraints = [signal.name for signal in manifold.residual_signals]
     for row, signal in enumerate(system.output_signals):
         if signal.name in names and not system.m[row, :].nnz():
             both = ca.vertcat(manifold.residual_expression, system.l[row])
             values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
             gradients = [_without_residuals(gradient, system.scale) for (gradient,) in values]
-            rows = combinations_of([*known, signal.name], gradients, _ON_MANIFOLD)
-            yield from (one for one in rows if one.name == signal.name)
+            rows = combinations_of([*constraints, signal.name], gradients, _ON_MANIFOLD)
+            yield from (row for row in rows if row.name == signal.name)
 
 
 def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
@@ -128,7 +128,7 @@ def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 def combinations_of(
     names: list[str], values: list[FloatArray], least: float = SINGULAR
 ) -> list[Combination]:
-    """The rows that follow from those before them at the first of some states.
+    """Returns the rows that depend on earlier rows at the first of some states.
 
     Args:
         names: The names of the rows.
@@ -136,30 +136,30 @@ def combinations_of(
         least: A row depends on others if its remainder, relative to its length, is below this.
     """
     matrix, lengths = _scaled(values[0])
-    kept: list[int] = []
-    found = []
+    independent: list[int] = []
+    combinations = []
     for i, name in enumerate(names):
-        factors, error = _fit(matrix, kept, i)
+        factors, error = _fit(matrix, independent, i)
         if error >= least:
-            kept.append(i)
+            independent.append(i)
             continue
-        used = [j for j, factor in zip(kept, factors, strict=True) if abs(factor) > least]
+        used = [j for j, factor in zip(independent, factors, strict=True) if abs(factor) > least]
         plain = _fit(matrix, used, i)[0] * lengths[i] / lengths[used]
         others = []
         for value in values[1:]:
-            scaled, own = _scaled(value)
-            others.append(_fit(scaled, used, i)[0] * own[i] / own[used])
+            scaled, lengths_there = _scaled(value)
+            others.append(_fit(scaled, used, i)[0] * lengths_there[i] / lengths_there[used])
         constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
-        found.append(Combination(name, tuple(names[j] for j in used), plain, constant))
-    return found
+        combinations.append(Combination(name, tuple(names[j] for j in used), plain, constant))
+    return combinations
 
 
-def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, float]:
+def _fit(matrix: FloatArray, others: list[int], row: int) -> tuple[FloatArray, float]:
     """The factors of rows whose combination is nearest to another row, and the remainder."""
-    if not kept:
+    if not others:
         return np.zeros(0), float(np.linalg.norm(matrix[row]))
-    factors = scipy.linalg.lstsq(matrix[kept].T, matrix[row])[0]
-    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[kept]))
+    factors = scipy.linalg.lstsq(matrix[others].T, matrix[row])[0]
+    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[others]))
 
 
 def _scaled(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

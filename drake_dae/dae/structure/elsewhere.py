@@ -21,16 +21,16 @@ DOUBTFUL = 1e-13
 
 
 class Elsewhere:
-    """Rows that are zero for the default parameters and not for others, by constraint or output."""
+    """Constraints and outputs whose row is zero at the default parameters but not at others."""
 
     def __init__(self) -> None:
-        self._found: dict[int, Violation] = {}
+        self._violations: dict[int, Violation] = {}
 
     def look(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
-        """Tests whether a row that is zero for the default parameters is zero for others as well.
+        """Tests a row that is zero at the default parameters at other parameters, and records it.
 
         Args:
-            index: The constraint or output of the row; the first row that is not zero is kept.
+            index: The constraint or output of the row; the first violation of each is recorded.
             violation: The violation if the row is not zero.
             samples: The states at which it is zero.
             row: The row at a state, with values of all parameters.
@@ -38,7 +38,7 @@ class Elsewhere:
         Warns:
             NegligibleWarning: An entry counts as zero but may be intended.
         """
-        if index in self._found:
+        if index in self._violations:
             return
         system = samples.system
 
@@ -50,7 +50,7 @@ class Elsewhere:
         family = Family(samples.manifold, samples.states)
         deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
         if deciding:
-            self._found[index] = replace(violation, deciding=deciding)
+            self._violations[index] = replace(violation, deciding=deciding)
         defaults = system.parameter_values
         if system.negligible > DOUBTFUL and all(
             acts(state, defaults, DOUBTFUL) for state in samples.states
@@ -65,15 +65,15 @@ class Elsewhere:
             )
 
     def refuse(self, index: int) -> None:
-        """Refuses a constraint or output whose degree differs for other parameters.
+        """Checks that the degree of a constraint or output is the same for other parameters.
 
         Raises:
             AssumptionError: The degree differs; the message has the deciding numbers.
         """
-        if index in self._found:
-            raise self._found[index].error()
+        if index in self._violations:
+            raise self._violations[index].error()
 
     def deciding(self, indices: Sequence[int]) -> Deciding | None:
-        """The deciding numbers for constraints or outputs on which nothing acts at the defaults."""
-        found = (self._found[i].deciding for i in indices if i in self._found)
-        return next(found, None)
+        """Returns the parameters for which an input acts on one of some constraints or outputs."""
+        violations = (self._violations[i] for i in indices if i in self._violations)
+        return next((violation.deciding for violation in violations), None)

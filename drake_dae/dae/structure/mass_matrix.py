@@ -9,7 +9,7 @@ from drake_dae.errors import ModelError
 
 
 def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Refuses an invalid mass matrix, since LDL^T reads only one triangle of it.
+    """Checks a mass matrix, since LDL^T reads only one triangle of it.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.

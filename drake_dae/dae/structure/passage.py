@@ -39,7 +39,7 @@ length NEAREST if it is nearer). With a larger change the system is almost at re
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """The motion of a system on N* through a singular configuration that it crosses.
+    """The motion of a system on N* through a singular configuration.
 
     Let n be the combinations of constraints whose gradients vanish in the configuration, n^T C = 0
     with the gradients C of the last derivatives c = L_f^(r_i - 1) k_i. There n^T c' = 0 does not
@@ -64,7 +64,7 @@ class Passage:
     def motion(
         self, state: FloatArray, control: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """x' and v at a state next to a singular configuration, shapes (n,) and (m,).
+        """Returns x' and v at a state close to a singular configuration, shapes (n,) and (m,).
 
         Returns:
             None if the system does not cross one there: its gradients are independent, or stay
@@ -94,16 +94,16 @@ class Passage:
         lost = eigenvalues < NULL
         if not lost.any():
             return None
-        kept, null = unit[:, None] * vectors[:, ~lost], unit[:, None] * vectors[:, lost]
+        independent, null = unit[:, None] * vectors[:, ~lost], unit[:, None] * vectors[:, lost]
 
         # The motion without the lost constraints.
         free = values["f"][:, 0] + values["h"] @ control
         c_rate = self._along(state, free, parameters)[0]
-        v = -kept @ ((kept.T @ c_rate) / eigenvalues[~lost])
+        v = -independent @ ((independent.T @ c_rate) / eigenvalues[~lost])
         rate = free + values["g"] @ v
         c_rate, _, _, turning, _ = self._along(state, rate, parameters)
-        columns, mass = turning @ np.hstack([kept, null]), mass.reshape(n, n)
-        least, most = _return_of_lost(mass, values["g"] @ kept, columns)
+        columns, mass = turning @ np.hstack([independent, null]), mass.reshape(n, n)
+        least, most = _return_of_lost(mass, values["g"] @ independent, columns)
         if not least > CROSSING**2 * most:
             return None
         # With r = 2, c = J v: on a branch the lost part of J' v is zero as well.
@@ -111,19 +111,19 @@ class Passage:
         energy = float(moving @ mass @ moving)
         if not np.linalg.norm(null.T @ c_rate) <= BRANCH * np.sqrt(most * energy):
             return None
-        missed = self._missed(state, parameters, kept, null)
+        missed = self._missed(state, parameters, independent, null)
         if not missed * np.sqrt(most) < MISS**2 * np.sqrt(energy):
             return None
 
         # With the input directions that return.
-        ways = np.hstack([values["g"] @ kept, np.linalg.solve(mass, turning @ null)])
+        ways = np.hstack([values["g"] @ independent, np.linalg.solve(mass, turning @ null)])
         for _ in range(3):
             c_rate, c_second, slope, _, _ = self._along(state, rate, parameters)
-            rows = np.vstack([kept.T @ gradient, null.T @ slope])
-            left = np.concatenate([kept.T @ c_rate, null.T @ c_second])
-            step = np.linalg.lstsq(rows @ ways, -left)[0]
+            rows = np.vstack([independent.T @ gradient, null.T @ slope])
+            residuals = np.concatenate([independent.T @ c_rate, null.T @ c_second])
+            step = np.linalg.lstsq(rows @ ways, -residuals)[0]
             rate = rate + ways @ step
-            v = v + kept @ step[: kept.shape[1]]
+            v = v + independent @ step[: independent.shape[1]]
         bending = self._along(state, rate, parameters)[4] @ null
         if not np.all(np.isfinite(bending)):
             return None
@@ -132,37 +132,39 @@ class Passage:
         return (rate, v) if distance * np.sqrt(max(change, 0.0)) < STEADY * least else None
 
     def _missed(
-        self, state: FloatArray, parameters: FloatArray, kept: FloatArray, null: FloatArray
+        self, state: FloatArray, parameters: FloatArray, independent: FloatArray, null: FloatArray
     ) -> float:
         """The residual of the constraints in the singular configuration next to a state.
 
         There P k = 0 and J^T n = 0, which is solved for positions and for n = null + kept M by
         Newton's method. Where n^T k is not zero, N* comes near to it and turns away.
         """
-        x, mixed = state.copy(), np.zeros((kept.shape[1], null.shape[1]))
+        x, mixed = state.copy(), np.zeros((independent.shape[1], null.shape[1]))
         used, count = self._used, null.shape[1]
         size = len(used)
         for _ in range(SEARCH):
             k, gradient, hessian = (v.copy() for v in self._positions.evaluate(x, parameters))
             gradient = gradient.reshape(-1, size)
             turning = hessian.reshape(len(k), size, size)
-            n = null + kept @ mixed
-            matrix = np.zeros((kept.shape[1] + count * size, size + mixed.size))
-            matrix[: kept.shape[1], :size] = kept.T @ gradient
-            left = [kept.T @ k]
+            n = null + independent @ mixed
+            matrix = np.zeros((independent.shape[1] + count * size, size + mixed.size))
+            matrix[: independent.shape[1], :size] = independent.T @ gradient
+            residuals = [independent.T @ k]
             for j in range(count):
-                rows = slice(kept.shape[1] + j * size, kept.shape[1] + (j + 1) * size)
-                columns = slice(size + j * kept.shape[1], size + (j + 1) * kept.shape[1])
+                rows = slice(independent.shape[1] + j * size, independent.shape[1] + (j + 1) * size)
+                columns = slice(
+                    size + j * independent.shape[1], size + (j + 1) * independent.shape[1]
+                )
                 matrix[rows, :size] = np.tensordot(n[:, j], turning, 1)
-                matrix[rows, columns] = gradient.T @ kept
-                left.append(gradient.T @ n[:, j])
-            step = -np.linalg.lstsq(matrix, np.concatenate(left))[0]
+                matrix[rows, columns] = gradient.T @ independent
+                residuals.append(gradient.T @ n[:, j])
+            step = -np.linalg.lstsq(matrix, np.concatenate(residuals))[0]
             x[used] += step[:size]
             mixed = mixed + step[size:].reshape(count, -1).T
             if not np.all(np.isfinite(x)):
                 return np.inf
         k = self._positions.evaluate(x, parameters)[0]
-        return float(np.linalg.norm((null + kept @ mixed).T @ k))
+        return float(np.linalg.norm((null + independent @ mixed).T @ k))
 
     @cached_property
     def _used(self) -> list[int]:
@@ -183,7 +185,7 @@ class Passage:
 
     @cached_property
     def doubt(self) -> ca.SX | None:
-        """Negative where `motion` is needed; None if no singular configuration can be crossed."""
+        """An expression that is negative where `motion` is needed; None if it never is."""
         elimination, system = self.structure.elimination, self.structure.system
         if set(self.structure.constraint_degrees) != {2}:
             return None
@@ -241,8 +243,8 @@ class Passage:
         self, state: FloatArray, rate: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         n, m = state.size, self.structure.system.num_constraints
-        found = [v.copy() for v in self._derivatives.evaluate(state, rate, parameters)]
-        c_rate, c_second, slope, turning, bending = found
+        derivatives = [v.copy() for v in self._derivatives.evaluate(state, rate, parameters)]
+        c_rate, c_second, slope, turning, bending = derivatives
         return (
             c_rate,
             c_second,
@@ -262,16 +264,20 @@ def _is_plain(mass: ca.SX, row: int) -> bool:
     return mass[row, :].nnz() == 1 and mass[row, row].is_one()
 
 
-def _return_of_lost(mass: FloatArray, kept: FloatArray, turning: FloatArray) -> tuple[float, float]:
+def _return_of_lost(
+    mass: FloatArray, accelerations: FloatArray, turning: FloatArray
+) -> tuple[float, float]:
     """The rate at which lost gradients return, and that at which gradients turn; both squared.
 
     Args:
         mass: E.
-        kept: E^-1 g of the remaining constraints.
+        accelerations: E^-1 g of the remaining constraints.
         turning: The rates of the columns of g, those of the remaining constraints first.
     """
     speeds = turning.T @ np.linalg.solve(mass, turning)
-    count = kept.shape[1]
-    cross = turning[:, count:].T @ kept
-    back = speeds[count:, count:] - cross @ np.linalg.solve(kept.T @ mass @ kept, cross.T)
+    count = accelerations.shape[1]
+    cross = turning[:, count:].T @ accelerations
+    back = speeds[count:, count:] - cross @ np.linalg.solve(
+        accelerations.T @ mass @ accelerations, cross.T
+    )
     return float(np.linalg.eigvalsh(back)[0]), float(np.linalg.eigvalsh(speeds)[-1])

@@ -15,7 +15,7 @@ from drake_dae.dae.structure.dependence import Combination, redundant_constraint
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
-from drake_dae.trace.round_off import equilibration, positive
+from drake_dae.trace.round_off import equilibrated, positive
 
 SEARCH = 200
 """The largest number of steps to a state where all constraints hold; a dozen are enough."""
@@ -27,7 +27,12 @@ this fraction of the best."""
 
 @checked(ModelError)
 def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> DaeSystem:
-    """The same motion with fewer constraints: those that follow from others are left out.
+    """Returns a system with the same motion in which redundant constraints are removed.
+
+    Removing constraint i also removes the constraint input v_i. The motion is unchanged, because
+    the remaining columns of g span the same space. The forces of the remaining constraints depend
+    on this choice: (1)-(3) determine the sum g(x) v, but not how it is distributed among redundant
+    constraints.
 
     A constraint goes with the constraint input of the same number. The motion is the same, since
     the inputs that remain act in all directions in which those that go did. The forces of the
@@ -47,21 +52,21 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
     samples = consistent_samples(system)
     if names is None:
         names = [combination.name for combination in redundant_constraints(samples)]
-    kept = constraints_kept(system, names)
-    if len(kept) == system.num_constraints:
+    remaining = constraints_kept(system, names)
+    if len(remaining) == system.num_constraints:
         return system
     gone = ", ".join(f"'{name}'" for name in names)
-    if system.m[:, [i for i in range(system.num_constraints) if i not in kept]].nnz():
+    if system.m[:, [i for i in range(system.num_constraints) if i not in remaining]].nnz():
         raise ModelError(
             f"{system.name}: an output is the force of {gone}, which is not determined where "
             "constraints are redundant; choose other outputs, or leave out other constraints"
         )
-    check_same_motion(samples, kept, gone)
-    return with_constraints(system, kept)
+    check_same_motion(samples, remaining, gone)
+    return with_constraints(system, remaining)
 
 
 def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
-    """The constraints that follow from those before them at all states around the nominal one."""
+    """Returns the constraints that depend on earlier ones at all states near the nominal state."""
     try:
         return redundant_constraints(consistent_samples(system))
     except InconsistentStateError:
@@ -69,12 +74,12 @@ def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
 
 
 def consistent_samples(system: DaeSystem) -> Samples:
-    """Consistent states around the nominal one, by the constraints k_i alone."""
+    """Returns random states around the nominal state at which all constraints k_i hold."""
     return Samples(_Redundant(system), draw(system, None, 12, 0))
 
 
 class _Redundant(Manifold):
-    """The states at which all constraints k_i hold, redundant ones included.
+    """The states at which all constraints k_i hold, including redundant ones.
 
     Near these states the gradients of redundant constraints are nearly dependent, so that Newton
     steps become very long or lead to a singular configuration. Levenberg-Marquardt steps with a
@@ -95,28 +100,28 @@ class _Redundant(Manifold):
         z = self.system.state_vector(state) / scale
         gradients = self.gradients(scale * z, parameters) * scale
         length = positive(np.linalg.norm(gradients, axis=1))
-        left = self.residual(scale * z, parameters) / length
+        residual = self.residual(scale * z, parameters) / length
         damping = 1.0
         for _ in range(SEARCH):
-            size = float(np.linalg.norm(left))
+            size = float(np.linalg.norm(residual))
             u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
-            step = (u.T @ left) * s / positive(s * s + damping * size) @ v
+            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
             following = self.residual(scale * (z - step), parameters) / length
             if not np.linalg.norm(following) < size:
                 if size <= ROUND_OFF * (1.0 + np.linalg.norm(z)):
                     return np.asarray(scale * z)
                 damping *= 4.0
                 continue
-            z, left, damping = z - step, following, 1.0
+            z, residual, damping = z - step, following, 1.0
             gradients = self.gradients(scale * z, parameters) * scale
         raise InconsistentStateError(
             f"{self.system.name}: no state found near the given one at which all constraints hold",
-            left * length,
+            residual * length,
         )
 
 
 def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
-    """The constraints that remain without those of the given names.
+    """Returns the indices of the constraints whose names are not listed.
 
     Raises:
         ModelError: No constraint has that name.
@@ -129,62 +134,59 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 
 
 def independent_constraints(samples: Samples) -> list[int]:
-    """The constraints that can stay, chosen so that they are well independent at all samples."""
+    """Selects constraints that are well independent of each other at all sampled states."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
-    rest = []
-    for (gradient,) in values:
-        rows, columns = equilibration(gradient)
-        rest.append(gradient / rows[:, None] / columns)
-    most = min(int(_rank(gradient)) for (gradient,) in values)
-    kept: list[int] = []
-    while len(kept) < most:
-        left = np.min([np.linalg.norm(matrix, axis=1) for matrix in rest], axis=0)
-        left[kept] = 0.0
-        chosen = int(np.argmax(left >= PREFERRED * left.max()))
-        kept.append(chosen)
-        for matrix in rest:
+    remainders = [equilibrated(gradient) for (gradient,) in values]
+    most = min(_rank(gradient) for (gradient,) in values)
+    remaining: list[int] = []
+    while len(remaining) < most:
+        independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
+        independence[remaining] = 0.0
+        chosen = int(np.argmax(independence >= PREFERRED * independence.max()))
+        remaining.append(chosen)
+        for matrix in remainders:
             direction = matrix[chosen] / np.linalg.norm(matrix[chosen])
             matrix -= np.outer(matrix @ direction, direction)
-    return sorted(kept)
+    return sorted(remaining)
 
 
-def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
-    """A system with some of its constraints and their inputs alone."""
-    signals = tuple(system.constraint_input_signals[i] for i in kept)
+def with_constraints(system: DaeSystem, remaining: list[int]) -> DaeSystem:
+    """Returns a system with only some of its constraints and their inputs."""
+    signals = tuple(system.constraint_input_signals[i] for i in remaining)
     names = {signal.name for signal in signals}
     return replace(
         system,
-        g=system.g[:, kept],
-        k=system.k[kept],
-        m=system.m[:, kept],
+        g=system.g[:, remaining],
+        k=system.k[remaining],
+        m=system.m[:, remaining],
         contacts=tuple(contact for contact in system.contacts if contact.force in names),
         constraint_input_signals=signals,
-        constraint_output_signals=tuple(system.constraint_output_signals[i] for i in kept),
-        implicit=_fewer(system, kept),
+        constraint_output_signals=tuple(system.constraint_output_signals[i] for i in remaining),
+        implicit=_fewer(system, remaining),
     )
 
 
-def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
-    """Refuses to leave out constraints that are not redundant."""
+def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None:
+    """Checks that the motion does not change if some constraints are removed."""
     system = samples.system
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
     gradients = samples.values(
         gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
     )
     for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
-        if _rank(gradient[kept]) < _rank(gradient):
+        if _rank(gradient[remaining]) < _rank(gradient):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its gradients are no combinations of "
                 "the gradients of the remaining constraints"
             )
         both = np.hstack([gradient, moved])
-        if _rank(both[kept]) < _rank(both):
+        if _rank(both[remaining]) < _rank(both):
             names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: where the exogenous signals {names} "
                 "move, the constraints left out are no longer implied by the remaining ones"
             )
-        if _rank(fields["g"].T[kept]) < _rank(fields["g"].T):
+        if _rank(fields["g"].T[remaining]) < _rank(fields["g"].T):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: the constraint inputs of the same "
                 "numbers act in directions in which no other one does"
@@ -192,13 +194,11 @@ def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
 
 
 def _rank(matrix: FloatArray) -> int:
-    rows, columns = equilibration(matrix)
-    scaled = matrix / rows[:, None] / columns
-    return int(np.linalg.matrix_rank(scaled, DEPENDENT)) if matrix.size else 0
+    return int(np.linalg.matrix_rank(equilibrated(matrix), DEPENDENT)) if matrix.size else 0
 
 
 def _fewer(
-    system: DaeSystem, kept: list[int]
+    system: DaeSystem, remaining: list[int]
 ) -> Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None:
     """The implicit form of a system, if it has one, for the remaining inputs and outputs."""
     whole = system.implicit
@@ -207,8 +207,8 @@ def _fewer(
 
     def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
         every = ca.SX(system.num_constraints, 1)
-        every[kept] = constraint_input
+        every[remaining] = constraint_input
         rest, constraint_rate = whole(rate, every)
-        return rest, constraint_rate[kept]
+        return rest, constraint_rate[remaining]
 
     return implicit

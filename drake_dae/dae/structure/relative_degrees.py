@@ -65,7 +65,7 @@ def constraint_chains(
         force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
         control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
         reached = _reached(explicit.g, f, last, x)
-        numbers, still, stuck = _ChainRows(samples), [], []
+        numbers, next_undecided, stuck = _ChainRows(samples), [], []
         for row, i in enumerate(undecided):
             order = len(chains[i])
             if force_acts[row].all():
@@ -84,27 +84,27 @@ def constraint_chains(
                     violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
                     along = numbers.along(chains[i][-1], key)
                     elsewhere.look(i, violation, samples, along)
-            still.append(i)
+            next_undecided.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
             ):
                 stuck.append(i)
-        if not still:
+        if not next_undecided:
             return chains, samples
-        if sum(len(chain) for chain in chains) + len(still) > system.num_states:
-            stuck = still
+        if sum(len(chain) for chain in chains) + len(next_undecided) > system.num_states:
+            stuck = next_undecided
         if stuck:
             dependent = redundant_constraints(samples)
             those = tuple(names[i] for i in stuck)
             deciding = elsewhere.deciding(stuck)
             violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
             raise replace(violation, deciding=deciding).error()
-        for i in still:
-            following = lie_derivative(chains[i][-1], f, x)
+        for i in next_undecided:
+            derivative = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
-                following += system.exogenous.rate(chains[i][-1])
-            chains[i].append(following)
-        undecided = still
+                derivative += system.exogenous.rate(chains[i][-1])
+            chains[i].append(derivative)
+        undecided = next_undecided
     return chains, Samples(Manifold(system, chains), guesses, region)
 
 
@@ -192,20 +192,14 @@ def output_chains(
                 stuck.append(i)
         if stuck:
             those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
-            found = tuple(following_outputs(samples, those))
+            following = tuple(following_outputs(samples, those))
             violation = Violation(
-                5, ViolationKind.NO_CONTROL, those, combinations=found, deciding=deciding
+                5, ViolationKind.NO_CONTROL, those, combinations=following, deciding=deciding
             )
             raise violation.error()
         undecided = still
-    return OutputChains(
-        chains=tuple(tuple(chain) for chain in chains),
-        drift=drift,
-        control_matrix=control_matrix,
-        highest_derivatives=highest_derivatives,
-        need_force=need_force,
-        round_off=round_off,
-    )
+    every = tuple(tuple(chain) for chain in chains)
+    return OutputChains(every, drift, control_matrix, highest_derivatives, need_force, round_off)
 
 
 def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Sized], list[Sized]]:

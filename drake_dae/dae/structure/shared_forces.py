@@ -31,7 +31,7 @@ def share_forces(
     *,
     compliances: Mapping[str, float] | None = None,
 ) -> DaeSystem:
-    """The same motion with fewer constraints, and the forces of all by least squares.
+    """Removes redundant constraints and distributes the forces among all by least squares.
 
     On N* the input of a constraint that is left out acts as a combination of those that stay, E^-1
     g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all v_all =
@@ -67,19 +67,21 @@ def share_forces(
     """
     weights = _weights(system, compliances or {})
     samples = consistent_samples(system)
-    kept = independent_constraints(samples) if names is None else constraints_kept(system, names)
-    if len(kept) == system.num_constraints:
+    remaining = (
+        independent_constraints(samples) if names is None else constraints_kept(system, names)
+    )
+    if len(remaining) == system.num_constraints:
         return system
-    others = [i for i in range(system.num_constraints) if i not in kept]
+    left_out = [i for i in range(system.num_constraints) if i not in remaining]
     signals = system.constraint_output_signals
-    check_same_motion(samples, kept, ", ".join(f"'{signals[i].name}'" for i in others))
+    check_same_motion(samples, remaining, ", ".join(f"'{signals[i].name}'" for i in left_out))
     inertia = PositiveDefiniteFactorization(system.mass_matrix)
     half = inertia.forward(system.g)
     product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
-    gather = ca.SX(len(kept), system.num_constraints)
-    gather[:, kept] = ca.SX.eye(len(kept))
-    gather[:, others] = PositiveDefiniteFactorization(product[kept, kept]).solve(
-        product[kept, others]
+    gather = ca.SX(len(remaining), system.num_constraints)
+    gather[:, remaining] = ca.SX.eye(len(remaining))
+    gather[:, left_out] = PositiveDefiniteFactorization(product[remaining, remaining]).solve(
+        product[remaining, left_out]
     )
     weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
     sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
@@ -89,14 +91,14 @@ def share_forces(
         gather=gather,
         signals=system.constraint_input_signals,
         undetermined=_undetermined(samples, gather, split),
-        left_out=system.k[others],
-        left_out_signals=tuple(signals[i] for i in others),
+        left_out=system.k[left_out],
+        left_out_signals=tuple(signals[i] for i in left_out),
     )
-    return replace(with_constraints(system, kept), sharing=sharing)
+    return replace(with_constraints(system, remaining), sharing=sharing)
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
-    """The states at which the redundant constraints that were left out hold; None without any.
+    """Returns the states at which the removed redundant constraints hold; None without any.
 
     It contains N*, and possibly states of another assembly mode.
     """

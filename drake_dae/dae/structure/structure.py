@@ -30,7 +30,7 @@ from drake_dae.trace.factorization import Factorization, nearest_solution
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Structure(ConstraintStructure):
-    """The structure that the paper assumes, by Assumptions (1)-(5), found for one system.
+    """The structure of one system by Assumptions (1)-(5): relative degrees, A(x), B(x), margins.
 
     Attributes:
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
@@ -61,7 +61,7 @@ class Structure(ConstraintStructure):
 
     @property
     def layout(self) -> DerivativeLayout:
-        """How references and output chains are stacked."""
+        """The layout of reference vectors and output chains."""
         return DerivativeLayout(self.output_degrees)
 
     @property
@@ -76,16 +76,16 @@ class Structure(ConstraintStructure):
 
     @property
     def chain(self) -> ca.SX:
-        """The output chains below each other, as `layout` stacks them, shape (sum mu_i, 1)."""
+        """The output chains in one column, in the order of `layout`, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
-    def motion_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """x' and v under the control of `control_for`, solved for along with it.
+    def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
+        """Returns x' and v under the control of `control_for`, solved together with the control.
 
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
@@ -96,43 +96,43 @@ class Structure(ConstraintStructure):
             return None
         motion = self.derivatives
         shown = ca.vertcat(motion.rate, motion.constraint_input)
-        found = motion.inverse(self.highest_derivatives, wanted, shown)
-        if found is None:
+        solution = motion.inverse(self.highest_derivatives, commanded, shown)
+        if solution is None:
             return None
         size = self.system.num_states
-        return found[2][:size, :], found[2][size:, :], found[1]
+        return solution[2][:size, :], solution[2][size:, :], solution[1]
 
-    def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
+    def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
 
         If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
         """
-        found: tuple[ca.SX, ...] | None = None
+        solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
-            found = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
-        if found is None:  # L_h* of an output vanishes, but not by structure.
-            found = self.control_by_matrix(wanted)
-        control, pivot, *_ = found
+            solution = self.derivatives.inverse(self.highest_derivatives, commanded)  # (28)
+        if solution is None:  # L_h* of an output vanishes, but not by structure.
+            solution = self.control_by_matrix(commanded)
+        control, pivot, *_ = solution
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
 
-    def control_by_matrix(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The control of `control_for` by B(x) itself, where A(x) is regular.
+    def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Returns the control of `control_for`, computed with B(x); A(x) must be regular.
 
         Args:
-            wanted: ubar of (28), shape (p, 1).
+            commanded: ubar of (28), shape (p, 1).
 
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
         """
-        needed, metric = wanted - self.drift, self.system.control_metric  # (28)
+        needed, metric = commanded - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
         factors = Factorization(self.control_matrix)
@@ -172,10 +172,10 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The given structure of a system, or that found if none is given.
+    """Returns the structure of a system: the argument, or the result of `find_structure` if None.
 
     Args:
-        owner: Who needs it, for messages.
+        owner: The caller's name in messages.
         system: The system (1)-(3).
         structure: The structure, or None to find it.
 
@@ -183,17 +183,15 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
         ModelError: It is not a system, or the structure is that of another one.
     """
-    return (
-        find_structure(system)
-        if structure is None
-        else checked_structure(owner, system, structure, Structure, "find_structure")
-    )
+    if structure is None:
+        return find_structure(system)
+    return checked_structure(owner, system, structure, Structure, "find_structure")
 
 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, Violation | None]:
-    """Finds the structure as `find_structure` does, but also where B(x) is singular.
+    """Finds the structure as `find_structure`, but also returns it where B(x) is singular.
 
     Returns:
         The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
@@ -203,7 +201,8 @@ def examine_structure(
             output has no degree.
         InconsistentStateError, ModelError: It has no structure; see `find_structure`.
     """
-    _check_counts(system)
+    if why := why_no_law(system):
+        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
     violation = constraint_violation(constrained)
     if violation:
@@ -213,7 +212,7 @@ def examine_structure(
 
 
 def why_no_law(system: DaeSystem) -> str:
-    """Why a system has no law (28), by its numbers of inputs and outputs; empty if it may have."""
+    """Returns why a system has no law (28) by its numbers of inputs and outputs, else ""."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
         return "there is no control input, so no output can be controlled"
@@ -231,14 +230,8 @@ def why_no_law(system: DaeSystem) -> str:
     return ""
 
 
-def _check_counts(system: DaeSystem) -> None:
-    why = why_no_law(system)
-    if why:
-        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
-
-
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
-    """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
+    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular.
 
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
@@ -254,10 +247,10 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         ca.SX(1, samples.system.num_controls) if degree else elimination.n_star[i, :]
         for i, degree in enumerate(degrees)
     ]
-    known = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
-    known["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
+    attributes = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
+    attributes["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
     return Structure(
-        **known,
+        **attributes,
         output_degrees=degrees,
         output_chains=outputs.chains,
         highest_derivatives=outputs.highest_derivatives,
@@ -270,7 +263,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 
 def _check_metric(samples: Samples) -> None:
-    """Refuses an invalid `control_metric`.
+    """Checks the `control_metric`.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
@@ -288,7 +281,7 @@ def _check_metric(samples: Samples) -> None:
 
 
 def control_violation(structure: Structure) -> Violation | None:
-    """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
+    """Returns the violation of Assumption (4) or (5) by a singular B(x); None if it is regular."""
     causes = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
     margin, degrees = structure.control_margin, structure.output_degrees
     signals = structure.system.output_signals

@@ -20,7 +20,7 @@ def called_functions(
     labels: Mapping[str, Any],
     fields: Sequence[str],
 ) -> dict[str, Any]:
-    """The fields of a `DaeSystem` whose functions are given in Python; see `from_functions`.
+    """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`.
 
     Args:
         state: Names (or Signals) of the states, or their number n.
@@ -33,11 +33,11 @@ def called_functions(
         ModelError: A name is wrong, or a function fails.
     """
     owner = labels.get("name", "system")
-    own = {"state", "parameters", "state_signals", *"fghklm"}
-    known = [item for item in fields if item not in own]
+    fixed = {"state", "parameters", "state_signals", *"fghklm"}
+    allowed = [item for item in fields if item not in fixed]
     for label in labels:
-        if label not in known:
-            raise ModelError(f"{owner}: {unknown_name('field', label, known)}")
+        if label not in allowed:
+            raise ModelError(f"{owner}: {unknown_name('field', label, allowed)}")
     bad = [name for name in parameters if not name.isidentifier()]
     if bad:
         raise ModelError(f"parameter names must be Python identifiers, to be read as p.name: {bad}")
@@ -52,7 +52,7 @@ def called_functions(
     arguments: list[Any] = [x]
     if defined:
         arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
-    values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
+    values = {key: call(owner, key, function, arguments) for key, function in functions.items()}
     if values["h"].shape[0] == 1 and x.numel() != 1:
         values["h"] = values["h"].T
     return {"state": x, **values, "parameters": defined, "state_signals": named, **labels}

@@ -15,46 +15,44 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import check_choice
 
 
-def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a system, converted from the given ones.
+def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Checks the fields of a system and returns them converted.
 
     Args:
-        given: Every field by its name; see `DaeSystem`.
+        arguments: Name -> value of every field; see `DaeSystem`.
 
     Raises:
         ModelError: They do not form a system; see `DaeSystem`.
     """
-    name = given["name"]
+    name = arguments["name"]
     if not isinstance(name, str):
         raise ModelError(f"the name of a system must be text, got {name!r}")
-    state = given["state"]
+    state = arguments["state"]
     if not (is_symbol(state) and state.numel()):
         raise ModelError(
             f"{name}: 'state' must be a CasADi SX column of symbols, "
             f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
         )
-    check_choice(name, given["compiled"])
+    check_choice(name, arguments["compiled"])
     for key in ("least_margin", "negligible"):
-        number = numbers(f"{name}: {key}", given[key])
+        number = numbers(f"{name}: {key}", arguments[key])
         if number.ndim or not 1e-15 <= number < 1.0:
             raise ModelError(
                 f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{brief(given[key])}"
+                f"{brief(arguments[key])}"
             )
-    if not (
-        isinstance(given["contacts"], (list, tuple))
-        and all(isinstance(contact, UnilateralInput) for contact in given["contacts"])
+    contacts = arguments["contacts"]
+    if not isinstance(contacts, (list, tuple)) or not all(
+        isinstance(contact, UnilateralInput) for contact in contacts
     ):
-        raise ModelError(
-            f"{name}: contacts must be a list of Contacts, got {brief(given['contacts'])}"
-        )
+        raise ModelError(f"{name}: contacts must be a list of Contacts, got {brief(contacts)}")
     state = ca.vec(state)
-    parameters = _parameters(name, given["parameters"])
-    for contact in given["contacts"]:
+    parameters = _parameters(name, arguments["parameters"])
+    for contact in contacts:
         if contact.friction is not None:
             parameter_slice(name, parameters, contact.friction)
-    expressions = _expressions(given, state, parameters)
-    found = {"state": state, "parameters": parameters, **expressions}
+    expressions = _expressions(arguments, state, parameters)
+    fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
     for key, count, letter in (
@@ -64,60 +62,64 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         ("control_signals", p, "u"),
         ("output_signals", q, "z"),
     ):
-        found[key] = _signals(name, key, given[key], count, letter)
-    found |= _numbers(name, given, n)
-    found |= _choice(name, given, p, q)
-    return found
+        fields[key] = _signals(name, key, arguments[key], count, letter)
+    fields |= _numbers(name, arguments, n)
+    fields |= _choice(name, arguments, p, q)
+    return fields
 
 
-def _parameters(name: str, given: Any) -> tuple[Parameter, ...]:
-    parameters: Any = given if isinstance(given, (list, tuple)) else [None]
+def _parameters(name: str, argument: Any) -> tuple[Parameter, ...]:
+    parameters: Any = argument if isinstance(argument, (list, tuple)) else [None]
     if not all(isinstance(parameter, Parameter) for parameter in parameters):
-        raise ModelError(f"{name}: parameters must be a list of Parameters, got {brief(given)}")
+        raise ModelError(f"{name}: parameters must be a list of Parameters, got {brief(argument)}")
     check_unique(name, "parameter", [p.name for p in parameters])
     return tuple(parameters)
 
 
 def _expressions(
-    given: Mapping[str, Any], state: ca.SX, parameters: Sequence[Parameter]
+    arguments: Mapping[str, Any], state: ca.SX, parameters: Sequence[Parameter]
 ) -> dict[str, ca.SX]:
-    """The functions of (1)-(3), E, and how the control is chosen, as expressions that fit."""
-    functions = {key: given[key] for key in ("f", "g", "h", "k", "l", "m")}
-    mass = given["mass_matrix"]
+    """The functions of (1)-(3), E, the control metric and u_0, as expressions of right shapes."""
+    functions = {key: arguments[key] for key in ("f", "g", "h", "k", "l", "m")}
+    mass = arguments["mass_matrix"]
     functions["mass_matrix"] = ca.SX.eye(state.numel()) if mass is None else mass
-    chosen = {key: given[key] for key in ("control_metric", "free_control")}
+    chosen = {key: arguments[key] for key in ("control_metric", "free_control")}
     functions |= {key: value for key, value in chosen.items() if value is not None}
-    return as_functions(given["name"], functions, state, parameter_symbol(parameters))
+    return as_functions(arguments["name"], functions, state, parameter_symbol(parameters))
 
 
 def _signals(
-    name: str, key: str, given: Sequence[Any], count: int, letter: str
+    name: str, key: str, argument: Sequence[Any], count: int, letter: str
 ) -> tuple[Signal, ...]:
-    """Names and units of a vector, made up where not given."""
-    signals = as_signals(f"{name}: {key}", given or [f"{letter}{i}" for i in range(count)])
+    """Names and units of a vector, with default names such as x0, x1."""
+    signals = as_signals(f"{name}: {key}", argument or [f"{letter}{i}" for i in range(count)])
     if len(signals) != count:
         raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
     check_unique(name, key, [signal.name for signal in signals])
     return signals
 
 
-def _numbers(name: str, given: Mapping[str, Any], size: int) -> dict[str, FloatArray]:
-    """The nominal state, and how large states are where that is given."""
-    start = np.zeros(size) if given["nominal_state"] is None else given["nominal_state"]
-    found = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
-    if given["state_scale"] is not None:
-        scale = vector(f"{name}: state_scale", given["state_scale"], size)
+def _numbers(name: str, arguments: Mapping[str, Any], size: int) -> dict[str, FloatArray]:
+    """The nominal state, and the scale of the states if there is one."""
+    start = np.zeros(size) if arguments["nominal_state"] is None else arguments["nominal_state"]
+    arrays = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
+    if arguments["state_scale"] is not None:
+        scale = vector(f"{name}: state_scale", arguments["state_scale"], size)
         if not np.all(scale > 0.0):
             raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
-        found["state_scale"] = scale
-    for array in found.values():
+        arrays["state_scale"] = scale
+    for array in arrays.values():
         array.setflags(write=False)
-    return found
+    return arrays
 
 
-def _choice(name: str, given: Mapping[str, Any], controls: int, outputs: int) -> dict[str, ca.SX]:
+def _choice(
+    name: str, arguments: Mapping[str, Any], controls: int, outputs: int
+) -> dict[str, ca.SX]:
     """The default of u_0; refuses u_0 without a metric, and a metric that is not needed."""
-    has_metric, has_free = (given[key] is not None for key in ("control_metric", "free_control"))
+    has_metric, has_free = (
+        arguments[key] is not None for key in ("control_metric", "free_control")
+    )
     if has_free and not has_metric:
         raise ModelError(f"{name}: free_control needs a control_metric that it is near in")
     if has_metric and controls <= outputs:

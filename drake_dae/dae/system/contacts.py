@@ -31,7 +31,7 @@ MOST = 8
 
 @dataclass(frozen=True)
 class UnilateralInput:
-    """A constraint input that can only push.
+    """A constraint input that must not be negative: a contact force that can only push.
 
     Attributes:
         force: The name of the constraint input, which acts on the constraint in the same place.
@@ -43,7 +43,7 @@ class UnilateralInput:
 
 
 class PainleveOutcome(Enum):
-    """The number of motions in a Painleve paradox; the value describes it."""
+    """The number of possible motions in a Painleve paradox; the enum value is a description."""
 
     INCONSISTENT = (
         "inconsistent: no compressive force maintains the contact, and without a force there "
@@ -57,7 +57,7 @@ class PainleveOutcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """The contacts of a system, where friction acts on one of them.
+    """The unilateral contacts of a system in which at least one contact has friction.
 
     Args:
         owner: The name of the system, for messages.
@@ -92,32 +92,32 @@ class Contacts:
 
     @property
     def rows(self) -> list[int]:
-        return list(self._found)
+        return list(self._friction_of_rows)
 
     @property
     def frictions(self) -> list[Parameter | None]:
-        return list(self._found.values())
+        return list(self._friction_of_rows.values())
 
     @property
-    def _found(self) -> dict[int, Parameter | None]:
+    def _friction_of_rows(self) -> dict[int, Parameter | None]:
         names = [signal.name for signal in self.inputs]
-        known = {parameter.name: parameter for parameter in self.parameters}
+        by_name = {parameter.name: parameter for parameter in self.parameters}
         return {
-            names.index(contact.force): known[contact.friction] if contact.friction else None
+            names.index(contact.force): by_name[contact.friction] if contact.friction else None
             for contact in self.contacts
             if contact.force in names
         }
 
     def without_friction(self, matrix: ca.SX) -> ca.SX:
-        """An expression with all coefficients of friction zero."""
+        """Returns an expression with all coefficients of friction set to zero."""
         if not self:
             return matrix
-        own = {p.name: p.symbol for p in self.frictions if p}  # Contacts may share a coefficient.
-        symbols = ca.vertcat(*own.values())
+        # Contacts may share a coefficient.
+        symbols = ca.vertcat(*{p.name: p.symbol for p in self.frictions if p}.values())
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:
-        """The smallest principal minor of A(x), each divided by its value without friction.
+        """Returns the smallest principal minor of A(x), relative to its value without friction.
 
         Minors are those of sets of contacts with all other constraints, of which none can open. The
         least ratio is the same in any order of the contacts and in any units, 1 without friction,
@@ -130,9 +130,9 @@ class Contacts:
             A scalar. Where it is not positive, only its sign has a meaning.
         """
         smallest = ca.SX(1)
-        kept = [i for i in range(matrix.shape[0]) if i not in self.rows]
+        others = [i for i in range(matrix.shape[0]) if i not in self.rows]
         both = [matrix, self.without_friction(matrix)]
-        for i in kept:  # Positive without friction, of which these constraints have none.
+        for i in others:  # These constraints have no friction, so their pivots are positive.
             both = [_eliminated(part, i) for part in both]
         for minor, without in zip(*(_minors(part, self.rows) for part in both), strict=True):
             smallest = ca.fmin(smallest, minor / without)
@@ -140,7 +140,7 @@ class Contacts:
 
 
 def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
-    """The Schur complement after row and column i, which stay where they are."""
+    """The Schur complement of entry (i, i), in the shape of the matrix."""
     return matrix - ca.mtimes(matrix[:, i], matrix[i, :]) / matrix[i, i]
 
 
@@ -153,7 +153,7 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
     Args:
         matrix: A, shape (m, m).
         rows: The rows.
-        before: What minors are multiplied by: the pivots of rows that are eliminated.
+        before: The product of the pivots of eliminated rows, by which minors are multiplied.
     """
     if rows:
         first, *others = rows
@@ -165,7 +165,7 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
 
 
 def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
-    """The smallest s > 0 for which a principal minor of A_0 - s D is zero, infinite if none is.
+    """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity.
 
     Args:
         without: A_0, A(x) without friction, shape (m, m).
@@ -188,7 +188,7 @@ def painleve_outcome(
     size: FloatArray,
     rows: Sequence[int],
 ) -> PainleveOutcome | None:
-    """The outcome of a Painleve paradox, by the linear complementarity problem of all sets.
+    """Determines the outcome of a Painleve paradox by the linear complementarity problem.
 
     Args:
         matrix: A(x), shape (m, m).
@@ -215,10 +215,10 @@ def painleve_outcome(
             force[used] = np.linalg.solve(matrix[np.ix_(used, used)], -free[used])
         except np.linalg.LinAlgError:
             return None
-        kept = np.isin(rows, used)
+        closed = np.isin(rows, used)
         rate = (matrix @ force + free)[rows]
-        if np.all(force[rows][kept] >= 0.0) and np.all(rate[~kept] >= 0.0):
-            fitting.append(kept)
+        if np.all(force[rows][closed] >= 0.0) and np.all(rate[~closed] >= 0.0):
+            fitting.append(closed)
     if not fitting:
         return PainleveOutcome.INCONSISTENT
     if len(fitting) > 1:
@@ -227,8 +227,8 @@ def painleve_outcome(
 
 
 def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
-    """Every set of contacts, each together with all bilateral constraints."""
-    kept = [i for i in range(size) if i not in rows]
+    """Generates every set of contacts, each together with all bilateral constraints."""
+    always = [i for i in range(size) if i not in rows]
     counts = range(0 if with_none else 1, len(rows) + 1)
     for chosen in chain.from_iterable(combinations(rows, count) for count in counts):
-        yield [*kept, *chosen]
+        yield [*always, *chosen]

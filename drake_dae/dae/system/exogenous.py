@@ -11,7 +11,7 @@ from drake_dae.errors import ModelError
 
 @dataclass(frozen=True, eq=False)
 class Exogenous:
-    """The parameters of a system that move, w, with symbols for their derivatives.
+    """The exogenous parameters w of a system, with symbols for their time derivatives.
 
     Attributes:
         owner: The name of the system, for messages.
@@ -23,7 +23,7 @@ class Exogenous:
 
     @property
     def moving(self) -> tuple[Parameter, ...]:
-        """The parameters that move."""
+        """The exogenous parameters."""
         return tuple(p for p in self.parameters if p.exogenous)
 
     def __bool__(self) -> bool:
@@ -35,24 +35,24 @@ class Exogenous:
         return tuple(signal for p in self.moving for signal in p.signals)
 
     def rate(self, expression: ca.SX) -> ca.SX:
-        """The part sum_j (d/dw^(j)) w^(j+1) of the time derivative of an expression, shape (k, 1).
+        """Returns the part sum_j (d/dw^(j)) w^(j+1) of a time derivative, shape (k, 1).
 
         Raises:
             ModelError: The expression needs more derivatives of w than are available.
         """
         rate = ca.SX(expression.numel(), 1)
         for p in self.moving:
-            known = (p.symbol, *p.derivatives)
-            if ca.depends_on(expression, known[-1]):
+            levels = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, levels[-1]):
                 raise ModelError(
                     f"{self.owner}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
                     "needed"
                 )
-            rate += ca.jtimes(expression, ca.vertcat(*known[:-1]), ca.vertcat(*known[1:]))
+            rate += ca.jtimes(expression, ca.vertcat(*levels[:-1]), ca.vertcat(*levels[1:]))
         return rate
 
     def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
-        """How many derivatives of each entry of w some expressions depend on."""
+        """Returns the number of derivatives of each entry of w on which expressions depend."""
         every = ca.veccat(*expressions)
         degrees: list[int] = []
         for p in self.moving:
@@ -62,18 +62,18 @@ class Exogenous:
         return tuple(degrees)
 
     def places(self, degrees: Sequence[int]) -> list[int]:
-        """Where W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) stands in `DaeSystem.parameter_symbol`.
+        """Returns the indices of W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) in the parameter vector.
 
         Args:
             degrees: d_1, d_2, ..., one for each entry of w.
         """
         start, following = 0, sum(p.value.size for p in self.parameters)
-        places, left = [], iter(degrees)
+        places, remaining = [], iter(degrees)
         for p in self.parameters:
             size = p.value.size
             if p.exogenous:
                 for i in range(size):
-                    rates = range(next(left))
+                    rates = range(next(remaining))
                     places += [start + i, *(following + order * size + i for order in rates)]
                 following += size * len(p.derivatives)
             start += size

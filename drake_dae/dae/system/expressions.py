@@ -18,11 +18,11 @@ from drake_dae.trace.smoothness import find_flaw
 
 
 def as_expression(owner: str, key: str, value: Any) -> ca.SX:
-    """An SX matrix from an SX, a number, an array, or a (nested) list of these.
+    """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix.
 
     Args:
         owner: The name of the system, for messages.
-        key: What the value is, for messages.
+        key: The name of the value, for messages.
         value: A list of lists is a matrix, row by row.
 
     Raises:
@@ -45,13 +45,13 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 
 
 def as_functions(
-    owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
+    owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """The given functions of (1)-(3) and others as expressions of the right shapes.
+    """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them.
 
     Args:
         owner: The name of the system, for messages.
-        given: Name of a function -> what `as_expression` takes.
+        functions: Name -> what `as_expression` takes.
         state: x, shape (n, 1).
         parameters: The symbols of all parameters, below each other.
 
@@ -59,13 +59,13 @@ def as_functions(
         ModelError: A shape does not fit, a symbol is neither state nor parameter, a constant is
             not finite, or a function is not smooth in the state.
     """
-    values = {key: as_expression(owner, key, value) for key, value in given.items()}
+    values = {key: as_expression(owner, key, value) for key, value in functions.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()
     shapes = {"f": (n, 1), "g": (n, m), "h": (n, p), "k": (m, 1), "l": (q, 1), "m": (q, m)}
     shapes |= {"mass_matrix": (n, n), "control_metric": (p, p), "free_control": (p, 1)}
-    known = ca.vertcat(state, parameters)
-    if len(ca.symvar(known)) != known.numel():
+    allowed = ca.vertcat(state, parameters)
+    if len(ca.symvar(allowed)) != allowed.numel():
         raise ModelError(f"{owner}: a symbol occurs twice among the states and parameters")
     for key, value in values.items():
         shape = shapes[key]
@@ -75,7 +75,7 @@ def as_functions(
             value = value.T
         if value.shape != shape:
             raise ModelError(f"{owner}: {_misshapen(key, value, shape, (n, m, p, q))}")
-        unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(known, s)]
+        unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(allowed, s)]
         if unknown:
             raise ModelError(
                 f"{owner}: {key} depends on {', '.join(unknown)}, which is neither a "
@@ -99,7 +99,7 @@ def _misshapen(
 
 
 def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, other: ca.SX) -> None:
-    """Refuses expressions that can be evaluated but are not smooth."""
+    """Checks that expressions are smooth; CasADi also evaluates those that are not."""
     if find_flaw(ca.veccat(*values.values()), state, other) is None:
         return
     for key, value in values.items():
@@ -113,7 +113,7 @@ def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, oth
 
 
 def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
-    """Refuses names that occur twice.
+    """Checks that no name occurs twice.
 
     Raises:
         ModelError: A name occurs twice.
@@ -123,15 +123,15 @@ def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
         raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")
 
 
-def as_signals(what: str, given: Any) -> tuple[Signal, ...]:
-    """Signals from a list of these, or of names of signals without unit.
+def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
+    """Converts a list of signals, or of names of signals without unit, to signals.
 
     Raises:
         ModelError: An entry is neither.
     """
-    items = [given] if isinstance(given, str) or not isinstance(given, Sequence) else given
+    items = [signals] if isinstance(signals, str) or not isinstance(signals, Sequence) else signals
     bad = [item for item in items if not isinstance(item, (Signal, str))]
-    if items is not given or bad:
+    if items is not signals or bad:
         raise ModelError(f"{what} must be a list of names or Signals, got {(bad or items)[0]!r}")
     return tuple(Signal(item) if isinstance(item, str) else item for item in items)
 
@@ -139,7 +139,7 @@ def as_signals(what: str, given: Any) -> tuple[Signal, ...]:
 def call(
     owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
 ) -> ca.SX:
-    """The expression that a user's function of symbols returns; empty without a function.
+    """Calls a user's function with symbols and returns its expression; empty without a function.
 
     Args:
         owner: The name of the system, for messages.
@@ -171,7 +171,7 @@ def call(
 
 
 def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    """The text of an error in a user's function, and what it means here."""
+    """Explains an error in a user's function."""
     text = str(error)
     try:
         signature(function).bind(*arguments)

@@ -10,13 +10,13 @@ from drake_dae.errors import ModelError
 
 
 def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
-    """The symbols of all parameters in one column; then w', w'', ... of those that move."""
+    """Returns the symbols of all parameters in one column, then w', w'', ... of exogenous ones."""
     rates = [rate for p in parameters if p.exogenous for rate in p.derivatives]
     return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters], *rates)
 
 
 def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
-    """The slice of a parameter in the vector of all.
+    """Returns the slice of a parameter in the parameter vector.
 
     Raises:
         ModelError: No parameter has that name.

@@ -84,10 +84,10 @@ def natural_scale(
     parameters: tuple[ca.SX, FloatArray],
     nominal: FloatArray,
 ) -> FloatArray:
-    """Half the sizes of the states at which the terms of the equations (1)-(3) are equally large.
+    """Computes half the state sizes for which the terms of the equations (1)-(3) are equally large.
 
     The equations are expanded in Taylor series around the nominal state. A term c x_i^a x_j^b has
-    the size |c| s_i^a s_j^b, where s are the sizes wanted; a derivative x_i' has the size w s_i
+    the size |c| s_i^a s_j^b, where s are the unknown sizes; a derivative x_i' has the size w s_i
     with a common rate w; inputs and equations have sizes of their own. The logarithms are linear in
     those of the unknowns, so that a fit makes the terms of each equation as alike as they can be.
     The sizes do not depend on the units of states, inputs and equations. Where the equations leave
@@ -148,26 +148,26 @@ def _alike(comparisons: list[_Comparison]) -> FloatArray:
     The sum of sqrt(1 + residual^2) is minimized, which is robust against a few outliers.
     """
     unknowns, logarithms, equation, weight, is_plain = map(np.array, zip(*comparisons, strict=True))
-    kept: Booleans = is_plain
-    found = np.zeros(unknowns.shape[1])
+    relevant: Booleans = is_plain
+    solution = np.zeros(unknowns.shape[1])
     for _ in range(SELECTIONS):
-        weights = kept * weight
+        weights = relevant * weight
         for _ in range(REPETITIONS):
-            factors, last = np.sqrt(weights), found
-            found = np.linalg.lstsq(factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9)[
-                0
-            ]
-            left = unknowns @ found + logarithms
-            weights = kept * weight / np.sqrt(1.0 + left * left)
-            if np.max(np.abs(found - last)) < CONVERGED:
+            factors, last = np.sqrt(weights), solution
+            solution = np.linalg.lstsq(
+                factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9
+            )[0]
+            residuals = unknowns @ solution + logarithms
+            weights = relevant * weight / np.sqrt(1.0 + residuals * residuals)
+            if np.max(np.abs(solution - last)) < CONVERGED:
                 break
         largest = np.zeros(unknowns.shape[1])
-        np.maximum.at(largest, equation, left)
-        significant = left > largest[equation] + NEGLIGIBLE
-        if np.array_equal(significant, kept):
+        np.maximum.at(largest, equation, residuals)
+        significant = residuals > largest[equation] + NEGLIGIBLE
+        if np.array_equal(significant, relevant):
             break
-        kept = significant
-    return found
+        relevant = significant
+    return solution
 
 
 def _terms(
@@ -223,7 +223,7 @@ def _linear_part(
 
 
 def spread_about(state: FloatArray, scale: FloatArray) -> FloatArray:
-    """The default standard deviation of random states around one, shape (n,): 0.1 of their scale.
+    """Returns the default standard deviation of random states around a state: 0.1 of the scale.
 
     It is a hundredth of a value above 10 scales, and a tenth of one below 1e-3 scales that is not
     round-off.

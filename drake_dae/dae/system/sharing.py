@@ -9,7 +9,7 @@ from drake_dae.dae.system.signals import Signal
 
 @dataclass(frozen=True, eq=False)
 class ForceSharing:
-    """All constraint inputs of a system, of whose redundant constraints some were left out.
+    """The distribution of forces among redundant constraints, some of which are removed.
 
     The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
     the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.

@@ -16,7 +16,7 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class Signal:
-    """A scalar of a vector signal.
+    """One scalar component of a vector signal: its name and its unit.
 
     Attributes:
         name: Its name, unique in its vector.
@@ -30,7 +30,7 @@ class Signal:
         check_writable("the name of a signal", self.name)
 
     def derivative(self, order: int) -> "Signal":
-        """Its time derivative: x -> x', x'', ..., with the unit to match."""
+        """Returns the signal of a time derivative: x -> x', x'', ..., with the matching unit."""
         if order == 0:
             return self
         per_time = "/s" if order == 1 else f"/s^{order}"
@@ -49,7 +49,7 @@ to five parameters before they divide."""
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """A number, or a vector of numbers, that a study changes without tracing again.
+    """A number, or a vector of numbers, whose value can change without tracing the equations again.
 
     An exogenous one is a signal w(t) that is not controlled but has known derivatives, as a
     reference has: the position of a moving surface, a known load, time.
@@ -118,7 +118,7 @@ class Parameter:
 
     @property
     def low(self) -> FloatArray:
-        """The lowest values that are examined, shape (k,)."""
+        """The lowest values for which relative degrees are checked, shape (k,)."""
         if self.bounds is not None:
             return np.broadcast_to(np.asarray(self.bounds[0], dtype=float), self.value.shape)
         least = -1.0 if not (self.positive or self.nonnegative) else 0.0
@@ -126,7 +126,7 @@ class Parameter:
 
     @property
     def high(self) -> FloatArray:
-        """The highest values that are examined, shape (k,)."""
+        """The highest values for which relative degrees are checked, shape (k,)."""
         if self.bounds is not None:
             return np.broadcast_to(np.asarray(self.bounds[1], dtype=float), self.value.shape)
         return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
@@ -144,7 +144,7 @@ class Parameter:
         return self.derivatives[0] if self.derivatives else ca.SX(self.value.size, 1)
 
     def check(self, value: FloatArray) -> None:
-        """Refuses values outside the range of the parameter.
+        """Checks that values are within the range of the parameter.
 
         Raises:
             ModelError: A number is not finite, has the wrong sign, or exceeds `LARGEST`.
@@ -168,19 +168,19 @@ class Parameter:
 
 
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
-    """Signals that share a unit."""
+    """Returns signals of the given names that share a unit."""
     return tuple(Signal(name, unit) for name in names)
 
 
 def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Parameter, ...]:
-    """The same parameters; those with the given names are exogenous."""
+    """Returns the parameters, with those of the given names as exogenous signals."""
     return tuple(
         replace(p, exogenous=True) if p.name in names and not p.exogenous else p for p in parameters
     )
 
 
 def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parameter:
-    """The same parameter, with the same symbols, within bounds.
+    """Returns a parameter with bounds and with the same symbols.
 
     Raises:
         ModelError: The bounds are not valid, or the value is outside of them.
@@ -189,17 +189,17 @@ def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parame
 
 
 def valued(parameter: Parameter, value: ArrayLike) -> Parameter:
-    """The same parameter, with the same symbols, with another default; a number for all entries.
+    """Returns a parameter with another default and the same symbols; one number sets all entries.
 
     Raises:
         ModelError: The value does not fit, or is out of the parameter's range.
     """
-    given = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
-    if given.shape not in ((1,), parameter.value.shape):
+    entries = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
+    if entries.shape not in ((1,), parameter.value.shape):
         raise ModelError(
             f"parameter '{parameter.name}' has {parameter.value.size} entries, got {value!r}"
         )
-    full = np.broadcast_to(given, parameter.value.shape).copy()
+    full = np.broadcast_to(entries, parameter.value.shape).copy()
     return _same_symbols(parameter, replace(parameter, value=full))
 
 

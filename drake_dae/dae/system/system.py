@@ -127,8 +127,8 @@ class DaeSystem:
     negligible: float = NEGLIGIBLE
 
     def __post_init__(self) -> None:
-        given = {item.name: getattr(self, item.name) for item in fields(self)}
-        for key, value in checked_fields(given).items():
+        arguments = {item.name: getattr(self, item.name) for item in fields(self)}
+        for key, value in checked_fields(arguments).items():
             object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
@@ -179,7 +179,7 @@ class DaeSystem:
 
     @cached_property
     def explicit(self) -> "DaeSystem":
-        """The same system with E = 1: f, g and h are those of the paper."""
+        """The equivalent system with E = 1, whose f, g and h are those of the paper."""
         if ca.is_equal(self.mass_matrix, ca.SX.eye(self.num_states)):
             return self
         fields = ca.horzcat(self.f, self.g, self.h)
@@ -197,7 +197,7 @@ class DaeSystem:
 
     @cached_property
     def fields(self) -> TracedFunction:
-        """f, g, h, l and m of the system with E = 1, as a function of state and parameters."""
+        """The function (state, parameters) -> f, g, h, l, m of the system with E = 1."""
         e = self.explicit
         outputs = {"f": e.f, "g": e.g, "h": e.h, "l": e.l, "m": e.m}
         return self.trace("fields", outputs, often=False)
@@ -219,32 +219,32 @@ class DaeSystem:
 
     @property
     def num_outputs(self) -> int:
-        """The number of controlled outputs; a law (28) needs as many as controls."""
+        """The number of controlled outputs. The law (28) needs as many outputs as controls."""
         return int(self.l.numel())
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
-        """Names and units of all constraint inputs, those of redundant constraints included."""
+        """Names and units of all constraint inputs, including those of redundant constraints."""
         return self.constraint_input_signals if self.sharing is None else self.sharing.signals
 
     def forces(self, constraint_input: ca.SX) -> ca.SX:
-        """All constraint inputs, one for each of `force_signals`, of v, shape (m, 1)."""
+        """Returns all constraint inputs, named by `force_signals`, from v of shape (m, 1)."""
         if self.sharing is None:
             return constraint_input
         return ca.mtimes(self.sharing.split, constraint_input)
 
     def outputs(self, constraint_input: ca.SX) -> ca.SX:
-        """z = l(x) + m(x) v (3) of v, shape (m, 1): the controlled outputs, shape (p, 1)."""
+        """Returns the controlled outputs z = l(x) + m(x) v (3), shape (p, 1)."""
         return self.l + ca.mtimes(self.m, constraint_input)  # (3)
 
     @cached_property
     def parameter_symbol(self) -> ca.SX:
-        """The symbols of all parameters in one column; then w', w'', ... of those that move."""
+        """The symbols of all parameters in one column, then w', w'', ... of exogenous ones."""
         return parameter_symbol(self.parameters)
 
     @property
     def parameter_values(self) -> FloatArray:
-        """The defaults of all parameters as `parameter_symbol`; derivatives are zero."""
+        """The default parameter vector, as `parameter_symbol`; derivatives are zero."""
         return self._defaults.copy()
 
     @cached_property
@@ -254,17 +254,17 @@ class DaeSystem:
 
     @cached_property
     def exogenous(self) -> Exogenous:
-        """The parameters that move, w, and how they enter time derivatives."""
+        """The exogenous parameters w, and the terms that they add to time derivatives."""
         return Exogenous(self.name, self.parameters)
 
     @cached_property
     def frictional_contacts(self) -> Contacts:
-        """The unilateral contacts, if friction acts on one of them; see `dae.system.contacts`."""
+        """The unilateral contacts; it is true if at least one of them has friction."""
         return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
 
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
-        """The same system with some parameters as exogenous signals.
+        """Returns the same system with some parameters as exogenous signals.
 
         Raises:
             ModelError: No parameter has that name.
@@ -275,7 +275,7 @@ class DaeSystem:
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
-        """The same system with bounds for some parameters.
+        """Returns the same system with bounds for some parameters.
 
         Relative degrees must be the same for all values of the parameters: an input acts on a
         derivative for all of them or for none. Bounds restrict the values to those for which this
@@ -288,18 +288,11 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name, or bounds are not valid.
         """
-        for name in bounds:
-            self.parameter_slice(name)
-        return replace(
-            self,
-            parameters=tuple(
-                bounded(p, bounds[p.name]) if p.name in bounds else p for p in self.parameters
-            ),
-        )
+        return self._with_parameters(bounded, bounds)
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
-        """The same system with other defaults of some parameters.
+        """Returns the same system with other default values of some parameters.
 
         Args:
             values: Name -> its default, a number for all entries or one for each.
@@ -307,14 +300,17 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name, or a value does not fit.
         """
+        return self._with_parameters(valued, values)
+
+    def _with_parameters(
+        self, changed: Callable[[Parameter, Any], Parameter], values: Mapping[str, Any]
+    ) -> "DaeSystem":
         for name in values:
             self.parameter_slice(name)
-        return replace(
-            self,
-            parameters=tuple(
-                valued(p, values[p.name]) if p.name in values else p for p in self.parameters
-            ),
-        )
+        parameters = [
+            changed(p, values[p.name]) if p.name in values else p for p in self.parameters
+        ]
+        return replace(self, parameters=tuple(parameters))
 
     @property
     def parameter_box(self) -> tuple[FloatArray, FloatArray]:
@@ -350,7 +346,7 @@ class DaeSystem:
         return self.usual_spread(self.nominal_state)
 
     def usual_spread(self, state: ArrayLike) -> FloatArray:
-        """The default standard deviation of random states around one, shape (n,).
+        """Returns the default standard deviation of random states around a state, shape (n,).
 
         Raises:
             ModelError: The state has a wrong shape, or a number is not finite.
@@ -368,7 +364,7 @@ class DaeSystem:
         doubt: ca.SX | None = None,
         lean: bool = False,
     ) -> TracedFunction:
-        """Expressions as a fast function of the state, of other inputs and of the parameters.
+        """Compiles expressions to a function of the state, of other inputs and of the parameters.
 
         Args:
             name: The name of the outputs in messages.
@@ -381,7 +377,7 @@ class DaeSystem:
         )
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
-        """Values of all parameters in the order of `parameter_symbol`; the defaults if None.
+        """Checks a parameter vector, ordered as `parameter_symbol`; the default if None.
 
         The array may be shared: do not change it.
 
@@ -401,7 +397,7 @@ class DaeSystem:
 
     @checked(ModelError)
     def parameters_of(self, other: "DaeSystem", values: ArrayLike) -> FloatArray:
-        """The parameters of this system as another one has them; else the defaults.
+        """Returns the parameter vector of this system with the values that another system has.
 
         Those are taken that have the same name and size in both.
 
@@ -418,17 +414,17 @@ class DaeSystem:
                 f"{self.name}: values must have shape ({size},) or (samples, {size}), got "
                 f"{values.shape}"
             )
-        found = np.empty((*values.shape[:-1], self._defaults.size))
-        found[...] = self._defaults
+        parameters = np.empty((*values.shape[:-1], self._defaults.size))
+        parameters[...] = self._defaults
         sizes = {p.name: p.value.size for p in other.parameters}
         for p in self.parameters:
             if sizes.get(p.name) == p.value.size:
-                own = self.parameter_slice(p.name)
-                found[..., own] = values[..., other.parameter_slice(p.name)]
-        return found
+                place = self.parameter_slice(p.name)
+                parameters[..., place] = values[..., other.parameter_slice(p.name)]
+        return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
-        """A state as a new array of shape (n,).
+        """Checks a state and returns it as a new array of shape (n,).
 
         Raises:
             ModelError: The shape is wrong, or a number is not finite.
@@ -437,7 +433,7 @@ class DaeSystem:
 
     @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
-        """The slice of a parameter in `parameter_values`.
+        """Returns the slice of a parameter in the parameter vector.
 
         Raises:
             ModelError: No parameter has that name.

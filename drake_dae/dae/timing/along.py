@@ -27,13 +27,13 @@ COARSE = 16
 
 
 class AlongCurve:
-    """The tracking law's own feedforward along a curve, equations (28), (35) without error.
+    """The feedforward of the tracking law along a curve: (28), (35) without tracking error.
 
-    On Z(R), where all outputs are on their references, (28) is u = B^-1 (-a + r^(mu)), and (25) is
-    v = alpha + beta u. With r' = r_s w, r'' = r_ss w^2 + r_s a both are affine in a at a given
-    speed w = s', and affine in (a, b), b = w^2, for a rigid robot without friction:
+    On Z(R), where all outputs are on their references, (28) is u = B^-1 (r^(mu) - a(x)), and (25)
+    is v = alpha + beta u. With r' = r_s s', r'' = r_ss s'^2 + r_s s'' both are affine in s'' for
+    a constant speed w = s'. For a rigid robot without friction they are affine in s'' and s'^2:
 
-        u = m(s) b + n(s) a + c(s).
+        u = m(s) s'^2 + n(s) s'' + c(s).
 
     Args:
         structure: The structure of the system: degrees 0 and 2, no zero dynamics.
@@ -58,16 +58,16 @@ class AlongCurve:
         reference = ca.SX.sym("R", self.layout.reference_size)
         goal = reference[self.layout.chained.tolist(), :]
         equations = ca.vertcat(residual, structure.chain - goal)
-        given = [state, reference, self.system.parameter_symbol]
+        inputs = [state, reference, self.system.parameter_symbol]
         gradients = ca.densify(ca.jacobian(equations, state))
-        newton = ca.Function("newton", given, ca.cse([ca.densify(equations), gradients]))
+        newton = ca.Function("newton", inputs, ca.cse([ca.densify(equations), gradients]))
         self._newton = ManyPoints(newton, self.system.compiled)
         control, _ = structure.control_for(reference[self.layout.highest.tolist(), :])  # (28)
-        values = ca.Function("along", given, ca.cse([self.limited.values(control)]))
+        values = ca.Function("along", inputs, ca.cse([self.limited.values(control)]))
         self._values = ManyPoints(values, self.system.compiled)
 
     def reference(self, piece: Piece, w: FloatArray, a: FloatArray) -> FloatArray:
-        """R at the points for speeds and accelerations along the curve, (N + 1, sum (mu_i + 1))."""
+        """Returns R at the points for speeds and accelerations, shape (N + 1, sum (mu_i + 1))."""
         rows, first = piece.values.copy(), self.layout.lowest[self.layout.dynamic]
         rows[:, first + 1] = piece.tangents * w[:, None]
         rows[:, first + 2] = piece.curvatures * w[:, None] ** 2 + piece.tangents * a[:, None]
@@ -76,7 +76,7 @@ class AlongCurve:
     def states_at_rest(
         self, piece: Piece, guess: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The states on Z(R) at rest at the points, and their derivatives by the speed w there.
+        """Returns the states on Z(R) at rest at the points, and their derivatives by the speed w.
 
         Returns:
             x, shape (N + 1, n), and dx/dw at w = 0, shape (N + 1, n).
@@ -85,8 +85,8 @@ class AlongCurve:
             ReferenceSignalError: A point is out of reach, or the path leads through a singular
                 configuration.
         """
-        count, still = len(piece.times) - 1, np.zeros(len(piece.times))
-        rest = self.reference(piece, still, still)
+        count, zero = len(piece.times) - 1, np.zeros(len(piece.times))
+        rest = self.reference(piece, zero, zero)
         places = np.unique(np.linspace(0, count, COARSE + 1).astype(int))
         coarse = []
         for row, time in zip(rest[places], piece.times[places], strict=True):
@@ -96,21 +96,21 @@ class AlongCurve:
                 where = f"at t = {time:.4g} s of the reference the path is out of reach"
                 raise ReferenceSignalError(f"{where}: {error}") from error
             coarse.append(guess)
-        found = np.array(coarse)
+        states = np.array(coarse)
         # By interpolation, then on finer grids.
         for number in (4 * COARSE, count):
             finer = np.unique(np.linspace(0, count, number + 1).astype(int))
-            start = _interpolated(places, found, finer)
-            found, places = self.states(rest[finer], start, parameters), finer
-        moving = self.reference(piece, still + 1.0, still) - rest
+            start = _interpolated(places, states, finer)
+            states, places = self.states(rest[finer], start, parameters), finer
+        moving = self.reference(piece, zero + 1.0, zero) - rest
         moving[:, self.layout.lowest[self.layout.dynamic] + 2] = 0.0
-        _, gradients = self._newton(found, rest, parameters)
-        goals = np.zeros(found.shape)
+        _, gradients = self._newton(states, rest, parameters)
+        goals = np.zeros(states.shape)
         goals[:, -self.layout.chain_size :] = moving[:, self.layout.chained]
-        return found, self._solved(gradients, goals)
+        return states, self._solved(gradients, goals)
 
     def states(self, rows: FloatArray, start: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The states on Z(R) of rows of R near given ones, by Newton's method, shape (k, n).
+        """Returns states on Z(R) for rows of R, by Newton's method from guesses, shape (k, n).
 
         Raises:
             ReferenceSignalError: It does not converge.
@@ -136,19 +136,19 @@ class AlongCurve:
             raise ReferenceSignalError(_SINGULAR.format(self.system.name)) from None
 
     def values(self, states: FloatArray, rows: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The limited signals for states on Z(R) and rows of R, shape (k, number of them)."""
+        """Returns the limited signals for states on Z(R) and rows of R, shape (k, signals)."""
         return self._values(states, rows, parameters)[0]
 
     def limited_states(self, states: FloatArray) -> FloatArray:
-        """The limited states, shape (k, number of them)."""
+        """Returns the limited states, shape (k, limited states)."""
         return states[:, self.limited.states]
 
 
-def _interpolated(places: np.ndarray, values: FloatArray, wanted: np.ndarray) -> FloatArray:
+def _interpolated(places: np.ndarray, values: FloatArray, targets: np.ndarray) -> FloatArray:
     """Values between places by a cubic spline."""
     from scipy.interpolate import CubicSpline  # It takes long to load.
 
-    return np.asarray(CubicSpline(places, values)(wanted))
+    return np.asarray(CubicSpline(places, values)(targets))
 
 
 def _check(structure: Structure) -> None:

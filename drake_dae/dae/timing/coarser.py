@@ -17,7 +17,7 @@ CLOSE = 1e-6
 
 
 def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomials:
-    """A table with fewer and longer pieces.
+    """Returns a table with fewer and longer pieces.
 
     A longer piece has r, r' and r'' of the given table at both ends, so that the result has as many
     continuous derivatives. Outputs that have no derivatives are interpolated at up to six times.
@@ -38,47 +38,49 @@ def coarser(table: PiecewisePolynomials, moving: Indices) -> PiecewisePolynomial
         """The polynomials from break i to break j, None if they are not accurate enough."""
         width = breaks[j] - breaks[i]
         x = (breaks[i : j + 1] - breaks[i]) / width
-        found = np.zeros((factors.shape[1], 6))
+        coefficients = np.zeros((factors.shape[1], 6))
         units = np.array([1.0, width, width**2])
         ends = np.concatenate([first[i] * units, last[j - 1] * units], axis=1)
-        found[moving] = ends @ QUINTIC.T
+        coefficients[moving] = ends @ QUINTIC.T
         powers = x[:, None] ** np.arange(6)
-        bent = powers[:, :4] @ (found[moving, 2:] * [2.0, 6.0, 12.0, 20.0]).T / width**2
+        bent = powers[:, :4] @ (coefficients[moving, 2:] * [2.0, 6.0, 12.0, 20.0]).T / width**2
         off = np.abs(np.stack([bent[1:] - last[i:j, :, 2], bent[:-1] - first[i:j, :, 2]]))
-        away = np.abs(powers[:-1] @ found[moving].T - first[i:j, :, 0])
+        away = np.abs(powers[:-1] @ coefficients[moving].T - first[i:j, :, 0])
         if (off > ACCURACY * sizes).any() or (away > CLOSE * lengths).any():
             return None
         if others.size:
             chosen = np.unique(np.linspace(i, j, 6).round().astype(int))
             fitted = np.linalg.solve(powers[chosen - i][:, : chosen.size], values[chosen])
-            found[others, : chosen.size] = fitted.T
-            if (np.abs(powers @ found[others].T - values[i : j + 1]) > ACCURACY * ranges).any():
+            coefficients[others, : chosen.size] = fitted.T
+            if (
+                np.abs(powers @ coefficients[others].T - values[i : j + 1]) > ACCURACY * ranges
+            ).any():
                 return None
-        return found
+        return coefficients
 
-    kept, rows, i = [0], [], 0
+    breaks_kept, rows, i = [0], [], 0
     while i < len(factors):
-        place, row = _furthest(joined, i, len(factors))
+        reached, row = _furthest(joined, i, len(factors))
         rows.append(factors[i] if row is None else row)
-        kept.append(place)
-        i = place
-    return PiecewisePolynomials(breaks[kept], np.stack(rows))
+        breaks_kept.append(reached)
+        i = reached
+    return PiecewisePolynomials(breaks[breaks_kept], np.stack(rows))
 
 
 def _furthest(
     joined: Callable[[int, int], FloatArray | None], i: int, end: int
 ) -> tuple[int, FloatArray | None]:
-    """The furthest break up to which pieces are joined, by doubling and halving."""
+    """Finds the furthest break up to which pieces are joined, by doubling and bisection."""
     good, row, step = i + 1, None, 2
-    while i + step <= end and (found := joined(i, i + step)) is not None:
-        good, row, step = i + step, found, 2 * step
+    while i + step <= end and (polynomials := joined(i, i + step)) is not None:
+        good, row, step = i + step, polynomials, 2 * step
     low, high = good, min(i + step, end + 1)
     while high - low > 1:
         middle = (low + high) // 2
-        if (found := joined(i, middle)) is None:
+        if (polynomials := joined(i, middle)) is None:
             high = middle
         else:
-            low, row = middle, found
+            low, row = middle, polynomials
     return low, row
 
 

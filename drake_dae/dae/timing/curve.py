@@ -24,7 +24,7 @@ from drake_dae.dae.timing.many_points import ManyPoints
 from drake_dae.errors import ReferenceSignalError
 
 REST = 1e-9
-"""A reference rests where its speed is below this share of its largest."""
+"""A reference is at rest where its speed is below this fraction of the largest speed."""
 
 TURN = 0.5
 """The cosine between directions of neighbouring samples below which a rest is looked for."""
@@ -35,8 +35,8 @@ Times = Callable[[FloatArray], FloatArray]
 
 
 def at_times(references: Sequence[Reference], layout: DerivativeLayout) -> Times:
-    """References as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
-    parts = [_one_at_times(*each) for each in with_degrees(references, layout.degrees)]
+    """Returns references as a function of many times, shape (k,) -> (k, sum (mu_i + 1))."""
+    parts = [_one_at_times(*part) for part in with_degrees(references, layout.degrees)]
     return lambda times: np.hstack([part(times) for part in parts])
 
 
@@ -80,7 +80,7 @@ class Piece:
 
 
 class Curve:
-    """The curve of a reference.
+    """The curve of a reference, by the distance along it.
 
     Args:
         references: The references, in the order of the outputs.
@@ -110,8 +110,8 @@ class Curve:
         fine = np.linspace(begin, end, max(2001, 2 * count + 1))
         values = self.at(fine)
         if not np.isfinite(values).all():
-            place = fine[int(np.argmin(np.isfinite(values).all(axis=1)))]
-            raise ReferenceSignalError(f"the reference is not finite at t = {place:g} s")
+            worst = fine[int(np.argmin(np.isfinite(values).all(axis=1)))]
+            raise ReferenceSignalError(f"the reference is not finite at t = {worst:g} s")
         spread = np.ptp(values[:, layout.lowest[self.moving]], axis=0)
         moves = spread > 1e-12 * np.abs(values[:, layout.lowest[self.moving]]).max(axis=0)
         if not moves.any():
@@ -123,11 +123,11 @@ class Curve:
         self._rest = REST * float(speeds.max())
         ranges = list(self._ranges(fine, values, speeds))
         # Between rests points are spread as the time is that a motion at full acceleration takes.
-        shares = np.array([0.0 if still else length**0.5 for *_, length, still in ranges])
+        shares = np.array([0.0 if is_pause else length**0.5 for *_, length, is_pause in ranges])
         counts = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 20)
         self.pieces = tuple(
-            self._pause(first, last) if still else self._piece(first, last, int(number))
-            for (first, last, _, still), number in zip(ranges, counts, strict=True)
+            self._pause(first, last) if is_pause else self._piece(first, last, int(number))
+            for (first, last, _, is_pause), number in zip(ranges, counts, strict=True)
         )
 
     def _speed(self, values: FloatArray) -> FloatArray:
@@ -138,7 +138,7 @@ class Curve:
         self, times: FloatArray, values: FloatArray, speeds: FloatArray
     ) -> list[tuple[float, float, float, bool]]:
         """First and last time, length, and whether it is a pause, of each piece."""
-        found: list[tuple[float, float, bool]] = []
+        ranges: list[tuple[float, float, bool]] = []
         moves = speeds > self._rest
         first, before = float(times[0]), -1  # The begin of a piece, and its last moving sample.
         rates = self._weights * values[:, self._first]
@@ -150,45 +150,45 @@ class Curve:
                 is_next = before >= 0 and k - before <= 2
                 turn = self._turn(times, rates, before, k) if is_next else None
                 if turn is not None:
-                    found.append((first, turn, False))
+                    ranges.append((first, turn, False))
                     first = turn
                 before = k
             elif k + 1 < times.size and not moves[k + 1] and (k == 0 or moves[k - 1]):
                 last = k + int(np.argmax(np.append(moves[k:], True)))
                 if before >= 0:
-                    found.append((first, float(times[k]), False))
+                    ranges.append((first, float(times[k]), False))
                 first, before = float(times[last - 1]), -1
-                found.append((float(times[k]), first, True))
+                ranges.append((float(times[k]), first, True))
         if first < times[-1]:
-            found.append((first, float(times[-1]), False))
+            ranges.append((first, float(times[-1]), False))
         lengths = np.concatenate(
             [[0.0], np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2)]
         )
         return [
-            (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), still)
-            for a, b, still in found
+            (a, b, float(np.diff(np.interp([a, b], times, lengths))[0]), is_pause)
+            for a, b, is_pause in ranges
         ]
 
     def _turn(self, times: FloatArray, rates: FloatArray, k: int, after: int) -> float | None:
-        """The time between two samples at which the reference rests and turns."""
+        """Returns the time between two samples at which the reference rests and turns, if any."""
         from scipy.optimize import brentq, minimize_scalar  # It takes long to load.
 
-        one, other = rates[k], rates[after]
-        if one @ other > TURN * np.linalg.norm(one) * np.linalg.norm(other):
+        rate, next_rate = rates[k], rates[after]
+        if rate @ next_rate > TURN * np.linalg.norm(rate) * np.linalg.norm(next_rate):
             return None
 
         def along(time: float) -> float:
-            return float(self._weights * self.at(np.array([time]))[0, self._first] @ one)
+            return float(self._weights * self.at(np.array([time]))[0, self._first] @ rate)
 
         def speed(time: float) -> float:
             return float(self._speed(self.at(np.array([time])))[0])
 
-        if one @ other < 0.0:
-            place = float(brentq(along, times[k], times[after], xtol=1e-15, rtol=1e-15))
+        if rate @ next_rate < 0.0:
+            turn = float(brentq(along, times[k], times[after], xtol=1e-15, rtol=1e-15))
         else:
             limits = (times[k], times[after])
-            place = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
-        return place if speed(place) < 1e3 * self._rest else None
+            turn = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
+        return turn if speed(turn) < 1e3 * self._rest else None
 
     def _pause(self, first: float, last: float) -> Piece:
         times = np.linspace(first, last, 21)
@@ -200,8 +200,8 @@ class Curve:
         fine = np.linspace(first, last, max(1001, 2 * count + 1))
         middle = self._speed(self.at((fine[1:] + fine[:-1]) / 2.0))
         far = np.concatenate([[0.0], np.cumsum(middle * np.diff(fine))])
-        wanted = far[-1] * (1.0 - np.cos(np.pi * np.arange(count + 1) / count)) / 2.0
-        times = np.interp(wanted, far, fine)
+        close = far[-1] * (1.0 - np.cos(np.pi * np.arange(count + 1) / count)) / 2.0
+        times = np.interp(close, far, fine)
         times[0], times[-1] = first, last
         half = np.diff(times)[:, None] / 2.0
         inner = (times[:-1, None] + half) + half * _NODES
@@ -225,7 +225,7 @@ class Curve:
         tangents = first / safe
         curvatures = (second - tangents * slope) / safe**2
         curvatures[rests] = 0.0
-        for place, other in ((0, 1), (-1, -2)):
-            if rests[place]:
-                tangents[place] = tangents[other]
+        for end, neighbour in ((0, 1), (-1, -2)):
+            if rests[end]:
+                tangents[end] = tangents[neighbour]
         return tangents, curvatures, np.where(rests, 0.0, rho)

@@ -9,7 +9,7 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 
 
 class LimitedSignals:
-    """Controls, rates of states, constraint forces and friction cones that have limits.
+    """The controls, rates of states, constraint forces and friction cones that have limits.
 
     On N* they are y = y_0(x) + Y(x) u: x' = f* + h* u by (9), (10), and v = alpha + beta u by (25).
 
@@ -58,32 +58,30 @@ class LimitedSignals:
         self.state_low, self.state_high = low[self.states], high[self.states]
 
     def values(self, control: ca.SX) -> ca.SX:
-        """The signals for a control, shape (k, 1)."""
+        """Returns the limited signals for a control, shape (k, 1)."""
         motion = self._structure.derivatives
         rate, force = (  # (25), (35)
             ca.substitute(motion.expand(unknown), motion.control, control)
             for unknown in (motion.rate, motion.constraint_input)
         )
-        asked = ca.vertcat(control, rate, force, ca.mtimes(ca.DM(self._cones), force))
-        return ca.densify(asked[self._rows, :])
+        signals = ca.vertcat(control, rate, force, ca.mtimes(ca.DM(self._cones), force))
+        return ca.densify(signals[self._rows, :])
 
     def by_control(self) -> tuple[ca.SX, ca.SX]:
-        """y_0(x), shape (k, 1), and Y(x), shape (k, p)."""
+        """Returns y_0(x), shape (k, 1), and Y(x), shape (k, p)."""
         motion = self._structure.derivatives
-        own, by = motion.by_control(ca.vertcat(motion.rate, motion.constraint_input))
-        free, slope = self._chosen(own, by)
-        return free, slope
+        free, by = motion.by_control(ca.vertcat(motion.rate, motion.constraint_input))
+        return self._chosen(free, by)
 
     def rates_of_states(self) -> tuple[ca.SX, ca.SX]:
-        """x' of the limited states as a + B u, shapes (k, 1) and (k, p)."""
+        """Returns a and B of x' = a + B u of the limited states, shapes (k, 1) and (k, p)."""
         motion = self._structure.derivatives
-        own, by = motion.by_control(motion.rate)
-        return ca.densify(own[self.states, :]), ca.densify(by[self.states, :])
+        free, by = motion.by_control(motion.rate)
+        return ca.densify(free[self.states, :]), ca.densify(by[self.states, :])
 
-    def _chosen(self, own: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
+    def _chosen(self, free: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
         system, cones = self._structure.system, ca.DM(self._cones)
-        size = system.num_states
-        count = system.num_controls
-        every = ca.vertcat(ca.SX.zeros(count), own, ca.mtimes(cones, own[size:, :]))
+        size, count = system.num_states, system.num_controls
+        every = ca.vertcat(ca.SX.zeros(count), free, ca.mtimes(cones, free[size:, :]))
         slopes = ca.vertcat(ca.SX.eye(count), by, ca.mtimes(cones, by[size:, :]))
         return ca.densify(every[self._rows, :]), ca.densify(slopes[self._rows, :])

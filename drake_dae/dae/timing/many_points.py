@@ -11,7 +11,7 @@ BLOCK = 128
 
 
 class ManyPoints:
-    """A CasADi function, called at many points without conversions between its matrices and NumPy.
+    """A CasADi function that is evaluated at many points without conversions of matrices.
 
     Args:
         function: The function, with dense inputs and outputs.
@@ -23,15 +23,15 @@ class ManyPoints:
         if compiled:
             function = machine_code(function, compiled, compiled is True) or function
         self._buffer, self._evaluate = function.map(BLOCK).buffer()
-        self._given = [np.zeros((BLOCK, function.nnz_in(i))) for i in range(function.n_in())]
-        self._found = [np.zeros((BLOCK, rows * columns)) for rows, columns in self._shapes]
-        for index, array in enumerate(self._given):
+        self._arguments = [np.zeros((BLOCK, function.nnz_in(i))) for i in range(function.n_in())]
+        self._results = [np.zeros((BLOCK, rows * columns)) for rows, columns in self._shapes]
+        for index, array in enumerate(self._arguments):
             self._buffer.set_arg(index, array.reshape(-1).data)
-        for index, array in enumerate(self._found):
+        for index, array in enumerate(self._results):
             self._buffer.set_res(index, array.reshape(-1).data)
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
-        """The results at all points.
+        """Evaluates the function at all points.
 
         Args:
             arguments: One for each input: a row for each point, shape (k, size), or one row for
@@ -41,14 +41,14 @@ class ManyPoints:
             For each result an array of shape (k, size), or (k, rows, columns) of a matrix.
         """
         count = len(arguments[0])
-        results = [np.empty((count, found.shape[1])) for found in self._found]
+        results = [np.empty((count, part.shape[1])) for part in self._results]
         for first in range(0, count, BLOCK):
             last = min(first + BLOCK, count)
-            for own, given in zip(self._given, arguments, strict=True):
-                own[: last - first] = given[first:last] if given.ndim == 2 else given
+            for column, argument in zip(self._arguments, arguments, strict=True):
+                column[: last - first] = argument[first:last] if argument.ndim == 2 else argument
             self._evaluate()
-            for result, found in zip(results, self._found, strict=True):
-                result[first:last] = found[: last - first]
+            for result, part in zip(results, self._results, strict=True):
+                result[first:last] = part[: last - first]
         return [
             array if columns == 1 else array.reshape(count, columns, rows).transpose(0, 2, 1)
             for array, (rows, columns) in zip(results, self._shapes, strict=True)

@@ -22,7 +22,7 @@ FACETS = 16
 @checked(ModelError)
 @dataclass(frozen=True)
 class FrictionCone:
-    """|tangential force| <= friction * normal force, for a contact that must not slide.
+    """The limit |tangential force| <= friction * normal force of a contact that must not slide.
 
     With two tangential forces it is the pyramid of 16 planes inside the cone, which is at most 2 %
     smaller.
@@ -50,7 +50,7 @@ class FrictionCone:
             )
 
     def rows(self, forces: Sequence[str]) -> FloatArray:
-        """C with C lambda <= 0 inside the cone, shape (k, m).
+        """Returns C with C lambda <= 0 inside the cone, shape (k, m).
 
         Raises:
             ModelError: A name is not that of a constraint force.
@@ -103,7 +103,7 @@ class MotionLimits:
                     )
 
     def bounds(self, kind: str, signals: Sequence[Signal]) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest values of all signals of a kind, infinite without a limit.
+        """Returns the lowest and highest values of all signals of a kind; infinite without a limit.
 
         Args:
             kind: "controls", "states", "rates" or "forces".
@@ -117,13 +117,13 @@ class MotionLimits:
         for name, (least, most) in getattr(self, kind).items():
             if name not in names:
                 raise ModelError(f"{kind}: {unknown_name('signal', name, names)}")
-            place = names.index(name)
-            low[place] = -inf if least is None else least
-            high[place] = inf if most is None else most
+            i = names.index(name)
+            low[i] = -inf if least is None else least
+            high[i] = inf if most is None else most
         return low, high
 
     def check(self, system: DaeSystem) -> None:
-        """Refuses names that a system does not have.
+        """Checks that the system has all signals that have limits.
 
         Raises:
             ModelError: A name is not that of a signal.

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +29,7 @@ from drake_dae.errors import ModelError, ReferenceSignalError
 _PAUSE = LimitRow("pause of the reference", "", "")
 
 PASSES = 40
-"""The most passes where signals are not linear in (a, b)."""
+"""The largest number of passes where signals are not linear in (a, b)."""
 
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
@@ -39,11 +38,11 @@ MOST_POLYNOMIALS = 500
 """The largest number of polynomials of an expression; longer references are tables."""
 
 LOWERINGS = 3
-"""How often limits are lowered where the motion exceeds them."""
+"""The largest number of times that limits are lowered where the motion exceeds them."""
 
 EXCESS = 0.02
-"""The excess over a limit at a few points that is left, as a share of it: less than the share of
-the limits that is left to the feedback."""
+"""The accepted excess over a limit at a few points, as a fraction of it: less than the part of the
+limits that is reserved for the feedback."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class TimeProfile:
     layout: DerivativeLayout
 
     def __repr__(self) -> str:
-        count = sum(not one.piece.is_pause for one in self.pieces)
+        count = sum(not part.piece.is_pause for part in self.pieces)
         return f"TimeProfile({self.duration:.4g} s, {count} motions from rest to rest)"
 
     @property
@@ -94,18 +93,18 @@ class TimeProfile:
 
     @property
     def shares(self) -> dict[str, float]:
-        """What limits the motion, with its share of the time, the largest first."""
-        found: dict[str, float] = {}
-        for one in self.pieces:
-            for place, time in zip(one.limiting.tolist(), np.diff(one.times), strict=True):
-                name = self.causes[place].text
-                found[name] = found.get(name, 0.0) + float(time) / self.duration
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+        """Name of what limits the motion -> its fraction of the time, the largest first."""
+        sums: dict[str, float] = {}
+        for part in self.pieces:
+            for cause, time in zip(part.limiting.tolist(), np.diff(part.times), strict=True):
+                name = self.causes[cause].text
+                sums[name] = sums.get(name, 0.0) + float(time) / self.duration
+        return dict(sorted(sums.items(), key=lambda item: -item[1]))
 
 
 @checked(ReferenceSignalError)
 class PathTiming:
-    """The shortest motions along the curves of references within limits, from rest to rest.
+    """Computes the shortest motions along the curves of references within limits.
 
     A reference r(t) is taken as a curve r(s), see `dae.timing.curve`. For any s(t) the reference
     r(s(t)) is admissible, so that errors obey (30), (31) whatever s does. With b = s'^2 and a = s''
@@ -115,7 +114,8 @@ class PathTiming:
 
     with m, n, c from the law itself, and so are accelerations; speeds limit b. The largest b is
     found by reachable sets, see `dae.timing.reachable`. Friction makes u nonlinear in b: it is then
-    linearized about the profile before, where it is exact, until this does not change.
+    linearized about the previous profile, at which it is exact, until the profile no longer
+    changes.
 
     Args:
         structure: The structure of the system, `find_structure`: rigid joints, where positions have
@@ -142,11 +142,11 @@ class PathTiming:
         largest_rate: float | None = None,
         points: int = 1000,
     ) -> TimeProfile:
-        """The shortest motion along the curve of a reference.
+        """Returns the shortest motion along the curve of a reference.
 
-        Forces are commanded as the reference has them at s. Where nothing moves the time passes as
-        in the reference; a pause at the end in which no output changes is left out. Limits of paths
-        of speed and acceleration, `PathLimits`, hold as well; their jerk is not limited.
+        A force is that of the reference at s. Where nothing moves, time passes as in the reference;
+        a pause at the end in which no output changes is omitted. Limits of speed and acceleration
+        of paths, `PathLimits`, hold as well; their jerk is not limited.
 
         Args:
             references: The references of all outputs; or name -> reference, or a number.
@@ -154,13 +154,13 @@ class PathTiming:
             begin: Its first time, in s.
             start: A state near which the motion begins, shape (n,); the nominal one if None.
             parameters: Values of all parameters; the defaults if None.
-            largest_rate: The largest rate of the reference's time, 1 to be nowhere faster than the
-                reference itself; None for no limit.
+            largest_rate: The largest rate of the reference's time: with 1 the motion is nowhere
+                faster than the reference; None for no limit.
             points: The number of intervals of the grid.
 
         Raises:
-            ReferenceSignalError: A rest on the curve is not within the limits, which are named with
-                the place; nothing limits the motion; nothing moves; the curve is out of reach.
+            ReferenceSignalError: The system is not within the limits at rest on the curve; nothing
+                limits the motion; nothing moves; or the curve is out of reach.
             ModelError: A number makes no sense.
         """
         check_whole_number("points", points, 20)
@@ -173,30 +173,30 @@ class PathTiming:
         names = [signal.name for signal in system.output_signals]
         if isinstance(references, Mapping):
             references = references_by_name(references, names, along.layout.degrees)
-        covered = sum(reference.size for reference in references)
-        if covered != len(names):
+        size = sum(reference.size for reference in references)
+        if size != len(names):
             raise ReferenceSignalError(
-                f"the references cover {covered} outputs, the system has {len(names)}"
+                f"the references cover {size} outputs, the system has {len(names)}"
             )
         curve = Curve(references, along.layout, begin, end, points)
         guess = system.nominal_state if start is None else vector("start", start, system.num_states)
         numbers = system.parameter_vector(parameters)
-        found, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
+        parts, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
         for piece in _without_last_pause(curve.pieces, along.layout):
             if piece.is_pause:
-                found.append(_pause(piece))
+                parts.append(_pause(piece))
                 continue
             tools = tool_limits(references, piece, along.layout)
             rows = rows_along(along, piece, guess, numbers, tools)
             guess, causes = rows.at_rest[-1], rows.names
-            found.append(_fastest(rows, piece, largest_rate))
-        return TimeProfile(tuple(found), (*causes, _PAUSE), begin, along.layout)
+            parts.append(_fastest(rows, piece, largest_rate))
+        return TimeProfile(tuple(parts), (*causes, _PAUSE), begin, along.layout)
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class TimeOptimalReference(PiecewiseReference):
-    """The reference of a profile, for all outputs, by the time of the motion.
+    """The reference of a time-optimal profile, for all outputs, over the time of the motion.
 
     Before and after, the values are constant. r'' is continuous except at rests, and accurate to
     5e-4 of its largest value; forces have no derivatives.
@@ -206,6 +206,7 @@ class TimeOptimalReference(PiecewiseReference):
     """
 
     is_table = True
+    most_in_expression = MOST_POLYNOMIALS
 
     profile: TimeProfile
     order: int = field(default=2, init=False)
@@ -217,24 +218,20 @@ class TimeOptimalReference(PiecewiseReference):
     @cached_property
     def table(self) -> PiecewisePolynomials:
         """The polynomials of r, one row for each output."""
-        parts = [(one.piece, one.times, one.b, one.a) for one in self.profile.pieces]
         layout = self.profile.layout
+        parts = [(part.piece, part.times, part.b, part.a) for part in self.profile.pieces]
         table = time_table(parts, layout, self.profile.start_time)
         return at_rest_outside(coarser(table, layout.dynamic))
 
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
         return stacked(self.table, degrees)
 
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        self._check(degrees)
-        pieces = self.pieces(degrees)
-        return pieces.expression(time) if len(pieces.factors) <= MOST_POLYNOMIALS else None
-
     def _check(self, degrees: Sequence[int]) -> None:
-        for i, (needed, own) in enumerate(zip(degrees, self.profile.layout.degrees, strict=True)):
-            if needed > own:
+        pairs = zip(degrees, self.profile.layout.degrees, strict=True)
+        for i, (needed, degree) in enumerate(pairs):
+            if needed > degree:
                 raise ReferenceSignalError(
-                    f"row {i} of this TimeOptimalReference has {own} derivatives, the law needs "
+                    f"row {i} of this TimeOptimalReference has {degree} derivatives, the law needs "
                     f"{needed}; make its profile with the structure of that law"
                 )
 
@@ -257,7 +254,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
     """The fastest motion along a piece.
 
     Where the acceleration changes from one interval to the next, as where n of a limit passes
-    through zero, smoothing exceeds the limit a little. It is lowered there if that is too much.
+    through zero, the smoothed motion exceeds the limit a little. If by too much, the limit is
+    lowered there.
 
     Raises:
         ReferenceSignalError: Nothing limits the motion, or it cannot leave a rest.
@@ -266,8 +264,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
     factor = np.ones(largest.size)
     before: FloatArray | None = None
     for _ in range(LOWERINGS + 1):
-        found, before = _settled(rows, piece, largest, factor, before)
-        b, a, times = smoothed(piece.distances, found.b, found.a)
+        fastest, before = _settled(rows, piece, largest, factor, before)
+        b, a, times = smoothed(piece.distances, fastest.b, fastest.a)
         lines = rows.lines(b)
         excess = np.max(lines.alpha * a[:, None] + lines.beta * b[:, None], axis=1, initial=0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -276,8 +274,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
             break
         wide = np.pad(np.maximum(excess / (1.0 + EXCESS / 2.0), 1.0), 1, mode="edge")
         factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
-    limiting = np.where(found.active >= 0, found.active, which[1:])
-    return ProfilePiece(piece, times, b, a, found.highest, limiting)
+    limiting = np.where(fastest.active >= 0, fastest.active, which[1:])
+    return ProfilePiece(piece, times, b, a, fastest.highest, limiting)
 
 
 def _settled(
@@ -287,24 +285,24 @@ def _settled(
     factor: FloatArray,
     before: FloatArray | None,
 ) -> tuple[FastestMotion, FloatArray | None]:
-    """The fastest motion with all limits divided by a factor, and b about which it is exact."""
+    """The fastest motion with all limits divided by a factor, and the b of their linearization."""
     for number in range(1 if rows.is_linear else PASSES):
         lines = rows.lines(before)
         lowered = LinearLimits(lines.alpha * factor[:, None], lines.beta * factor[:, None])
-        found = fastest_motion(piece.distances, lowered, largest / factor)
-        if not np.isfinite(found.b).all():
+        fastest = fastest_motion(piece.distances, lowered, largest / factor)
+        if not np.isfinite(fastest.b).all():
             raise ReferenceSignalError(
                 "nothing limits the motion: give limits of controls, joints or forces"
             )
-        moves = found.b[1:] + found.b[:-1] > 0.0
+        moves = fastest.b[1:] + fastest.b[:-1] > 0.0
         if not moves.all():
-            place = float(piece.times[int(np.argmin(moves))])
+            stop = float(piece.times[int(np.argmin(moves))])
             raise ReferenceSignalError(
-                f"the motion cannot go on from t = {place:.4g} s of the reference: rest there uses "
+                f"the motion cannot go on from t = {stop:.4g} s of the reference: rest there uses "
                 "all of a limit"
             )
-        if before is not None and np.abs(found.b - before).max() <= SETTLED * found.b.max():
+        if before is not None and np.abs(fastest.b - before).max() <= SETTLED * fastest.b.max():
             break
         if not rows.is_linear:
-            before = found.b if before is None or number < 10 else (found.b + before) / 2.0
-    return found, before
+            before = fastest.b if before is None or number < 10 else (fastest.b + before) / 2.0
+    return fastest, before

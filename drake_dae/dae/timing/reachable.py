@@ -22,7 +22,7 @@ from drake_dae.dae.system.layout import Indices
 
 @dataclass(frozen=True, eq=False)
 class LinearLimits:
-    """alpha a + beta b <= 1, k of them at each of N + 1 points; 0 a + 0 b where there is none.
+    """The limits alpha a + beta b <= 1, k of them at each of N + 1 points.
 
     Attributes:
         alpha, beta: Shape (N + 1, k).
@@ -34,26 +34,24 @@ class LinearLimits:
 
 @dataclass(frozen=True, eq=False)
 class FastestMotion:
-    """The fastest motion.
+    """The fastest motion from rest to rest.
 
     Attributes:
         b: s'^2 at the points, shape (N + 1,).
         a: s'' between them, shape (N,).
         highest: H, shape (N + 1,).
         active: The line that limits each interval, shape (N,); -1 for the largest b of a point.
-        brakes: Whether the motion is on H between two points, shape (N,).
     """
 
     b: FloatArray
     a: FloatArray
     highest: FloatArray
     active: Indices
-    brakes: np.typing.NDArray[np.bool_]
 
 
 @np.errstate(all="ignore")  # Without any limit b is infinite.
 def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray) -> FastestMotion:
-    """The fastest motion from rest to rest.
+    """Computes the fastest motion from rest to rest.
 
     Args:
         points: s_0, ..., s_N, increasing, shape (N + 1,).
@@ -71,29 +69,29 @@ def fastest_motion(points: FloatArray, lines: LinearLimits, largest: FloatArray)
     stopping = double[:, None] * of_two
     upper = np.where(alpha > 0.0, 1.0 / alpha, np.inf)
     falls = np.where(alpha > 0.0, beta / alpha, 0.0)
-    own = np.minimum(largest[:-1], np.where(alpha >= 0.0, stopping, np.inf).min(axis=1))
-    own = _with_both(alpha, beta, own)
+    at_point = np.minimum(largest[:-1], np.where(alpha >= 0.0, stopping, np.inf).min(axis=1))
+    at_point = _with_both(alpha, beta, at_point)
     stopping = np.where(alpha < 0.0, stopping, np.inf)
 
     highest, brake = np.zeros(points.size), np.full(points.size, -1, dtype=np.intp)
     for i in range(points.size - 2, -1, -1):
         can = stopping[i] + braking[i] * highest[i + 1]
-        place = int(can.argmin())
-        highest[i], brake[i] = min((can[place], place), (own[i], -1))
+        line = int(can.argmin())
+        highest[i], brake[i] = min((can[line], line), (at_point[i], -1))
         highest[i] = max(highest[i], 0.0)  # Of round-off.
 
     b, a = np.zeros(points.size), np.zeros(double.size)
-    active, brakes = np.full(double.size, -1, dtype=np.intp), np.zeros(double.size, dtype=bool)
+    active = np.full(double.size, -1, dtype=np.intp)
     for i in range(double.size):
         room = upper[i] - falls[i] * b[i]
-        place = int(room.argmin())
+        line = int(room.argmin())
         most = (highest[i + 1] - b[i]) / double[i]
-        if room[place] <= most:
-            a[i], active[i] = room[place], place
+        if room[line] <= most:
+            a[i], active[i] = room[line], line
         else:
-            a[i], active[i], brakes[i] = most, brake[i], True
+            a[i], active[i] = most, brake[i]
         b[i + 1] = min(max(b[i] + double[i] * a[i], 0.0), highest[i + 1])
-    return FastestMotion(b, a, highest, active, brakes)
+    return FastestMotion(b, a, highest, active)
 
 
 def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatArray:
@@ -102,14 +100,14 @@ def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatA
     The room between the lowest upper and the highest lower bound of a is concave in b: Newton's
     method from the right ends after finitely many steps.
     """
-    found = start.copy()
+    lowered = start.copy()
     rows = np.arange(len(alpha))
     up, down = alpha > 0.0, alpha < 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / np.where(alpha == 0.0, 1.0, alpha)
         slope = beta * inverse
         for _ in range(100):
-            finite = np.where(np.isfinite(found), found, 1e30)[:, None]
+            finite = np.where(np.isfinite(lowered), lowered, 1e30)[:, None]
             bounds = inverse - slope * finite
             p = np.where(up, bounds, np.inf).argmin(axis=1)
             q = np.where(down, bounds, -np.inf).argmax(axis=1)
@@ -117,8 +115,8 @@ def _with_both(alpha: FloatArray, beta: FloatArray, start: FloatArray) -> FloatA
             gap = bounds[rows, p] - bounds[rows, q]
             falls = slope[rows, p] - slope[rows, q]
             new = (inverse[rows, p] - inverse[rows, q]) / falls
-            over = has & (gap < 0.0) & (falls > 0.0) & (new < found * (1.0 - 1e-14))
+            over = has & (gap < 0.0) & (falls > 0.0) & (new < lowered * (1.0 - 1e-14))
             if not over.any():
                 break
-            found[over] = new[over]
-    return found
+            lowered[over] = new[over]
+    return lowered

@@ -20,12 +20,12 @@ SLOW = 0.01
 """The slowest speed at which friction is evaluated, as a share of the largest."""
 
 CHECKED = 20
-"""One point in so many is tested for that."""
+"""Every n-th point is tested, with this n."""
 
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What a line limits.
+    """The signal that a row limits.
 
     Attributes:
         name: The signal.
@@ -39,7 +39,7 @@ class LimitRow:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The limit as text."""
         return f"{self.side} {self.name}".strip()
 
 
@@ -75,7 +75,7 @@ class LimitRows:
 
     @property
     def names(self) -> tuple[LimitRow, ...]:
-        """What may limit: all lines, then what limits b alone."""
+        """The possible causes of a limit: all lines, then those that limit only b."""
         limited = self.along.limited
         pairs = [*zip(limited.signals, limited.low, limited.high, strict=True)]
         rows = [LimitRow(s.name, "largest", s.unit) for s, _, high in pairs if np.isfinite(high)]
@@ -88,7 +88,7 @@ class LimitRows:
         return (*rows, LimitRow("rate of the reference's time", "largest", ""))
 
     def lines(self, before: FloatArray | None) -> LinearLimits:
-        """The lines; where signals are not linear, those about a profile before.
+        """Returns the rows; where signals are not linear, those about a previous profile.
 
         Args:
             before: b of the profile before, shape (N + 1,), at which lines are exact; None for the
@@ -114,24 +114,24 @@ class LimitRows:
         return LinearLimits(np.hstack(of_a), np.hstack(of_b))
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
-        """The largest b at each point, and what limits it as a place in `names`.
+        """Returns the largest b at each point, and its cause as an index into `names`.
 
         Args:
             rate: The largest rate of the reference's time.
         """
         limited = self.along.limited
-        rest = self.along.limited_states(self.at_rest)
+        at_rest = self.along.limited_states(self.at_rest)
         slope = self.along.limited_states(self.moving)
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(slope > 0.0, limited.state_high - rest, limited.state_low - rest)
+            room = np.where(slope > 0.0, limited.state_high - at_rest, limited.state_low - at_rest)
             room = room / slope
         room = np.where(slope == 0.0, np.inf, room)
-        own = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(rest), np.inf)
-        columns = [room**2, *(tool.largest[:, None] for tool in self.tools), own[:, None] ** 2]
+        of_rate = rate * self.piece.speeds if np.isfinite(rate) else np.full(len(at_rest), np.inf)
+        columns = [room**2, *(tool.largest[:, None] for tool in self.tools), of_rate[:, None] ** 2]
         together = np.hstack(columns)
         least = together.argmin(axis=1)
         first = len(self.names) - together.shape[1]
-        return together[np.arange(len(rest)), least], least + first
+        return together[np.arange(len(at_rest)), least], least + first
 
     def _values(self, speed: FloatArray, a: FloatArray) -> FloatArray:
         """The limited signals at given speeds and accelerations, shape (N + 1, k)."""
@@ -146,7 +146,7 @@ def rows_along(
     parameters: FloatArray,
     tools: Sequence[ToolLimits],
 ) -> LimitRows:
-    """The limited signals along a piece.
+    """Computes the limited signals along a piece.
 
     Args:
         along: What the system needs along curves.
@@ -185,7 +185,7 @@ def rows_along(
 
 
 def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> None:
-    """Refuses friction that needs more than the limits in slow motion.
+    """Checks that friction in slow motion is within the limits.
 
     Raises:
         ReferenceSignalError: Which signal, and where.
@@ -203,7 +203,7 @@ def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> No
 
 
 def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: FloatArray) -> None:
-    """Refuses a piece on which a rest is not within the limits.
+    """Checks that the system is within the limits at rest on a piece.
 
     Raises:
         ReferenceSignalError: Which signal, where, and by how much.
@@ -220,9 +220,9 @@ def _check_rest(along: AlongCurve, piece: Piece, at_rest: FloatArray, still: Flo
     )
     for signals, low, high, values in both:
         if not np.isfinite(values).all():
-            place = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
+            time = piece.times[int(np.argmin(np.isfinite(values).all(axis=1)))]
             raise ReferenceSignalError(
-                f"the path has no control at t = {place:.4g} s of the reference: it leads through "
+                f"the path has no control at t = {time:.4g} s of the reference: it leads through "
                 "a singular configuration"
             )
         room = np.minimum(high - values, values - low)

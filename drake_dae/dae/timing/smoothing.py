@@ -8,7 +8,7 @@ from drake_dae.arrays import FloatArray
 def smoothed(
     points: FloatArray, b: FloatArray, a: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """b, a and times at the points, with a straight in time between them.
+    """Returns b, a and times at the points, for an acceleration that is linear in time.
 
     The acceleration at a point is the mean of those beside it, weighted by their intervals d,
 
@@ -39,10 +39,10 @@ def smoothed(
         share = np.where(lifted > 0.0, share, share / 2.0)
     at_points = np.concatenate([a[:1], (np.diff(b)[1:] + np.diff(b)[:-1]), a[-1:]])
     at_points[1:-1] /= 2.0 * (width[:-1] + width[1:])
-    found = b.copy()
-    found[1:-1] = lifted
-    speed = np.sqrt(found)
+    squares = b.copy()
+    squares[1:-1] = lifted
+    speed = np.sqrt(squares)
     mean = (speed[1:] + speed[:-1]) / 2.0
     bent = (at_points[:-1] - at_points[1:]) / 12.0
     root = np.sqrt(np.maximum(mean**2 + 4.0 * bent * width, 0.0))
-    return found, at_points, np.concatenate([[0.0], np.cumsum(2.0 * width / (mean + root))])
+    return squares, at_points, np.concatenate([[0.0], np.cumsum(2.0 * width / (mean + root))])

@@ -37,7 +37,7 @@ def time_table(
     layout: DerivativeLayout,
     start_time: float,
 ) -> PiecewisePolynomials:
-    """The polynomials of r along the pieces of a curve, a row for each output.
+    """Returns the polynomials of r along the pieces of a curve, a row for each output.
 
     Args:
         parts: Of each piece: it, the times of its points in s after its begin, b = s'^2 at these,
@@ -53,7 +53,7 @@ def time_table(
 
 
 def at_rest_outside(table: PiecewisePolynomials) -> PiecewisePolynomials:
-    """The table with a second of rest before and after, so that r'' is 0 there."""
+    """Returns the table with a second of rest before and after, so that r'' is 0 there."""
     breaks, factors = table.breaks, table.factors
     rests = np.zeros((2, *factors.shape[1:]))
     rests[0, :, 0], rests[1, :, 0] = factors[0, :, 0], factors[-1].sum(axis=-1)
@@ -64,7 +64,7 @@ def at_rest_outside(table: PiecewisePolynomials) -> PiecewisePolynomials:
 
 
 def stacked(table: PiecewisePolynomials, degrees: Sequence[int]) -> PiecewisePolynomials:
-    """Polynomials with their derivatives: r_1, ..., r_1^(mu_1), r_2, ..."""
+    """Returns polynomials with their derivatives: r_1, ..., r_1^(mu_1), r_2, ..."""
     widths, rows = np.diff(table.breaks)[:, None], []
     for output, degree in enumerate(degrees):
         row = table.factors[:, output]
@@ -80,12 +80,12 @@ def _polynomials(
 ) -> FloatArray:
     """The factors of (1, x, ..., x^5) in each interval, shape (N, outputs, 6)."""
     count, low = widths.size, layout.lowest
-    found = np.zeros((count, len(layout.degrees), 6))
+    coefficients = np.zeros((count, len(layout.degrees), 6))
     values = piece.values[:, low]
-    found[:, :, 0] = values[:-1]
-    found[:, :, 1] = np.diff(values, axis=0)
+    coefficients[:, :, 0] = values[:-1]
+    coefficients[:, :, 1] = np.diff(values, axis=0)
     if piece.is_pause:
-        return found
+        return coefficients
     speed = np.sqrt(b)
     width = widths[:, None]
     rates = piece.tangents * speed[:, None]
@@ -102,5 +102,5 @@ def _polynomials(
         ],
         axis=-1,
     )
-    found[:, moving] = given @ QUINTIC.T
-    return found
+    coefficients[:, moving] = given @ QUINTIC.T
+    return coefficients

@@ -18,7 +18,7 @@ DIRECTIONS = 25
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """|r'| and |r''| of a path: linear bounds on (a, b).
+    """The limits |r'| and |r''| of a path as linear bounds on (a, b).
 
     Attributes:
         largest: The largest b by the speed, shape (N + 1,).
@@ -33,7 +33,7 @@ class ToolLimits:
 def tool_limits(
     references: Sequence[Reference], piece: Piece, layout: DerivativeLayout
 ) -> list[ToolLimits]:
-    """The limits of all paths with any.
+    """Returns the limits of all paths that have limits.
 
     |r''| <= A is a circle in the plane of the tangential and the normal part,
 
@@ -41,7 +41,7 @@ def tool_limits(
 
     with a polygon inside it.
     """
-    found, first = [], 0
+    every, first = list[ToolLimits](), 0
     columns = {int(place): column for column, place in enumerate(layout.dynamic)}
     for reference in references:
         rows = range(first, first + reference.size)
@@ -63,5 +63,5 @@ def tool_limits(
         with np.errstate(divide="ignore"):
             largest = np.where(size > 0.0, (limits.speed / size) ** 2, np.inf)
         of_b = (along[:, None] * cosine + across[:, None] * sine) / shrunk
-        found.append(ToolLimits(largest, size[:, None] * cosine / shrunk, of_b))
-    return found
+        every.append(ToolLimits(largest, size[:, None] * cosine / shrunk, of_b))
+    return every

@@ -28,7 +28,7 @@ STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIF
 
 
 def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
-    """The structure of a law's model that demands, instead of y_i^(r_i) = 0,
+    """Returns the structure of a law's model that demands, instead of y_i^(r_i) = 0,
 
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
 
@@ -55,16 +55,16 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
     residual = manifold.residual_expression
     names = tuple(signal.name for signal in system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
-    found = damping
-    if not isinstance(found, FeedbackGains):
-        found = result_of("constraint_damping", found, names, degrees, error=GainError)
-    if not isinstance(found, FeedbackGains) or (found.names, found.degrees) != (names, degrees):
+    gains = damping
+    if not isinstance(gains, FeedbackGains):
+        gains = result_of("constraint_damping", gains, names, degrees, error=GainError)
+    if not isinstance(gains, FeedbackGains) or (gains.names, gains.degrees) != (names, degrees):
         raise GainError(
             f"constraint_damping must be a design such as poles(-200.0) for the constraints "
             f"{', '.join(names) or 'none'} with r_i - 1 = {degrees} poles each"
         )
     rates = residual[np.flatnonzero(layout.orders).tolist(), :]
-    force = ca.mtimes(ca.sparsify(ca.DM(found.matrix)), rates)
+    force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     return _along(replace(structure, derivatives=derivatives), derivatives)
 
@@ -78,15 +78,15 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
     moving = system.outputs(derivatives.constraint_input)
     for order in range(max(degrees, default=0) + 1):
         values, _ = derivatives.by_control(moving)
-        for place, i in enumerate(rows):
+        for row, i in enumerate(rows):
             if degrees[i] == order:
-                highest[i] = moving[place]
+                highest[i] = moving[row]
             else:
-                chains[i].append(values[place])
-        still = [place for place, i in enumerate(rows) if degrees[i] > order]
-        rows = [rows[place] for place in still]
+                chains[i].append(values[row])
+        remaining = [row for row, i in enumerate(rows) if degrees[i] > order]
+        rows = [rows[row] for row in remaining]
         if rows:
-            moving = derivatives.derivative(moving[still])
+            moving = derivatives.derivative(moving[remaining])
     drift, control_matrix = derivatives.by_control(highest)
     elimination = eliminate(derivatives)
     return replace(
@@ -103,7 +103,7 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
 def contact_damping(
     stiffness: float, mobility: float, sample_time: float = 0.0, delay: int = 1
 ) -> float:
-    """The damping c for which a contact of given stiffness settles fastest.
+    """Returns the damping c for which a contact of the stated stiffness settles fastest.
 
     On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
 
@@ -141,16 +141,16 @@ def contact_damping(
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    found = best_damping(stiffness, mobility, sample_time, delay)
+    best = best_damping(stiffness, mobility, sample_time, delay)
     if sample_time:
         frequency = float(np.sqrt(mobility * stiffness))
-        lost = unstable_from(frequency, sample_time, delay, found)
-        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {found:.4g} 1/s")
-    return found
+        lost = unstable_from(frequency, sample_time, delay, best)
+        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {best:.4g} 1/s")
+    return best
 
 
 def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
-    """`contact_damping` without a warning outside its range of validity."""
+    """Acts as `contact_damping`, without a warning outside the range of validity."""
     for name, value, least in (
         ("stiffness", stiffness, "positive"),
         ("mobility", mobility, "positive"),
@@ -174,7 +174,7 @@ def best_damping(stiffness: float, mobility: float, sample_time: float, delay: i
 def unstable_from(
     frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
 ) -> float | None:
-    """The lowest stiffness at which a contact is unstable, relative to the given one.
+    """Returns the lowest relative stiffness at which a contact is unstable, if there is one.
 
     Args:
         frequency: w = sqrt(A k) of the given stiffness.
@@ -186,16 +186,16 @@ def unstable_from(
         The lowest up to a factor of two; None if all are stable.
     """
     for share in STIFFNESSES.tolist():
-        own = frequency * share**0.5
-        added = integral * own * sample_time
-        shown = own * sample_time < np.pi
-        if not (shown and _radius(_step(own, sample_time), damping, delay, added) < 1.0):
+        natural = frequency * share**0.5
+        added = integral * natural * sample_time
+        shown = natural * sample_time < np.pi
+        if not (shown and _radius(_step(natural, sample_time), damping, delay, added) < 1.0):
             return share
     return None
 
 
 def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
-    """Warns if a recommended gain is outside its range of validity.
+    """Warns if a recommended gain is outside the range in which it is valid.
 
     Args:
         lost: The result of `unstable_from`.

@@ -17,7 +17,7 @@ from drake_dae.errors import GainError
 @checked(GainError)
 @dataclass(frozen=True, eq=False)
 class FeedbackGains:
-    """The gains of the law (28), and with them the error dynamics (30).
+    """The feedback gains of the law (28), which determine the error dynamics (30).
 
     With the error coordinates e = (e_1, e_1', ..., e_1^(mu_1 - 1), ..., e_p^(mu_p - 1)), shape
     (N,), N = sum mu_i, the law sets
@@ -68,7 +68,7 @@ class FeedbackGains:
 
     @property
     def layout(self) -> DerivativeLayout:
-        """How the error coordinates are stacked."""
+        """The layout of the error coordinates."""
         return DerivativeLayout(self.degrees)
 
     @property
@@ -85,7 +85,7 @@ class FeedbackGains:
         return np.linalg.eigvals(self.error_matrix).astype(complex)
 
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
-        """The exact tracking error exp(E t) e(0) of (30), (31).
+        """Returns the exact tracking error exp(E t) e(0) of (30), (31).
 
         Args:
             times: Times in s after the start, shape (k,).
@@ -114,19 +114,21 @@ class FeedbackGains:
         lengths, which = np.unique(steps, return_inverse=True)
         result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
         orders, owner = self.layout.orders, self.layout.owners
-        for block in _coupled(self.layout, self.matrix):
-            rows = np.flatnonzero(np.isin(owner, block))
-            own = matrix[np.ix_(rows, rows)]
+        for outputs in _coupled(self.layout, self.matrix):
+            rows = np.flatnonzero(np.isin(owner, outputs))
+            block = matrix[np.ix_(rows, rows)]
             # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
             # sizes.
-            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(own))))))
+            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(block))))))
             scale = rate ** orders[rows]
-            transitions = scipy.linalg.expm(lengths[:, None, None] * (own / scale[:, None] * scale))
+            transitions = scipy.linalg.expm(
+                lengths[:, None, None] * (block / scale[:, None] * scale)
+            )
             current = coordinates[rows] / scale
             response = np.zeros((moments.size, rows.size))
-            for place, index in zip(order, which, strict=True):
+            for row, index in zip(order, which, strict=True):
                 current = transitions[index] @ current
-                response[place] = current
+                response[row] = current
             result[:, owner[rows[orders[rows] == 0]]] = response[:, orders[rows] == 0]
         return result
 
@@ -140,7 +142,7 @@ Poles = float | complex | Sequence[float | complex]
 
 @checked(GainError)
 def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
-    """Gains K_ij that give each output its own poles: the coefficients of (32).
+    """Designs gains K_ij that assign poles to each output: the coefficients of (32).
 
     Args:
         values: One pole in 1/s for all, or a sequence of mu_i poles for every output, or these per
@@ -159,7 +161,7 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
 def gain_coefficients(
     values: Sequence[float] | Mapping[str, float | Sequence[float]],
 ) -> GainDesign:
-    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first.
+    """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first.
 
     Args:
         values: mu_i numbers for every output, or these per output name, "*" for all others.
@@ -171,14 +173,14 @@ def gain_coefficients(
         chosen: list[tuple[str, int, float | Sequence[float]]]
         chosen = _per_output(values, names, degrees)
         for name, degree, row in chosen:
-            given = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
-            if given.shape != (degree,):
+            entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
+            if entries.shape != (degree,):
                 raise GainError(
                     f"output '{name}' has degree {degree} and takes {degree} coefficients "
-                    f"K_i1, ..., K_i{degree}, got {given.size}"
+                    f"K_i1, ..., K_i{degree}, got {entries.size}"
                 )
             start = int(starts[name])
-            matrix[list(names).index(name), start : start + degree] = given
+            matrix[list(names).index(name), start : start + degree] = entries
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design
@@ -186,7 +188,7 @@ def gain_coefficients(
 
 @checked(GainError)
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
-    """Gains as full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ..., Lambda_6 of (72)-(73).
+    """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73).
 
     Args:
         groups: For each degree mu >= 1 that occurs among the outputs, highest first, the mu
@@ -230,7 +232,7 @@ T = TypeVar("T")
 def _per_output(
     values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
 ) -> list[tuple[str, int, T]]:
-    """The name, degree and given value of each output with a degree above 0."""
+    """Returns name, degree and value of each output with a degree above 0."""
     dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
     if not isinstance(values, Mapping):
         return [(name, degree, values) for name, degree in dynamic]
@@ -240,13 +242,13 @@ def _per_output(
     useless = [name for name in values if name in names and name not in expected]
     if unknown or missing or useless:
         parts = [
-            f"{text}: {', '.join(found)}"
-            for text, found in (
+            f"{text}: {', '.join(is_wrong)}"
+            for text, is_wrong in (
                 ("unknown outputs", unknown),
                 ("no gains for", missing),
                 ("degree 0, no gains", useless),
             )
-            if found
+            if is_wrong
         ]
         raise GainError(f"gains per output: {'; '.join(parts)}. Needed: {', '.join(expected)}")
     return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]

@@ -43,19 +43,19 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> "IntegralAction":
-        """Integral action on outputs by their names.
+        """Returns the integral action on outputs by their names.
 
         Raises:
             GainError: A name is not that of an output, occurs twice, or is that of a force with
                 mu_i = 0 that is not measured.
         """
-        known = [signal.name for signal in system.output_signals]
-        found = []
+        names_of_outputs = [signal.name for signal in system.output_signals]
+        integrated = []
         for name in names:
-            if name not in known:
-                raise GainError(f"integral: {unknown_name('output', name, known)}")
-            i = known.index(name)
-            if i in found:
+            if name not in names_of_outputs:
+                raise GainError(f"integral: {unknown_name('output', name, names_of_outputs)}")
+            i = names_of_outputs.index(name)
+            if i in integrated:
                 raise GainError(f"integral: '{name}' occurs twice")
             if degrees[i] == 0 and (measured is None or i not in measured.inputs):
                 raise GainError(
@@ -63,10 +63,12 @@ class IntegralAction:
                     "no error to integrate; make the law with measured_force=True, and integrate "
                     "a constraint input"
                 )
-            found.append(i)
-        chosen = tuple(sorted(found))
+            integrated.append(i)
+        chosen = tuple(sorted(integrated))
         signals = tuple(
-            Signal(f"integral of {known[i]}", f"{system.output_signals[i].unit or '1'} s")
+            Signal(
+                f"integral of {names_of_outputs[i]}", f"{system.output_signals[i].unit or '1'} s"
+            )
             for i in chosen
         )
         return cls(chosen, tuple(degrees), signals, ca.SX.sym("integral", len(chosen)))
@@ -77,7 +79,7 @@ class IntegralAction:
         return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
 
     def coordinates(self, errors: ca.SX, integral: ca.SX | None = None) -> ca.SX:
-        """The error coordinates with the integrals among them.
+        """Returns the error coordinates, with the integrals among them.
 
         Args:
             errors: (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i, 1).
@@ -92,7 +94,7 @@ class IntegralAction:
         return ca.vertcat(ca.SX(0, 1), *rows)
 
     def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
-        """sigma' = z - r of these outputs, shape (k, 1).
+        """Returns sigma' = z - r of these outputs, shape (k, 1).
 
         Args:
             chain: The output chains, with measured forces where the law uses them.

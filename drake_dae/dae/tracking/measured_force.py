@@ -14,7 +14,7 @@ from drake_dae.errors import GainError, ModelError
 
 @dataclass(frozen=True, eq=False)
 class ForceMeasurement:
-    """How a measurement of v enters the law (28), for the outputs z_i = v_j:
+    """The measurement of v in the law (28), for the outputs z_i = v_j:
 
         mu_i = 0:  ubar_i = r_i - Gbar_j (v - r), the term J^T Gbar (lambda - r_2) of (59). The
             force error of a wrong model shrinks to 1 / (1 + Gbar).
@@ -34,7 +34,7 @@ class ForceMeasurement:
 
     @classmethod
     def of(cls, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> "ForceMeasurement":
-        """The measurement of all constraint inputs of a system.
+        """Returns the measurement of all constraint inputs of a system.
 
         Args:
             system: The system (1)-(3).
@@ -63,7 +63,7 @@ class ForceMeasurement:
         return cls(layout, inputs, matrix, ca.SX.sym("v", system.num_constraints))
 
     def chain(self, chain: ca.SX) -> ca.SX:
-        """The output chains with the measurement in place of the model's l*_i.
+        """Returns the output chains with the measurement in place of the model's l*_i.
 
         Args:
             chain: The output chains by the model, shape (sum mu_i, 1).
@@ -75,7 +75,7 @@ class ForceMeasurement:
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
-        """The highest derivatives of the reference, less Gbar (v - r) where mu_i = 0.
+        """Returns the highest derivatives of the reference, less Gbar (v - r) where mu_i = 0.
 
         Args:
             highest: r_i^(mu_i), shape (p, 1).
@@ -92,7 +92,7 @@ class ForceMeasurement:
 
 
 def force_gain(value: ArrayLike, size: int) -> FloatArray:
-    """Gbar of (59) as a matrix of shape (m, m).
+    """Checks Gbar of (59) and returns it as a matrix of shape (m, m).
 
     Args:
         value: A number for all forces, or the matrix.
@@ -117,15 +117,15 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
 
 def _force_outputs(system: DaeSystem) -> dict[int, int]:
     """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
-    found = {}
+    forces = {}
     for i in range(system.num_outputs):
         row = ca.sparsify(system.m[i, :])
         if row.nnz() == 1 and system.l[i].is_zero():
             j = row.sparsity().get_triplet()[1][0]
             if row[j].is_one():
-                found[i] = j
-    if not found:
+                forces[i] = j
+    if not forces:
         raise ModelError(
             f"{system.name}: measured_force needs an output that is a constraint input, z_i = v_j"
         )
-    return found
+    return forces

@@ -25,7 +25,7 @@ from drake_dae.trace.given import result_of
 
 @checked(ModelError)
 class TrackingLaw:
-    """The law (28), which makes the controlled outputs follow a reference:
+    """The tracking law (28), which makes the controlled outputs follow a reference:
 
         u(x, R) = B(x)^-1 (-a(x) + ubar),
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
@@ -119,7 +119,7 @@ class TrackingLaw:
         errors = chain - reference[layout.chained.tolist(), :]
         ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
-        # By the model; outputs with direct feedthrough have their wanted values.
+        # By the model; outputs with direct feedthrough have their reference values.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
@@ -131,7 +131,7 @@ class TrackingLaw:
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
-        self._wanted = ubar
+        self._ubar = ubar
         self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
         return TracedFunction(
             f"{self.system.name} tracking law",
@@ -144,41 +144,38 @@ class TrackingLaw:
 
     @property
     def inputs(self) -> dict[str, ca.SX]:
-        """The symbols that `function` takes, by their names."""
+        """Name -> symbol of each input of `function`."""
         return dict(self._inputs)
 
-    def wanted(self, reference: ca.SX) -> ca.SX:
-        """ubar of (28) for a reference, in terms of state and parameters, shape (p, 1).
+    def commanded_derivatives(self, reference: ca.SX) -> ca.SX:
+        """Returns ubar of (28) for a reference, as an expression of state and parameters, (p, 1).
 
-        A measured force is taken as wanted, and integrals as 0.
+        A measured force is assumed to equal its reference, and integrals to be 0.
 
         Args:
             reference: R, an expression of shape (sum (mu_i + 1), 1).
         """
-        given = {"reference": ca.densify(reference)}
+        values = {"reference": ca.densify(reference)}
         if self.measured_force is not None:
             force = ca.SX.zeros(self._inputs["measured_force"].numel())
-            for output, place in self.measured_force.inputs.items():
-                force[place] = reference[int(self.layout.lowest[output])]
-            given["measured_force"] = force
+            for output, i in self.measured_force.inputs.items():
+                force[i] = reference[int(self.layout.lowest[output])]
+            values["measured_force"] = force
         if self.integral.outputs:
-            given["integral"] = ca.SX.zeros(len(self.integral.outputs))
-        return ca.substitute(
-            self._wanted,
-            ca.vertcat(*[self._inputs[name] for name in given]),
-            ca.vertcat(*given.values()),
-        )
+            values["integral"] = ca.SX.zeros(len(self.integral.outputs))
+        symbols = ca.vertcat(*[self._inputs[name] for name in values])
+        return ca.substitute(self._ubar, symbols, ca.vertcat(*values.values()))
 
     def trace_motion(self) -> TracedFunction | None:
-        """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
+        """Traces x' and v of a plant that equals the law's model, under the law; see `motion_for`.
 
         Returns:
             A function of what `function` takes; None where there is none.
         """
-        found = self.structure.motion_for(self._wanted) if self._model is self.structure else None
-        if found is None:
+        motion = self.structure.motion_for(self._ubar) if self._model is self.structure else None
+        if motion is None:
             return None
-        rate, force, pivot = found
+        rate, force, pivot = motion
         outputs = {"rate": rate, "force": force}
         name = f"{self.system.name} under its law"
         return TracedFunction(name, self._inputs, outputs, pivot, often=False)
@@ -193,37 +190,37 @@ class TrackingLaw:
 
     @property
     def degrees(self) -> tuple[int, ...]:
-        """mu_1, ..., mu_p: how many derivatives of each reference the law needs."""
+        """mu_1, ..., mu_p: the number of derivatives of each reference that the law needs."""
         return self.layout.degrees
 
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
-        """The gains for the outputs of this law.
+        """Checks gains, or designs them, for the outputs of this law.
 
         Raises:
             GainError: The gains are for other outputs or degrees, or are no gains.
         """
         names = tuple(signal.name for signal in self.system.output_signals)
         degrees = self.integral.all_degrees
-        found = gains
-        if not isinstance(found, FeedbackGains):
-            found = result_of("gains", found, names, degrees, error=GainError)
-        if not isinstance(found, FeedbackGains):
+        designed = gains
+        if not isinstance(designed, FeedbackGains):
+            designed = result_of("gains", designed, names, degrees, error=GainError)
+        if not isinstance(designed, FeedbackGains):
             raise GainError(
-                f"gains must be a design such as poles(-4.0), got one of {brief(found)}"
+                f"gains must be a design such as poles(-4.0), got one of {brief(designed)}"
             )
-        if (found.names, found.degrees) != (names, degrees):
+        if (designed.names, designed.degrees) != (names, degrees):
             raise GainError(
-                f"the gains are for the outputs {', '.join(found.names)} with degrees "
-                f"{found.degrees}, the system has {', '.join(names)} with {degrees}"
+                f"the gains are for the outputs {', '.join(designed.names)} with degrees "
+                f"{designed.degrees}, the system has {', '.join(names)} with {degrees}"
             )
-        return found
+        return designed
 
     def all_parameters(
         self,
         parameters: ArrayLike | None = None,
         gains: GainDesign | FeedbackGains | None = None,
     ) -> FloatArray:
-        """The parameters of `function`: those of the system, then the entries of K by columns.
+        """Returns the parameters of `function`: those of the system, then the entries of K.
 
         Args:
             parameters: Values of the system's parameters; the defaults if None.
@@ -249,13 +246,13 @@ class TrackingLaw:
     def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
-        found = []
+        signals = []
         for i, (signal, degree) in enumerate(
             zip(self.system.output_signals, self.degrees, strict=True)
         ):
-            found += [integrals[i]] if i in integrals else []
-            found += [signal.derivative(order) for order in range(degree)]
-        return found
+            signals += [integrals[i]] if i in integrals else []
+            signals += [signal.derivative(order) for order in range(degree)]
+        return signals
 
     def control(
         self,
@@ -266,7 +263,7 @@ class TrackingLaw:
         integral: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """The control u(x, R) of (28).
+        """Returns the control u(x, R) of (28).
 
         Args:
             state: x, shape (n,).
@@ -283,9 +280,9 @@ class TrackingLaw:
             measured.append(self._integrals(integral))
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
 
-    def _integrals(self, given: ArrayLike | None) -> FloatArray:
+    def _integrals(self, integral: ArrayLike | None) -> FloatArray:
         size = len(self.integral.outputs)
-        return vector("integral", np.zeros(size) if given is None else given, size, GainError)
+        return vector("integral", np.zeros(size) if integral is None else integral, size, GainError)
 
     def error_coordinates(
         self,
@@ -294,7 +291,7 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         integral: ArrayLike | None = None,
     ) -> FloatArray:
-        """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
+        """Returns (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
 
         The integral of an error stands before it, where the law has one. The arguments are those of
         `control`.
@@ -310,7 +307,7 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         integral: ArrayLike | None = None,
     ) -> FloatArray:
-        """The error that theory predicts after a start from a state, shape (k, p).
+        """Returns the tracking error that the theory predicts after a start, shape (k, p).
 
         Args:
             times: Times in s after the start, shape (k,).
@@ -328,9 +325,9 @@ class TrackingLaw:
 
 
 def _measured_force(
-    system: DaeSystem, layout: DerivativeLayout, wanted: bool, gain: ArrayLike
+    system: DaeSystem, layout: DerivativeLayout, is_measured: bool, gain: ArrayLike
 ) -> ForceMeasurement | None:
-    if wanted:
+    if is_measured:
         return ForceMeasurement.of(system, layout, gain)
     if numbers("force_gain", gain, GainError).any():
         raise GainError("force_gain needs measured_force=True")

@@ -1,6 +1,6 @@
 """Stability of the zero dynamics along a reference: Floquet multipliers, and exponents.   (35)"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class StabilityAlong:
             undecided if they converge to a motion that does not return, or if a multiplier is on
             the circle up to the error. Without a period: by the exponents of the disturbances over
             the second half of the time; undecided if they neither grow nor decay.
+        reason: The reason for the verdict, in words.
         period: The period of the reference in s, or of the motion if that is a multiple of it; None
             without a period, 0 if the reference is constant.
         multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
@@ -31,28 +32,20 @@ class StabilityAlong:
             of the time, shape (dimension,); empty if the motion ends. If the reference is constant
             the real parts of the eigenvalues at rest.
         state: The start of the periodic motion, shape (n,); None without one.
-        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
-    period: float | None
-    multipliers: ComplexArray
-    exponents: FloatArray
-    state: FloatArray | None
     reason: str
-
-    @classmethod
-    def without_numbers(
-        cls, verdict: Verdict, reason: str, period: float | None = None
-    ) -> "StabilityAlong":
-        """A result without numbers."""
-        return cls(verdict, period, np.zeros(0, dtype=complex), np.zeros(0), None, reason)
+    period: float | None = None
+    multipliers: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    exponents: FloatArray = field(default_factory=lambda: np.zeros(0))
+    state: FloatArray | None = None
 
 
 def judge_along(
     flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
 ) -> StabilityAlong:
-    """Whether disturbances of a motion with pinned outputs grow.
+    """Judges whether disturbances of a motion with pinned outputs grow.
 
     Args:
         flow: Along the reference.
@@ -62,35 +55,29 @@ def judge_along(
     if motion.ending is not None:
         unbounded = motion.ending.cause is EndCause.UNBOUNDED
         verdict = Verdict.UNSTABLE if unbounded else Verdict.UNDECIDED
-        return StabilityAlong.without_numbers(verdict, f"the motion ends: {motion.ending}", period)
+        return StabilityAlong(verdict, f"the motion ends: {motion.ending}", period)
     if motion.times.size < 2:
         reason = "one time alone is no motion; give more times"
-        return StabilityAlong.without_numbers(Verdict.UNDECIDED, reason, period)
+        return StabilityAlong(Verdict.UNDECIDED, reason, period)
     if period is not None:
         # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.flatnonzero(motion.times <= motion.times[-1] - period)[-1])
-        starts = dict.fromkeys((late, 0))
-        found = (_closed(flow, motion, first, period) for first in starts)
-        closed = next((one for one in found if one is not None), None)
-        if closed is None or closed[0].repels:
+        closed = None
+        for first in dict.fromkeys((late, 0)):
+            begin = float(motion.times[first])
+            closed = close(flow, motion.states[first], begin, period, patient=True)
+            if closed is not None:
+                break
+        if closed is None or closed.repels:
             # The motion itself may have a period of several periods of the reference.
-            begin = float(motion.times[late])
-            repeating = flow.repeating(begin, period)
-            several = find_multiple(repeating, motion.states[late], begin, period)
+            begin_late = float(motion.times[late])
+            repeating = flow.repeating(begin_late, period)
+            several = find_multiple(repeating, motion.states[late], begin_late, period)
             if several is not None:
-                return _by_multipliers(repeating, several, begin)
+                return _by_multipliers(repeating, several, begin_late)
         if closed is not None:
-            return _by_multipliers(flow, *closed)
+            return _by_multipliers(flow, closed, begin)
     return _by_exponents(flow, motion, period)
-
-
-def _closed(
-    flow: DisturbanceFlow, motion: PinnedMotion, first: int, period: float
-) -> tuple[PeriodicMotion, float] | None:
-    """The periodic motion near one of the states of a motion, and its start time."""
-    begin = float(motion.times[first])
-    found = close(flow, motion.states[first], begin, period, patient=True)
-    return None if found is None else (found, begin)
 
 
 def _by_multipliers(flow: DisturbanceFlow, closed: PeriodicMotion, begin: float) -> StabilityAlong:
@@ -105,11 +92,7 @@ def _by_multipliers(flow: DisturbanceFlow, closed: PeriodicMotion, begin: float)
         repeating, turning = flow.repeating(begin, period), 2.0 * np.pi / period
         rate = float(exponents[0])
         course = leave(repeating, closed.state, begin, rate, turning, period)
-        verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
-            course.behavior, verdict
-        )
-        if course.behavior not in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
-            reason += f"; motions that leave it: {course}"
+        verdict, reason = course.verdict_on_unstable(reason)
     else:
         count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
         verdict = Verdict.UNDECIDED
@@ -117,13 +100,13 @@ def _by_multipliers(flow: DisturbanceFlow, closed: PeriodicMotion, begin: float)
             f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to the error "
             f"of integration, over {period:.6g} s"
         )
-    return StabilityAlong(verdict, period, values, exponents, closed.state, reason)
+    return StabilityAlong(verdict, reason, period, values, exponents, closed.state)
 
 
 def _by_exponents(
     flow: DisturbanceFlow, motion: PinnedMotion, period: float | None
 ) -> StabilityAlong:
-    """The growth of disturbances over the second half of the time."""
+    """Judges by the growth of disturbances over the second half of the time."""
     middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
     middle = min(middle, motion.times.size - 2)
     begin, end = float(motion.times[middle]), float(motion.times[-1])
@@ -132,7 +115,7 @@ def _by_exponents(
     except MotionLost as lost:
         verdict = Verdict.UNSTABLE if lost.cause is EndCause.UNBOUNDED else Verdict.UNDECIDED
         reason = f"from x = {show(motion.states[middle])}: {lost}"
-        return StabilityAlong.without_numbers(verdict, reason, period)
+        return StabilityAlong(verdict, reason, period)
     behavior = behavior_of(passage, *halves)
     verdict = {
         Behavior.SPREADS: Verdict.UNSTABLE,
@@ -148,5 +131,4 @@ def _by_exponents(
         reason += f"; the motion {behavior.value}"
     elif verdict is Verdict.UNDECIDED:
         reason += "; that is too short to decide"
-    none = np.zeros(0, dtype=complex)
-    return StabilityAlong(verdict, period, none, exponents, None, reason)
+    return StabilityAlong(verdict, reason, period, exponents=exponents)

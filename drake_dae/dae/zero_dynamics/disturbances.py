@@ -9,6 +9,7 @@ eigenvalues of M are the Floquet multipliers.
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,8 @@ MOST_STEPS = 5000
 """The largest number of steps in one interval."""
 
 LATE, HARDLY = 200, 1e-5
-"""So many steps that together lead through less than this share of a section, and do not double the
-state either, end a motion: it would take millions of them."""
+"""A motion ends if LATE steps together cover less than the fraction HARDLY of a section and do not
+double the state: it would take millions of them."""
 
 SECTIONS = 16
 """The number of parts of an interval; after each, the state is projected onto Z(R) and bases are
@@ -38,7 +39,7 @@ renewed."""
 
 
 class MotionLost(Exception):
-    """A motion cannot be followed to the end of an interval."""
+    """The exception for a motion that cannot be followed to the end of an interval."""
 
     def __init__(self, cause: EndCause) -> None:
         super().__init__(cause.value)
@@ -47,7 +48,7 @@ class MotionLost(Exception):
 
 @dataclass(frozen=True, eq=False)
 class StateTransition:
-    """The flow of a state on Z(R) and of its disturbances over an interval of time.
+    """The motion of a state on Z(R) and of its small disturbances over an interval of time.
 
     Attributes:
         state: The state at the end, shape (n,).
@@ -65,7 +66,7 @@ class StateTransition:
 
 
 class DisturbanceFlow:
-    """Carries states on Z(R(t)), and their disturbances, through intervals of time.
+    """Integrates states on Z(R(t)) and their small disturbances.
 
     Args:
         pinned: Z(R).
@@ -85,27 +86,26 @@ class DisturbanceFlow:
         self._reference = reference
 
     def basis(self, state: FloatArray, time: float) -> FloatArray:
-        """T at a state, shape (n, d)."""
+        """Returns the basis T of the tangent space at a state, shape (n, d)."""
         return self.pinned.tangent(state, self.parameters(time), self.scale)
 
     def goal(self, time: float) -> FloatArray:
-        """R at a time, shape (sum (mu_i + 1),).
+        """Returns the reference vector R at a time, shape (sum (mu_i + 1),).
 
         Raises:
             ModelError: The reference has another size, or is not finite.
         """
-        given = result_of("reference", self._reference, time)
-        size = self.pinned.layout.reference_size
-        return vector(f"reference({time:g})", np.ravel(given), size)
+        goal = np.ravel(result_of("reference", self._reference, time))
+        return vector(f"reference({time:g})", goal, self.pinned.layout.reference_size)
 
     def period(self, begin: float, end: float) -> float | None:
-        """The period of reference and parameters, as `find_period` finds it in an interval."""
+        """Returns the period of reference and parameters in an interval; see `find_period`."""
         return find_period(
             lambda time: np.concatenate([self.goal(time), self.parameters(time)]), begin, end
         )
 
     def repeating(self, begin: float, period: float) -> "DisturbanceFlow":
-        """The same flow for a reference and parameters that repeat one period."""
+        """Returns the same flow for a reference and parameters that repeat one period."""
 
         def within(time: float) -> float:
             return begin + (time - begin) % period
@@ -118,30 +118,32 @@ class DisturbanceFlow:
         )
 
     def onto(self, state: FloatArray, time: float) -> FloatArray:
-        """The state on Z(R(t)) next to a given one.
+        """Projects a state onto Z(R(t)).
 
         Raises:
-            Lost: There is none, or it is not near.
+            MotionLost: There is none, or it is not near.
         """
-        found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
-        if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
+        projected, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
+        is_near = np.abs(projected - state) <= 0.1 * (self.scale + np.abs(state))
+        if not (converged and np.all(is_near)):
             raise MotionLost(EndCause.NO_WAY_ON)
-        return found
+        return projected
 
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
     ) -> StateTransition:
-        """The state and its disturbances at the end of an interval.
+        """Integrates a state and its disturbances over an interval.
 
         Raises:
-            Lost: The motion grows without bound, is too fast, or leaves the domain.
+            MotionLost: The motion grows without bound, is too fast, or leaves the domain.
         """
         d = self.pinned.structure.zero_dynamics_dimension
         basis, transition, growth, volume = self.basis(state, begin), np.eye(d), 0.0, 0.0
-        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
-        for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        budget = iter(range(MOST_STEPS))
+        for start, stop in _sections(begin, end):
             columns = basis if disturbed else basis[:, :0]
-            state, columns, steps = self._integrate(state, columns, start, stop, steps)
+            for _, later, moved in self._steps(state, columns, start, stop, budget):
+                state, columns = later, moved
             state = self.onto(state, stop)
             basis = self.basis(state, stop)
             if disturbed:
@@ -155,35 +157,33 @@ class DisturbanceFlow:
     def way(
         self, state: FloatArray, begin: float, end: float
     ) -> Iterator[tuple[float, FloatArray]]:
-        """The times and states after each step from a state.
+        """Generates the times and states after each integration step from a state.
 
         Raises:
-            Lost: As `carry`.
+            MotionLost: As `carry`.
         """
-        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
-        for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-            for time, there, _ in self._steps(state, self.basis(state, start)[:, :0], start, stop):
-                steps -= 1
-                if steps < 0:
-                    raise MotionLost(EndCause.TOO_FAST)
-                state = there
+        budget = iter(range(MOST_STEPS))
+        for start, stop in _sections(begin, end):
+            for time, later, _ in self._steps(
+                state, np.zeros((state.size, 0)), start, stop, budget
+            ):
+                state = later
                 yield time, state
             state = self.onto(state, stop)
 
-    def _integrate(
-        self, state: FloatArray, columns: FloatArray, begin: float, end: float, steps: int
-    ) -> tuple[FloatArray, FloatArray, int]:
-        """The state and directions at the end of a section, and the number of remaining steps."""
-        for _, there, along in self._steps(state, columns, begin, end):
-            state, columns, steps = there, along, steps - 1
-            if steps < 0:
-                raise MotionLost(EndCause.TOO_FAST)
-        return state, columns, steps
-
     def _steps(
-        self, state: FloatArray, columns: FloatArray, begin: float, end: float
+        self,
+        state: FloatArray,
+        columns: FloatArray,
+        begin: float,
+        end: float,
+        budget: Iterator[int],
     ) -> Iterator[tuple[float, FloatArray, FloatArray]]:
-        """The time, the state and the directions after each step of a section."""
+        """Generates the time, the state and the directions after each step of a section.
+
+        Raises:
+            MotionLost: As `carry`; also if the budget of steps is used up.
+        """
         n, unit = state.size, self.scale[:, None]
         bound = GROWN * np.maximum(1.0, np.max(np.abs(state) / self.scale))
 
@@ -212,7 +212,7 @@ class DisturbanceFlow:
 
         def quietly(work: Callable[[], Any]) -> Any:
             with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # Of a failed step: see Lost.
+                warnings.simplefilter("ignore")  # A failed step raises MotionLost.
                 return work()
 
         y = joined(state, columns)
@@ -232,6 +232,11 @@ class DisturbanceFlow:
                 before, size = marks[-1 - LATE]
                 if solver.t - before < HARDLY * (end - begin) and largest < 2.0 * size:
                     raise MotionLost(EndCause.TOO_FAST)
-            if solver.status == "failed":
+            if solver.status == "failed" or next(budget, None) is None:
                 raise MotionLost(EndCause.TOO_FAST)
             yield solver.t, *split(solver.y)
+
+
+def _sections(begin: float, end: float) -> Iterator[tuple[float, float]]:
+    """Returns the begin and end of each section of an interval."""
+    return pairwise(np.linspace(begin, end, SECTIONS + 1).tolist())

@@ -1,7 +1,6 @@
 """States at rest with constant outputs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -31,26 +30,8 @@ APART = 1e-6
 """States at rest that are nearer than this, relative to their sizes, are the same."""
 
 
-@dataclass(frozen=True)
-class EquilibriumDefect:
-    """The reason why a state is not a regular equilibrium.
-
-    Attributes:
-        regularity: Whether the motion is determined there.
-        moving: If it is, the state that changes most, relative to the terms of its rate.
-        rate: The time derivative of this state.
-    """
-
-    regularity: Regularity
-    moving: str = ""
-    rate: float = 0.0
-
-    def __str__(self) -> str:
-        return self.regularity.value or f"{self.moving}' = {self.rate:.3g}"
-
-
 def clock_rates(system: DaeSystem) -> FloatArray:
-    """The rates of states with a constant rate, such as clocks, shape (n,); 0 for others."""
+    """Returns the rates of states with a constant rate, such as clocks, shape (n,); else 0."""
     explicit, rates = system.explicit, np.zeros(system.num_states)
     for i in range(system.num_states):
         if explicit.f[i].is_constant() and not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz()):
@@ -59,7 +40,7 @@ def clock_rates(system: DaeSystem) -> FloatArray:
 
 
 class Equilibria:
-    """The states at rest on Z(R); all arguments are arrays of the right sizes.
+    """The equilibria on Z(R). The arguments of all methods are arrays of the right sizes.
 
     Args:
         pinned: Z(R).
@@ -75,8 +56,8 @@ class Equilibria:
         self.sizes = np.maximum(examined, pinned.system.nominal_spread)
         self._clocks = clock_rates(pinned.system)
 
-    def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R with constant outputs, taken at a state.
+    def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Returns R with the outputs of a state and zero derivatives.
 
         The state does not determine outputs of degree 0; they are chosen to minimize its rate.
         """
@@ -95,16 +76,16 @@ class Equilibria:
         return reference
 
     def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """An equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
+        """Finds an equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
 
         T spans the tangent space of Z(R), which contains x'. On a continuum of equilibria the
         shortest step is taken.
         """
         pinned = self.pinned
         if self._clocks.any():
-            names = [signal.name for signal in pinned.system.state_signals]
+            signals = pinned.system.state_signals
             running = ", ".join(
-                f"{names[i]}' = {self._clocks[i]:g}" for i in self._clocks.nonzero()[0]
+                f"{signals[i].name}' = {self._clocks[i]:g}" for i in self._clocks.nonzero()[0]
             )
             raise InconsistentStateError(
                 f"{pinned.system.name}: no state is an equilibrium, since {running} at all of "
@@ -140,7 +121,7 @@ class Equilibria:
         z, converged = newton(start / scale, linearize)
         state = scale * z
         point = pinned.point(state, reference, parameters)
-        unrest: EquilibriumDefect | str | None = self.unrest(point, reference, parameters)
+        unrest = self.unrest(point, reference, parameters)
         if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
             unrest = "it grows without bound"
         if converged and not unrest:
@@ -157,57 +138,54 @@ class Equilibria:
     def find_all(
         self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The distinct equilibria found from several guesses, shape (k, n).
+        """Finds distinct equilibria from several guesses, shape (k, n).
 
-        Of equilibria that are not isolated (with a zero eigenvalue) only the first is kept.
+        Of equilibria that are not isolated (with a zero eigenvalue) only the first is returned.
         """
-        found = np.zeros((0, self.sizes.size))
+        distinct = np.zeros((0, self.sizes.size))
         radii: list[float] = []
         for guess in guesses:
             try:
                 rest = self.find(reference, guess, parameters)
             except InconsistentStateError:
                 continue
-            near = np.abs(found - rest) <= APART * np.maximum(self.sizes, np.abs(rest))
+            near = np.abs(distinct - rest) <= APART * np.maximum(self.sizes, np.abs(rest))
             if np.any(np.all(near, axis=1)):
                 continue
-            values, errors, known = self.eigenvalues(reference, rest, parameters)
-            if np.all(np.abs(values) > errors):
-                radius = 0.0
-            else:
-                # Without a radius if the linearization is singular up to round-off.
-                radius = known.radius if known.degenerate else np.inf
-            off = np.max(np.abs(found - rest) / self.pinned.system.scale, axis=1)
-            if np.any(off <= radius + np.array(radii)) or (radius == np.inf and len(found)):
+            values, errors, accuracy = self.eigenvalues(reference, rest, parameters)
+            radius = 0.0
+            if not np.all(np.abs(values) > errors):
+                # Infinite if the linearization is singular up to round-off.
+                radius = accuracy.radius if accuracy.degenerate else np.inf
+            off = np.max(np.abs(distinct - rest) / self.pinned.system.scale, axis=1)
+            if np.any(off <= radius + np.array(radii)) or (radius == np.inf and len(distinct)):
                 continue
-            found = np.vstack([found, rest])
+            distinct = np.vstack([distinct, rest])
             radii.append(radius if radius < np.inf else 0.0)
-        return found
+        return distinct
 
     def eigenvalues(
         self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
     ) -> tuple[ComplexArray, FloatArray, Isolation]:
-        """The eigenvalues at an equilibrium, their errors, and the accuracy of its position."""
-        known = isolation(self.pinned, rest, reference, parameters)
-        known = known or Isolation(0, 0.0)
-        found = linearized_eigenvalues(self.pinned, self.sizes, rest, reference, parameters)
-        return found[0], known.errors(*found), known
+        """Returns the eigenvalues at an equilibrium, their errors, and its accuracy."""
+        accuracy = isolation(self.pinned, rest, reference, parameters) or Isolation(0, 0.0)
+        values, errors = linearized_eigenvalues(
+            self.pinned, self.sizes, rest, reference, parameters
+        )
+        return values, accuracy.errors(values, errors), accuracy
 
-    def unrest(
-        self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray
-    ) -> EquilibriumDefect | None:
-        """What changes at a point, or that it is singular; None at a regular equilibrium.
+    def unrest(self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray) -> str:
+        """Returns why a point is no regular equilibrium, as text; empty if it is one.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
         regularity = self.pinned.regularity(point)
         if regularity is not Regularity.REGULAR:
-            return EquilibriumDefect(regularity)
+            return regularity.value
         slopes, _ = self.pinned.slopes(point.state, reference, parameters)
         slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)
         worst = int(np.argmax(unrest))
         if unrest[worst] <= AT_REST:
-            return None
-        moving = self.pinned.system.state_signals[worst].name
-        return EquilibriumDefect(regularity, moving, float(point.rate[worst]))
+            return ""
+        return f"{self.pinned.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"

@@ -36,7 +36,7 @@ AFAR = 64.0
 state."""
 
 STRAIGHT = 0.1
-"""Tested at states that the projection onto Z(R) moves by less than this fraction of the
+"""The rate is tested where the projection onto Z(R) moves a state by less than this fraction of its
 distance."""
 
 
@@ -54,7 +54,7 @@ class Isolation:
     radius: float
 
     def errors(self, values: ComplexArray, errors: FloatArray) -> FloatArray:
-        """Errors of eigenvalues, which are 0 in degenerate directions."""
+        """Returns the errors of eigenvalues, widened for degenerate directions."""
         widened = errors.copy()
         smallest = np.argsort(np.abs(values))[: self.degenerate]
         widened[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
@@ -67,7 +67,7 @@ def isolation(
     reference: FloatArray,
     parameters: FloatArray,
 ) -> Isolation | None:
-    """The isolation of the equilibrium at which a search ends; None if there is none.
+    """Returns the accuracy of the equilibrium at which a search ends; None if it is none.
 
     Args:
         pinned: Z(R).
@@ -83,15 +83,15 @@ def isolation(
         return Isolation(0, 0.0)
     radius = 0.0
     for i in weak:
-        found = rest.radius(i)
-        if found is None:
+        distance = rest.radius(i)
+        if distance is None:
             return None
-        radius = max(radius, found)
+        radius = max(radius, distance)
     return Isolation(len(weak), radius)
 
 
 class _Rest:
-    """The rate and its slopes beside a state, in coordinates of Z(R) over their scale."""
+    """The rate close to a state, and its derivatives, in scaled coordinates of Z(R)."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class _Rest:
         return slopes[self._free] * self._scale[self._free] / self._scale[self._free][:, None]
 
     def _beside(self, index: int, distance: float) -> FloatArray:
-        """A state at a distance along a direction, relative to the scale; not put on Z(R)."""
+        """Returns a state at a scaled distance along a direction, not projected onto Z(R)."""
         along = self._moved @ (self._scale[self._free] * self._v[index])
         along /= np.max(np.abs(along) / self._scale)
         return np.asarray(self._state + distance * along)
@@ -142,38 +142,38 @@ class _Rest:
 
     @np.errstate(all="ignore")
     def radius(self, index: int) -> float | None:
-        """How far the equilibrium is in a direction in which it is not isolated.
+        """Returns the distance to which the equilibrium is known in a degenerate direction.
 
         Infinite if the rate vanishes along the whole direction, None if it vanishes nowhere. An
         analytic function that vanishes on a part of a line vanishes on all of it; one that is only
         flat at the state, like exp(-x), grows farther away.
         """
         noise = max(self._noise[index], ROUNDED * self._usual(index))
-        seen = GROWTH * max(self._left[index], noise)
-        found = None
+        visible = GROWTH * max(self._left[index], noise)
+        radius = None
         for distance in RADII:
             # On both sides: a function that grows on one and decreases on the other does not
             # vanish.
-            if not min(self._at_distance(index, distance)) > seen:
+            if not min(self._at_distance(index, distance)) > visible:
                 break
-            found = distance
-        if found is not None or self._left[index] > GROWTH * noise:
-            return found
+            radius = distance
+        if radius is not None or self._left[index] > GROWTH * noise:
+            return radius
         longest = max(AFAR, 2.0 * float(np.max(np.abs(self._state) / self._scale)))
         distances = 2.0 ** np.arange(1, np.log2(longest) + 1)
         far = (max(self._at_distance(index, float(distance))) for distance in distances)
-        return None if any(rate > seen for rate in far) else np.inf
+        return None if any(rate > visible for rate in far) else np.inf
 
     def _at_distance(self, index: int, distance: float) -> tuple[float, float]:
-        """The size of the rate on both sides of a direction; 0 where it is not known."""
-        found = []
+        """The size of the rate on both sides; 0 where no state on Z(R) is near."""
+        rates = []
         for side in (distance, -distance):
             aside = self._beside(index, side)
             state, converged = self._pinned.project(aside, *self._at)
             moved = np.max(np.abs(state - aside) / self._scale)
             is_near = converged and moved <= STRAIGHT * distance
-            found.append(self._left_at(state, index) if is_near else 0.0)
-        return found[0], found[1]
+            rates.append(self._left_at(state, index) if is_near else 0.0)
+        return rates[0], rates[1]
 
     def _left_at(self, state: FloatArray, index: int) -> float:
         rate = self._rate(state)

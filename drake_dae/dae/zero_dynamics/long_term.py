@@ -40,7 +40,7 @@ SLOWEST = 1e-4
 
 
 class Behavior(Enum):
-    """The long-term behavior of a motion; the value describes it."""
+    """The long-term behaviors of a motion; the enum value is a description."""
 
     GROWS = "grows without bound"
     SETTLES = "converges to another stable motion"
@@ -49,6 +49,15 @@ class Behavior(Enum):
     WANDERS = "attracts nearby motions but did not return: it may drift"
     SPREADS = "is unstable: small disturbances grow exponentially"
     UNCLEAR = "was not followed long enough to decide"
+
+
+VERDICTS = {
+    Behavior.GROWS: Verdict.UNSTABLE,
+    Behavior.LEAVES: Verdict.UNSTABLE,
+    Behavior.CIRCLES: Verdict.BOUNDED,
+    Behavior.WANDERS: Verdict.UNDECIDED,
+}
+"""The verdicts that follow from a long-term behavior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +75,23 @@ class LongTerm:
     closed: PeriodicMotion | None = None
 
     def __str__(self) -> str:
-        return (
-            self.behavior.value if self.closed is None else f"{self.behavior.value} ({self.closed})"
-        )
+        periodic = "" if self.closed is None else f" ({self.closed})"
+        return self.behavior.value + periodic
+
+    def verdict_on_unstable(self, reason: str) -> tuple[Verdict, str]:
+        """Returns verdict and reason for an unstable motion that other motions leave in this way.
+
+        Args:
+            reason: Why the motion is unstable; the returned reason may add the behavior.
+        """
+        if self.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
+            return Verdict.UNSTABLE, reason
+        verdict = VERDICTS.get(self.behavior, Verdict.UNSTABLE)
+        return verdict, f"{reason}; a motion that leaves it {self}"
 
 
 def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
-    """The behavior of a motion, from its disturbances over a late interval.
+    """Returns the behavior of a motion by the growth of its disturbances in a late interval.
 
     If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
     disturbances along the motion neither grow nor decay while volumes shrink; the same holds for a
@@ -97,10 +116,10 @@ def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
 def watch(
     flow: DisturbanceFlow, state: FloatArray, begin: float, end: float, period: float | None = None
 ) -> LongTerm:
-    """The long-term behavior of the motion from a state.
+    """Returns the long-term behavior of the motion from a state.
 
     Args:
-        flow: Of a reference that can be asked at all times.
+        flow: The flow of a reference that is defined at all times.
         state: The state, shape (n,).
         begin, end: The interval of observation, in s; the second half decides.
         period: The period of the reference; None if it is constant.
@@ -128,10 +147,10 @@ def watch(
 def carry_in_halves(
     flow: DisturbanceFlow, state: FloatArray, begin: float, end: float
 ) -> tuple[StateTransition, tuple[StateTransition, StateTransition]]:
-    """The flow over an interval and over its halves.
+    """Integrates over both halves of an interval, and combines them.
 
     Raises:
-        Lost: The motion cannot be followed.
+        MotionLost: The motion cannot be followed.
     """
     middle = 0.5 * (begin + end)
     first = flow.carry(state, begin, middle)
@@ -149,7 +168,7 @@ def carry_in_halves(
 
 
 def watch_from(flow: DisturbanceFlow, state: FloatArray) -> LongTerm:
-    """The long-term behavior from a state that is not at rest, for a constant reference.
+    """Returns the long-term behavior from a state that is not at rest, for constant R.
 
     The duration follows from the rates of its disturbances.
     """
@@ -173,10 +192,10 @@ def leave(
     fastest: float,
     period: float | None = None,
 ) -> LongTerm:
-    """The long-term behavior of the motions that leave an unstable one, on both sides.
+    """Returns the long-term behavior of motions that start on both sides of an unstable motion.
 
     Args:
-        flow: Of a reference that can be asked at all times.
+        flow: The flow of a reference that is defined at all times.
         state: A state of the unstable motion, shape (n,).
         time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.
@@ -208,7 +227,7 @@ def leave(
 def judge_at_rest(
     equilibria: Equilibria, goal: FloatArray, rest: FloatArray, parameters: FloatArray
 ) -> Stability:
-    """The verdict by eigenvalues; if unstable, also by the motions that leave the equilibrium.
+    """Judges an equilibrium by eigenvalues; if unstable, also by the motions that leave it.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -219,24 +238,13 @@ def judge_at_rest(
     pinned, sizes = equilibria.pinned, equilibria.sizes
     values, errors, _ = equilibria.eigenvalues(goal, rest, parameters)
     place = f"at the equilibrium with {pinned.describe(goal)}"
-    found = judge(values, errors, rest, place)
-    if found.verdict is not Verdict.UNSTABLE:
-        return found
+    at_rest = judge(values, errors, rest, place)
+    if at_rest.verdict is not Verdict.UNSTABLE:
+        return at_rest
     flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, sizes)
     course = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
-    return _after(found, course)
-
-
-def _after(found: Stability, course: LongTerm) -> Stability:
-    """The verdict on an unstable equilibrium, given the behavior of motions that leave it."""
-    verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
-        course.behavior, Verdict.UNSTABLE
-    )
-    if course.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
-        return found
-    return replace(
-        found, verdict=verdict, reason=f"{found.reason}; a motion that leaves it {course}"
-    )
+    verdict, reason = course.verdict_on_unstable(at_rest.reason)
+    return replace(at_rest, verdict=verdict, reason=reason)
 
 
 def judge_without_rest(
@@ -246,7 +254,7 @@ def judge_without_rest(
     parameters: FloatArray,
     reason: str,
 ) -> Stability:
-    """The verdict by the motion from a state near which no equilibrium is found.
+    """Judges by the motion from a state if no equilibrium is found near it.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -255,7 +263,7 @@ def judge_without_rest(
         parameters: Values of all parameters.
         reason: Why there is no equilibrium.
     """
-    nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
+    pinned = equilibria.pinned
     flow = DisturbanceFlow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         course = watch_from(flow, pinned.state(goal, start, parameters))
@@ -263,13 +271,7 @@ def judge_without_rest(
             rest = equilibria.find(goal, course.state, parameters)
             return judge_at_rest(equilibria, goal, rest, parameters)
     except InconsistentStateError:
-        return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    verdict = {
-        Behavior.GROWS: Verdict.UNSTABLE,
-        Behavior.LEAVES: Verdict.UNSTABLE,
-        Behavior.CIRCLES: Verdict.BOUNDED,
-        Behavior.WANDERS: Verdict.UNDECIDED,
-    }.get(course.behavior)
-    if verdict is None:
-        return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    return Stability(verdict, nothing, None, f"{reason}; the motion from there {course}")
+        return Stability(Verdict.UNDECIDED, reason)
+    if course.behavior not in VERDICTS:
+        return Stability(Verdict.UNDECIDED, reason)
+    return Stability(VERDICTS[course.behavior], f"{reason}; the motion from there {course}")

@@ -16,10 +16,10 @@ STILL = 1e-9
 
 
 def find_period(reference: Reference, begin: float, end: float) -> float | None:
-    """The smallest period of a reference that repeats itself in an interval at least once.
+    """Returns the smallest period of a reference that repeats itself in an interval.
 
     Args:
-        reference: The function t -> R(t); it is asked inside the interval alone.
+        reference: The function t -> R(t); it is evaluated only inside the interval.
         begin, end: The interval in s.
 
     Returns:
@@ -37,12 +37,12 @@ def find_period(reference: Reference, begin: float, end: float) -> float | None:
     off = np.array(
         [np.max(np.abs(scaled[lag : lag + half] - scaled[:half])) for lag in range(half + 1)]
     )
-    # How much it changes from sample to sample is how near a lag between samples may come.
+    # The period may be between two lags: then the difference is as large as that of neighbours.
     near = 2.0 * off[1] + REPEATED
     is_least = np.r_[False, (off[1:-1] <= off[:-2]) & (off[1:-1] <= off[2:]), True]
-    step = (end - begin) / SAMPLES
     for lag in np.flatnonzero(is_least & (off < near)):
-        period = _refined(reference, moving, width, times, float(lag * step), step)
+        guess = float(lag * ((end - begin) / SAMPLES))
+        period = _refined(reference, moving, width, begin, end, guess)
         if period is not None:
             return period
     return None
@@ -52,18 +52,18 @@ def _refined(
     reference: Reference,
     moving: Booleans,
     width: FloatArray,
-    times: FloatArray,
+    begin: float,
+    end: float,
     period: float,
-    step: float,
 ) -> float | None:
-    """A period near a guess, by Gauss's and Newton's method; None if there is none."""
-    begin, end = times[0], times[-1]
+    """Refines a period by the Gauss-Newton method; None if there is none."""
+    step = (end - begin) / SAMPLES
     # Not at round parts of the period, where references have their breaks.
     shares = (np.arange(1, 41) * 0.6180339887) % 1.0
-    tried = begin + shares * (end - begin - min(period + step, 0.5 * (end - begin)))
+    times = begin + shares * (end - begin - min(period + step, 0.5 * (end - begin)))
 
-    def off(wanted: float) -> FloatArray:
-        pairs = [(reference(float(t + wanted)), reference(float(t))) for t in tried]
+    def off(shift: float) -> FloatArray:
+        pairs = [(reference(float(t + shift)), reference(float(t))) for t in times]
         differences = np.array([np.ravel(a) - np.ravel(b) for a, b in pairs])
         return (differences[:, moving] / width[moving]).reshape(-1)
 

@@ -47,7 +47,7 @@ def follow(
     guess: FloatArray,
     parameters: Callable[[float], FloatArray],
 ) -> PinnedMotion:
-    """The motion on Z(R(t)) from a state next to a guess; see `ZeroDynamics.motion`.
+    """Computes the motion on Z(R(t)) from a state close to a guess; see `ZeroDynamics.motion`.
 
     Args:
         pinned: The system with its outputs pinned.
@@ -87,7 +87,7 @@ def follow(
 
 
 class _MotionEnded(Exception):
-    """The end of a motion with pinned outputs."""
+    """The exception at the end of a motion with pinned outputs."""
 
     def __init__(self, ending: MotionEnd) -> None:
         super().__init__(str(ending))
@@ -95,7 +95,7 @@ class _MotionEnded(Exception):
 
 
 class _Pursuit:
-    """Follows a reference from point to point; raises _MotionEnded at the end of the motion."""
+    """Follows a reference from point to point. It raises _MotionEnded where the motion ends."""
 
     def __init__(
         self,
@@ -206,11 +206,11 @@ class _Pursuit:
         )
 
     def _goal(self, time: float) -> FloatArray:
-        """R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
+        """Returns R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
         layout = self._pinned.layout
         try:
-            given = result_of("reference", self._reference, time)
-            goal = numbers(f"reference({time:g})", given).reshape(-1)
+            value = result_of("reference", self._reference, time)
+            goal = numbers(f"reference({time:g})", value).reshape(-1)
         except NonFiniteError as error:
             ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
             raise _MotionEnded(ending) from error
@@ -225,7 +225,7 @@ class _Pursuit:
         return goal
 
     def _reach(self, time: float, state: FloatArray) -> bool:
-        """Continues to the point next to a state, unless it is on another branch than the last."""
+        """Moves to the projected state, unless it is on another branch; returns whether it did."""
         last = self._last
         self._remaining -= 1
         if self._remaining < 0:
@@ -235,13 +235,13 @@ class _Pursuit:
                 "it is too fast to be followed",
             )
         goal, parameters = self._goal(time), self._parameters(time)
-        found, converged = self._pinned.project(state, goal, parameters)
+        projected, converged = self._pinned.project(state, goal, parameters)
         near = JUMP * np.maximum(self._pinned.system.scale, np.abs(last.state)) + np.abs(
             state - last.state
         )
-        if not converged or np.any(np.abs(found - state) > near):
+        if not converged or np.any(np.abs(projected - state) > near):
             return False
-        point = self._pinned.point(found, goal, parameters)
+        point = self._pinned.point(projected, goal, parameters)
         regular = self._pinned.regularity(point) is Regularity.REGULAR
         if not regular or point.signs != last.signs:
             return False
@@ -254,7 +254,7 @@ class _Pursuit:
             raise self._end(0.1 * interval)
 
     def _end(self, ahead: float) -> _MotionEnded:
-        """The reason why the motion ends at the last point, also from the reference ahead."""
+        """Returns why the motion ends at the last point, also by the reference after it."""
         last, when = self._last, f"t = {self._time:.6g} s"
         shares = [
             now / largest if largest < np.inf else 1.0
@@ -285,7 +285,7 @@ class _Pursuit:
         return self._stop(EndCause.OUT_OF_REACH, text, matrix)
 
     def _escape(self) -> _MotionEnded | None:
-        """The end where a state grows without bound within a finite time; None where none does.
+        """Returns the end if a state grows without bound within a finite time, else None.
 
         At such an end a rate is so large that the state would have grown by `GROWN` in the elapsed
         time. The state itself may still be small, as for x' = exp(x).
@@ -305,5 +305,5 @@ class _Pursuit:
         )
 
     def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _MotionEnded:
-        """The end of the motion at the last point."""
+        """Returns the end of the motion at the last point."""
         return _MotionEnded(MotionEnd(cause, self._time, text, self._last.state, matrix))

@@ -44,16 +44,13 @@ class PeriodicMotion:
     Attributes:
         state: Its start, shape (n,).
         period: Its period, in s.
-        monodromy: The transition matrix of disturbances over the period, in the basis at the start,
-            shape (d, d).
-        multipliers: Its eigenvalues, the largest first; for autonomous motions without the one that
-            is 1 along the motion.
+        multipliers: The eigenvalues of the transition matrix of disturbances over the period, the
+            largest first; for autonomous motions without the one that is 1 along the motion.
         errors: The error bound of each.
     """
 
     state: FloatArray
     period: float
-    monodromy: FloatArray
     multipliers: ComplexArray
     errors: FloatArray
 
@@ -83,7 +80,7 @@ def close(
     free: bool = False,
     patient: bool = False,
 ) -> PeriodicMotion | None:
-    """The periodic motion near a state for a period; None if none is found.
+    """Finds the periodic motion close to a state by Newton's method; None if there is none.
 
     Newton's method for the distance from the start after a period, along the tangent space.
 
@@ -113,7 +110,7 @@ def close(
         missed = float(np.linalg.norm(gap))
         if not patient and missed > max(0.5 * before, CLOSED):
             return None  # For example if the motion drifts.
-        matrix, left, before = monodromy - np.eye(gap.size), -gap, missed
+        matrix, right, before = monodromy - np.eye(gap.size), -gap, missed
         if free:
             # A little later, and not along the motion.
             rate = flow.pinned.rate(passage.state, flow.goal(begin), flow.parameters(begin))
@@ -124,8 +121,8 @@ def close(
             matrix = np.block(
                 [[matrix, onward[:, None] / size], [onward[None] / size, np.zeros((1, 1))]]
             )
-            left = np.append(left, 0.0)
-        change = np.linalg.lstsq(matrix, left, rcond=CARRIED)[0]
+            right = np.append(right, 0.0)
+        change = np.linalg.lstsq(matrix, right, rcond=CARRIED)[0]
         later = float(change[gap.size]) / size if free else 0.0
         step = basis @ change[: gap.size]
         if np.max(np.abs(step) / scale, initial=0.0) <= CLOSED and abs(later) <= CLOSED * period:
@@ -143,7 +140,7 @@ def close(
 
 
 def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> PeriodicMotion | None:
-    """The periodic motion on or near a motion of an autonomous system.
+    """Finds the periodic motion on or close to a motion of an autonomous system.
 
     Candidates are crossings of a section, the plane normal to its rate, near the start.
 
@@ -153,20 +150,20 @@ def find_return(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Pe
         duration: The longest time to follow, in s.
     """
     periods = islice(_near(flow, state, duration), CROSSINGS)
-    found = (close(flow, state, 0.0, period, free=True) for period in periods)
-    return next((one for one in found if one is not None), None)
+    motions = (close(flow, state, 0.0, period, free=True) for period in periods)
+    return next((motion for motion in motions if motion is not None), None)
 
 
 def find_multiple(
     flow: DisturbanceFlow, state: FloatArray, begin: float, period: float
 ) -> PeriodicMotion | None:
-    """The attracting motion near a state whose period is a multiple of the reference's."""
-    found = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
-    return next((one for one in found if one is not None and one.attracts), None)
+    """Finds an attracting motion near a state with a multiple of the reference's period."""
+    motions = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
+    return next((motion for motion in motions if motion is not None and motion.attracts), None)
 
 
 def _near(flow: DisturbanceFlow, state: FloatArray, duration: float) -> Iterator[float]:
-    """The times at which a motion crosses the section at a state in the same direction, near it."""
+    """Generates the times of near returns through the section at a state, in the same direction."""
     rate = flow.pinned.rate(state, flow.goal(0.0), flow.parameters(0.0)) / flow.scale
     if not np.any(rate):
         return
@@ -192,4 +189,4 @@ def _judged(state: FloatArray, period: float, monodromy: FloatArray, free: bool)
         along = int(np.argmin(np.abs(values - 1.0)))
         values, errors = np.delete(values, along), np.delete(errors, along)
     order = np.argsort(-np.abs(values), kind="stable")
-    return PeriodicMotion(state, period, monodromy, values[order], errors[order])
+    return PeriodicMotion(state, period, values[order], errors[order])

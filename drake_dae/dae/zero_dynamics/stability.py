@@ -1,6 +1,6 @@
 """Stability of the zero dynamics at an equilibrium, by linearization.            (35)-(36)"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -23,7 +23,7 @@ ComplexArray = np.typing.NDArray[np.complex128]
 
 
 class Verdict(StrEnum):
-    """The verdict on the zero dynamics."""
+    """The verdicts on the zero dynamics."""
 
     STABLE = "exponentially stable"
     BOUNDED = "bounded, not asymptotically stable"
@@ -44,16 +44,16 @@ class Stability:
             limit cycle; undecided if an eigenvalue is on the imaginary axis up to round-off, if no
             equilibrium is found, or if motions that leave it attract their neighbours but do not
             return. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
+        reason: The reason for the verdict, in words.
         eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
             (dimension,); empty if no equilibrium is found.
         state: The equilibrium, shape (n,); None if none is needed, or found.
-        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
-    eigenvalues: ComplexArray
-    state: FloatArray | None
     reason: str
+    eigenvalues: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    state: FloatArray | None = None
 
 
 def linearized_eigenvalues(
@@ -63,7 +63,7 @@ def linearized_eigenvalues(
     reference: FloatArray,
     parameters: FloatArray,
 ) -> tuple[ComplexArray, FloatArray]:
-    """The eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), and their errors.
+    """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors.
 
     The errors come from round-off in the derivative, and from the error of the equilibrium, which
     is large if Newton's method converges slowly.
@@ -103,7 +103,7 @@ def linearized_eigenvalues(
 
 
 def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) -> bool:
-    """Whether no eigenvalue of a matrix can cross the imaginary axis, within its error.
+    """Returns whether no eigenvalue can be on the imaginary axis, within the matrix's error.
 
     Eigenvalues of a defective matrix have errors of the root of its error, even if all are far from
     the axis. A perturbation that moves one to i w is at least the smallest singular value of A - i
@@ -126,7 +126,7 @@ def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) ->
 
 
 def balanced_norm(matrix: FloatArray) -> float:
-    """The norm of a matrix after balancing, independent of units."""
+    """Returns the norm of a matrix after balancing, which does not depend on units."""
     with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
         return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
 
@@ -134,7 +134,7 @@ def balanced_norm(matrix: FloatArray) -> float:
 def eigenvalues_of(
     matrix: FloatArray, error: FloatArray, rounded: float = 0.0
 ) -> tuple[ComplexArray, FloatArray]:
-    """Eigenvalues, largest real part first, and their error bounds.
+    """Returns eigenvalues, largest real part first, and their error bounds.
 
     To first order an error E of the matrix moves an eigenvalue by at most |y|^H |E| |x| / |y^H x|,
     with its left and right eigenvectors y and x. So in a triangular matrix a small eigenvalue is as
@@ -160,7 +160,7 @@ def eigenvalues_of(
 
 
 def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: str) -> Stability:
-    """The verdict by the eigenvalues at an equilibrium.
+    """Judges an equilibrium by its eigenvalues.
 
     Args:
         values, errors: What `linearized_eigenvalues` returns; at least one eigenvalue.
@@ -169,22 +169,19 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
     """
     largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
     if np.any(values.real > errors):
-        return Stability(Verdict.UNSTABLE, values, state, f"non-minimum phase: {largest}")
+        return Stability(Verdict.UNSTABLE, f"non-minimum phase: {largest}", values, state)
     if np.all(values.real < -errors):
-        return Stability(Verdict.STABLE, values, state, f"minimum phase: {largest}")
+        return Stability(Verdict.STABLE, f"minimum phase: {largest}", values, state)
     count = np.count_nonzero(np.abs(values.real) <= errors)
-    return Stability(
-        Verdict.UNDECIDED,
-        values,
-        state,
+    reason = (
         f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
-        f"imaginary axis, up to round-off, {place}",
+        f"imaginary axis, up to round-off, {place}"
     )
+    return Stability(Verdict.UNDECIDED, reason, values, state)
 
 
 def without_dynamics(structure: Structure) -> Stability:
-    """The verdict on a system without zero dynamics: whether R determines the motion."""
-    nothing = np.zeros(0, dtype=complex)
+    """Judges a system without zero dynamics: whether R determines the motion."""
     margins = {
         "A(x) of Assumption (2)": structure.constraint_margin,
         "B(x) of (16)": structure.control_margin,
@@ -195,6 +192,5 @@ def without_dynamics(structure: Structure) -> Stability:
                 "no zero dynamics, but the reference does not determine the motion: "
                 f"{matrix} is singular at x = {show(margin.state)}"
             )
-            return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    reason = "no zero dynamics: the reference alone determines the motion"
-    return Stability(Verdict.STABLE, nothing, None, reason)
+            return Stability(Verdict.UNDECIDED, reason)
+    return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")

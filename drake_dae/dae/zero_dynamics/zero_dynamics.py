@@ -33,7 +33,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 
 @checked(ModelError)
 class ZeroDynamics:
-    """The dynamics (35) that are left when the outputs are pinned to a reference.
+    """The dynamics (35) that remain if the outputs are pinned to a reference.
 
     In all methods `reference` is R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape
     (sum (mu_i + 1),), as for `TrackingLaw`; `guess` is a state, shape (n,), the nominal one if
@@ -66,7 +66,7 @@ class ZeroDynamics:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """A state on Z(R), to round-off, by Newton's method with shortest steps from a guess.
+        """Returns a state on Z(R), to round-off, by Newton's method from a guess.
 
         Returns:
             x, shape (n,).
@@ -88,13 +88,13 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         exogenous: Sequence[references.Reference] = (),
     ) -> PinnedMotion:
-        """The motion on Z(R(t)) from a state next to the guess, as far as it exists.
+        """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
         Without zero dynamics each state follows from the one before by Newton's method. Else
         x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
 
         Args:
-            reference: The function t -> R(t); it is also asked between the times.
+            reference: The function t -> R(t); it is also evaluated between the times.
             times: Times in s, increasing, shape (k,).
             guess: A state near the first one; it decides which of several solutions is followed.
             parameters: Values of all parameters.
@@ -118,7 +118,7 @@ class ZeroDynamics:
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """A state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
+        """Returns a state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
 
         Where there is a continuum of equilibria, it is one near the guess.
 
@@ -146,7 +146,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> ComplexArray:
-        """The eigenvalues of the zero dynamics, linearized at an equilibrium of held outputs.
+        """Returns the eigenvalues of the zero dynamics, linearized at an equilibrium.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
         eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
@@ -156,7 +156,7 @@ class ZeroDynamics:
             state: x, shape (n,).
             parameters: Values of all parameters.
             outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
-                state does not determine, are chosen such that x' is smallest. Give them if this
+                state does not determine, are those with the smallest x'. Give them if this
                 choice is not unique, as for a force that does not affect the motion.
 
         Returns:
@@ -184,7 +184,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> Stability:
-        """Whether Assumption 2.2 holds near an equilibrium, by linearization.
+        """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
 
         Args:
             state: Where to look for the equilibrium.
@@ -214,7 +214,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> FloatArray:
-        """The states at rest with the same outputs that a search from several guesses finds.
+        """Returns the equilibria with the same outputs that a search from several guesses finds.
 
         Args:
             guesses: States from which the search starts, shape (k, n); `structure.states` if None.
@@ -222,22 +222,20 @@ class ZeroDynamics:
             outputs: z, shape (p,). If None those of the first guess, as in `stability`.
 
         Returns:
-            Each of them once, in the order in which they are found, shape (l, n). Of states at rest
-            that are not isolated, only one that is found first.
+            The distinct states, in the order in which they are found, shape (l, n). Of states at
+            rest that are not isolated, only the first one.
 
         Raises:
             InconsistentStateError: The first guess is not near N*.
             ModelError: A shape is wrong, or a number is not finite.
         """
-        given = numbers(
-            f"{self.system.name}: guesses", self.structure.states if guesses is None else guesses
-        )
-        if given.ndim != 2 or not len(given):
+        name = self.system.name
+        rows = numbers(f"{name}: guesses", self.structure.states if guesses is None else guesses)
+        if rows.ndim != 2 or not len(rows):
             raise ModelError(
-                f"{self.system.name}: guesses must have shape (k, {self.system.num_states}), got "
-                f"{given.shape}"
+                f"{name}: guesses must have shape (k, {self.system.num_states}), got {rows.shape}"
             )
-        starts, p = [self._guess(row) for row in given], self.system.parameter_vector(parameters)
+        starts, p = [self._guess(row) for row in rows], self.system.parameter_vector(parameters)
         goal = self._goal(self.structure.manifold.project(starts[0], p), outputs, p)
         return self._equilibria.find_all(goal, starts, p)
 
@@ -248,7 +246,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         exogenous: Sequence[references.Reference] = (),
     ) -> StabilityAlong:
-        """Whether Assumption 2.2 holds along a motion, by what it does to small disturbances.
+        """Judges by the growth of small disturbances whether Assumption 2.2 holds along a motion.
 
         On Z(R(t)) a disturbance moves by delta' = (dx'/dx) delta. If the reference repeats itself
         within the times, the motion of the same period is sought, and the eigenvalues of the
@@ -266,8 +264,8 @@ class ZeroDynamics:
             ModelError: A shape is wrong, or a number is not finite.
         """
         if self.dimension == 0:
-            still = without_dynamics(self.structure)
-            return StabilityAlong.without_numbers(still.verdict, still.reason)
+            at_rest = without_dynamics(self.structure)
+            return StabilityAlong(at_rest.verdict, at_rest.reason)
         p, n = self.system.parameter_vector(parameters), self.system.num_states
         if motion.states.shape != (motion.times.size, n):
             raise ModelError(
@@ -275,26 +273,24 @@ class ZeroDynamics:
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
         moving = self._moving(p, exogenous)
-        flow, period = (
-            DisturbanceFlow(self._pinned, reference, moving, self._equilibria.sizes),
-            None,
-        )
+        flow = DisturbanceFlow(self._pinned, reference, moving, self._equilibria.sizes)
+        period = None
         if motion.ending is None and motion.times.size > 1:
             period = flow.period(float(motion.times[0]), float(motion.times[-1]))
         if period == 0.0:
-            outputs = self._pinned.layout.values(flow.goal(float(motion.times[0])))
-            held = moving(float(motion.times[0]))
-            found = self.stability(motion.states[0], held, outputs)
-            rates = found.eigenvalues.real.copy()
+            begin = float(motion.times[0])
+            outputs = self._pinned.layout.values(flow.goal(begin))
+            at_rest = self.stability(motion.states[0], moving(begin), outputs)
+            rates = at_rest.eigenvalues.real.copy()
             return StabilityAlong(
-                found.verdict, 0.0, found.eigenvalues[:0], rates, found.state, found.reason
+                at_rest.verdict, at_rest.reason, 0.0, exponents=rates, state=at_rest.state
             )
         return judge_along(flow, motion, period)
 
     def _moving(
         self, parameters: FloatArray, exogenous: Sequence[references.Reference]
     ) -> Callable[[float], FloatArray]:
-        """The function t -> values of all parameters."""
+        """Returns the function t -> values of all parameters."""
         if not exogenous:
             return lambda time: parameters
         structure, system = self.structure, self.system
@@ -303,10 +299,10 @@ class ZeroDynamics:
         if system.control_metric is not None:
             matrices += [system.control_metric, system.free_control]
         degrees = system.exogenous.degrees(residual, structure.chain, structure.drift, v, *matrices)
-        given = sum(reference.size for reference in exogenous)
-        if given != len(degrees):
+        size = sum(reference.size for reference in exogenous)
+        if size != len(degrees):
             raise ModelError(
-                f"{system.name}: exogenous covers {given} signals, the system has {len(degrees)}"
+                f"{system.name}: exogenous covers {size} signals, the system has {len(degrees)}"
             )
         signals = references.stack_references(exogenous, degrees)
         places = system.exogenous.places(degrees)
@@ -322,18 +318,18 @@ class ZeroDynamics:
         return vector(f"{self.system.name}: {what}", np.ravel(value), size)
 
     def _guess(self, guess: ArrayLike | None) -> FloatArray:
-        given = self.system.nominal_state if guess is None else guess
-        return self._vector("state", given, self.system.num_states)
+        state = self.system.nominal_state if guess is None else guess
+        return self._vector("state", state, self.system.num_states)
 
     def _goal(
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
     ) -> FloatArray:
-        """R with constant outputs: those given, or those of a state."""
+        """Returns R with constant outputs; with those of the state if None."""
         if outputs is None:
-            return self._equilibria.held_outputs(state, parameters)
+            return self._equilibria.constant_outputs(state, parameters)
         return self._constant(outputs)
 
     def _constant(self, outputs: ArrayLike) -> FloatArray:
-        """R with outputs that stay at given values."""
+        """Returns R with constant outputs."""
         values = self._vector("outputs", outputs, self.system.num_outputs)
         return self._pinned.layout.constant(values)

@@ -73,25 +73,23 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
     loads = [(position, velocity)]
     for name, other, before in zip(names[1:], names, attached, strict=False):
         if before.shaft is None:
-            raise ModelError(
-                f"{name} cannot stand behind {other}, which has no shaft to drive; put {other} last"
-            )
+            raise ModelError(f"{name} cannot drive {other}, which has no shaft; put {other} last")
         loads.append(before.shaft)
-    delivered = [own.force(*load) for own, load in zip(attached, loads, strict=True)]
-    drifts = [own.drift(*load) for own, load in zip(attached, loads, strict=True)]
+    delivered = [stage.force(*load) for stage, load in zip(attached, loads, strict=True)]
+    drifts = [stage.drift(*load) for stage, load in zip(attached, loads, strict=True)]
     for i, force in enumerate(delivered[1:]):
         drifts[i] += ca.mtimes(attached[i].drive_matrix, force)
-    idle = sum(own.state.numel() for own in attached[:-1])
+    idle = sum(stage.state.numel() for stage in attached[:-1])
     return ActuationChain(
         stages=tuple(attached),
         joint_force=delivered[0],
         direct=ca.SX(p, p),
-        state=ca.vertcat(*[own.state for own in attached]),
-        mass=ca.diagcat(*[own.mass for own in attached]),
+        state=ca.vertcat(*[stage.state for stage in attached]),
+        mass=ca.diagcat(*[stage.mass for stage in attached]),
         drift=ca.vertcat(*drifts),
         drive=ca.vertcat(ca.SX(idle, p), attached[-1].drive_matrix),
         control_signals=attached[-1].drive_signals,
-        parameters=tuple(p for own in attached for p in own.parameters),
+        parameters=tuple(p for stage in attached for p in stage.parameters),
     )
 
 
@@ -131,7 +129,7 @@ def _actuated(links: Links) -> tuple[ca.SX, ca.SX]:
 
 def _check_rotors(names: Sequence[str], attached: Sequence[AttachedStage]) -> None:
     """Refuses rotors in more than one stage, since they would count twice."""
-    carriers = [n for n, own in zip(names, attached, strict=True) if own.carries_rotors]
+    carriers = [n for n, stage in zip(names, attached, strict=True) if stage.carries_rotors]
     if len(carriers) > 1:
         raise ModelError(
             f"the rotors would turn with each of {', '.join(carriers)}, but stages that carry them "

@@ -46,18 +46,18 @@ class DcMotors(Stage):
         inductance, l = diagonal_parameter("dc_motors.inductance", self.inductance, p, "H", True)  # noqa: E741
         resistance, r = diagonal_parameter("dc_motors.resistance", self.resistance, p, "ohm")
         gears, n = diagonal_parameter("dc_motors.gear_ratio", ratio, p, "")
-        for parameter, wrong, wanted in (
+        for parameter, wrong, rule in (
             (constant, constant.value == 0, "not be zero"),
             (gears, gears.value == 0, "not be zero"),
             (resistance, resistance.value < 0, "not be negative"),
         ):
             if wrong.any():
-                raise ModelError(f"{parameter.name} must {wanted}, got {parameter.value}")
+                raise ModelError(f"{parameter.name} must {rule}, got {parameter.value}")
         current = ca.SX.sym("I", p)
 
         def drive_for(force: ca.SX, velocity: ca.SX, rate: ca.SX) -> ca.SX:
-            wanted = force / (n * k_m)
-            return r * current + k_m * n * velocity + l * rate * (wanted - current)
+            rule = force / (n * k_m)
+            return r * current + k_m * n * velocity + l * rate * (rule - current)
 
         return AttachedStage(
             state=current,

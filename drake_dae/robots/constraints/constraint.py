@@ -186,9 +186,9 @@ class Constraint(ABC):
         """The same constraint; parameters of the given names are exogenous."""
         if not any(parameter.name in names for parameter in self.parameters):
             return self
-        found = copy(self)  # Its class may be frozen.
-        object.__setattr__(found, "parameters", moving(self.parameters, names))
-        return found
+        changed = copy(self)  # Its class may be frozen.
+        object.__setattr__(changed, "parameters", moving(self.parameters, names))
+        return changed
 
     @property
     def is_unilateral(self) -> tuple[bool, ...]:

@@ -121,16 +121,16 @@ class ConstraintSet:
             raise ModelError(unknown_name("constraint", name, parts))
         constraint, part = parts[name]
         acting = constraint.applications(kinematics)
-        found = [a for a in acting if frame in (a.frame_a, a.frame_b)]
-        if len(found) != 1:
+        on_frame = [a for a in acting if frame in (a.frame_a, a.frame_b)]
+        if len(on_frame) != 1:
             frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
-            where = "at several points of" if found else "not on"
+            where = "at several points of" if on_frame else "not on"
             raise ModelError(
                 f"constraint '{name}' acts {where} '{frame}', and exactly one point on it is "
-                f"needed; it acts on {frames or 'no frame that is known'}"
+                f"needed; it acts on {frames or 'no known frame'}"
             )
-        sign = 1.0 if frame == found[0].frame_b else -1.0
-        return found[0].point, sign * found[0].force(constraint_force[part])
+        sign = 1.0 if frame == on_frame[0].frame_b else -1.0
+        return on_frame[0].point, sign * on_frame[0].force(constraint_force[part])
 
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
@@ -151,16 +151,16 @@ class ConstraintSet:
         """
         rows, names = [ca.SX(0, 1)], []
         for constraint, part in self.parts():
-            own: dict[str, ca.SX] = {}
+            by_frame: dict[str, ca.SX] = {}
             for application in constraint.applications(kinematics):
                 force = application.force(constraint_force[part])
                 moment = ca.mtimes(application.moment_axes, constraint_force[part])
                 for frame, sign in ((application.frame_b, 1.0), (application.frame_a, -1.0)):
                     lever = application.point - kinematics.position(frame)
                     wrench = ca.vertcat(moment + ca.cross(lever, force), force)
-                    own[frame] = own.get(frame, ca.SX(6, 1)) + sign * wrench
-            rows += own.values()
-            names += [f"{constraint.name}.{frame}" for frame in own]
+                    by_frame[frame] = by_frame.get(frame, ca.SX(6, 1)) + sign * wrench
+            rows += by_frame.values()
+            names += [f"{constraint.name}.{frame}" for frame in by_frame]
         parts = (("mx", "N m"), ("my", "N m"), ("mz", "N m"), ("fx", "N"), ("fy", "N"), ("fz", "N"))
         signals = tuple(Signal(f"{name}.{part}", unit) for name in names for part, unit in parts)
         return kinematics.value(ca.vertcat(*rows)), signals
@@ -175,8 +175,8 @@ class ConstraintSet:
     @property
     def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
         """The joints that close loops, with their properties along the coordinate."""
-        found = ((constraint, constraint.joint) for constraint in self.constraints)
-        return tuple((constraint, joint) for constraint, joint in found if joint is not None)
+        pairs = ((constraint, constraint.joint) for constraint in self.constraints)
+        return tuple((constraint, joint) for constraint, joint in pairs if joint is not None)
 
     @property
     def motors(self) -> tuple[Signal, ...]:
@@ -211,7 +211,7 @@ class ConstraintSet:
     @property
     def contacts(self) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
-        found = [
+        contacts = [
             UnilateralInput(signal.name, constraint.friction_parameter)
             for constraint in self.constraints
             for signal, pushes in zip(
@@ -219,7 +219,7 @@ class ConstraintSet:
             )
             if pushes
         ]
-        return tuple(found) if any(contact.friction for contact in found) else ()
+        return tuple(contacts) if any(contact.friction for contact in contacts) else ()
 
     def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
         """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.

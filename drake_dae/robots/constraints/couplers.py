@@ -83,11 +83,11 @@ class JointCoupler(Constraint):
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         both = (self.follower, 1.0), (self.leader, -self.parameters[0].symbol)
-        found = []
+        applications = []
         for name, share in both:
             axis = kinematics.joint_axis(name)
             if axis is None:
                 return ()
             axes = share * axis.force, share * axis.moment
-            found.append(Application(axis.point, *axes, axis.child, axis.parent))
-        return tuple(found)
+            applications.append(Application(axis.point, *axes, axis.child, axis.parent))
+        return tuple(applications)

@@ -30,13 +30,13 @@ class Friction:
             parameters: Its parameters.
             sliding: v_t, the velocity of the point along the surface, m/s, shape (3, 1).
         """
-        known = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
+        symbols = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
         pull, drag = ca.SX(3, 1), None
-        if "friction" in known:
-            speed = ca.sqrt(ca.sumsqr(sliding) + known["stiction_tolerance"] ** 2)
-            pull = -known["friction"] * sliding / speed
-        if "viscous_friction" in known:
-            drag = -known["viscous_friction"] * sliding
+        if "friction" in symbols:
+            speed = ca.sqrt(ca.sumsqr(sliding) + symbols["stiction_tolerance"] ** 2)
+            pull = -symbols["friction"] * sliding / speed
+        if "viscous_friction" in symbols:
+            drag = -symbols["viscous_friction"] * sliding
         return cls(pull, drag)
 
 
@@ -57,11 +57,11 @@ def friction_parameters(
     tolerance = Parameter(
         f"{name}.stiction_tolerance", np.array([stiction_tolerance]), "m/s", positive=True
     )
-    found = []
+    parameters = []
     if friction is not None:
         coefficient = Parameter(f"{name}.friction", np.array([friction]), nonnegative=True)
-        found += [coefficient, tolerance]
+        parameters += [coefficient, tolerance]
     if viscous_friction is not None:
         value = np.array([viscous_friction])
-        found.append(Parameter(f"{name}.viscous_friction", value, "N s/m", nonnegative=True))
-    return found
+        parameters.append(Parameter(f"{name}.viscous_friction", value, "N s/m", nonnegative=True))
+    return parameters

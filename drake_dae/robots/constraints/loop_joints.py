@@ -96,11 +96,13 @@ class LoopJoint(Constraint):
         low, high = self._limits
         if not low < high:
             raise ModelError(f"lower must be below upper, got {low:g} and {high:g}")
-        (unit, force), made = self.units, []
+        (unit, force), parameters = self.units, []
         for key, per in (("damping", f"{force} s/{unit}"), ("stiffness", f"{force}/{unit}")):
             if getattr(self, key):
-                made.append(Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per))
-        object.__setattr__(self, "parameters", tuple(made))
+                parameters.append(
+                    Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per)
+                )
+        object.__setattr__(self, "parameters", tuple(parameters))
 
     @property
     @abstractmethod

@@ -31,15 +31,15 @@ def plant_constraints(links: Links) -> tuple[Constraint, ...]:
     plant = links.plant
     if plant is None or plant.num_constraints() == 0:
         return ()
-    found = (*_couplers(plant, links), *_rods(plant))
-    others = plant.num_constraints() - len(found)
+    constraints = (*_couplers(plant, links), *_rods(plant))
+    others = plant.num_constraints() - len(constraints)
     if others:
         raise ModelError(
             f"the plant has {others} constraint(s) that cannot be read back from it; take them out "
             "of the plant or of its file, and give them as `constraints`: a ball constraint is "
             "CoincidentPoints, a weld constraint WeldedFrames"
         )
-    return found
+    return constraints
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
         raise ModelError(
             f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
         ) from None
-    found: list[Coupling] = []
+    couplings: list[Coupling] = []
     followers: set[str] = set()
     joints = {joint.position_start(): name for name, joint in joint_names(plant).items()}
     index = {variable.get_id(): i for i, variable in enumerate(q)}
@@ -82,22 +82,21 @@ def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
         followers.add(names[place])
         ratio = -factors[1 - place] / factors[place]
         offset = float(row.lower_bound()[0]) / factors[place]
-        found.append(Coupling(names[place], names[1 - place], ratio, offset))
-    return found
+        couplings.append(Coupling(names[place], names[1 - place], ratio, offset))
+    return couplings
 
 
 def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
     units = {signal.name: signal.unit for signal in links.position_signals}
-    for one in couplings_of(plant):
-        unit: Literal["rad", "m"] = "m" if units[one.follower] == "m" else "rad"
-        name = f"{one.follower}_coupler"
-        yield JointCoupler(one.follower, one.leader, one.ratio, one.offset, unit, name)
+    for coupling in couplings_of(plant):
+        unit: Literal["rad", "m"] = "m" if units[coupling.follower] == "m" else "rad"
+        yield JointCoupler(**vars(coupling), unit=unit, name=f"{coupling.follower}_coupler")
 
 
 def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:
-    every = plant.GetDefaultDistanceConstraintParams()
-    for number, key in enumerate(sorted(every, key=lambda key: key.get_value())):
-        rod = every[key]
+    rods = plant.GetDefaultDistanceConstraintParams()
+    for number, key in enumerate(sorted(rods, key=lambda key: key.get_value())):
+        rod = rods[key]
         bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
         start, end = (frame_name(plant, body.body_frame()) for body in bodies)
         if np.isfinite(rod.stiffness()):

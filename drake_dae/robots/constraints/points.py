@@ -95,8 +95,8 @@ class PointOnSurface(Constraint):
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:
-        own = self.surface.coordinate_signals
-        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
+        coordinates = self.surface.coordinate_signals
+        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in coordinates)
 
     def offset(self, frames: Frames) -> ca.SX:
         """The point relative to the surface, in its axes, m, shape (3, 1)."""

@@ -210,8 +210,8 @@ class RollingBall(Constraint):
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:
-        own = self.surface.coordinate_signals
-        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
+        coordinates = self.surface.coordinate_signals
+        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in coordinates)
 
     def residual(self, frames: Frames) -> ca.SX:
         return self.surface.distance(self._offset(frames)) - self.parameters[1].symbol

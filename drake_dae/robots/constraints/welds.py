@@ -62,8 +62,8 @@ class WeldedFrames(Constraint):
     def residual(self, frames: Frames) -> ca.SX:
         R_AW = frames.rotation(self.frame_a).T
         offset = frames.position(self.frame_b) - frames.position(self.frame_a)
-        wanted = ca.SX(ca.sparsify(ca.DM(constant_pose(self.pose)[0])))
-        E = ca.mtimes(R_AW, ca.mtimes(frames.rotation(self.frame_b), wanted.T))
+        rotation = ca.SX(ca.sparsify(ca.DM(constant_pose(self.pose)[0])))
+        E = ca.mtimes(R_AW, ca.mtimes(frames.rotation(self.frame_b), rotation.T))
         skew = ca.vertcat(E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1])
         shift = ca.mtimes(R_AW, offset) - self.parameters[0].symbol
         return ca.vertcat(shift, 2 * skew / (1 + ca.trace(E)))

@@ -1,6 +1,6 @@
-"""Whether the links of a robot are on the free side of the surfaces that it touches."""
+"""The distances of a robot's links from the surfaces that it touches."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,23 +9,23 @@ import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.robots.constraints.constraint import Touch
-from drake_dae.robots.geometry.shapes import TOUCHING, LeastDistance, LinkShapes, moments
+from drake_dae.robots.geometry.shapes import TOUCHING, LeastDistance, LinkShapes, sampled
 from drake_dae.robots.model import RobotModel
 from drake_dae.trace.functions import TracedFunction
 
-SHARE = 0.05
-"""A link counts as behind a surface where it is so deep, relative to its distance from the contact:
-tools lie along a surface, and surfaces give way."""
+ORIGIN_DEPTH = 0.05
+"""The depth at which a link's origin counts as behind a surface, relative to its distance from the
+contact: tools lie along a surface, and surfaces are compliant."""
 
-SHAPE = 0.01
-"""So deep, relative to the same distance, a corner of its shape is."""
+CORNER_DEPTH = 0.01
+"""The same depth for a corner of its shape."""
 
 NEARER = 1.1
-"""A link belongs to the contact where its distance from there is below so many times that from what
-stands still."""
+"""A link counts if its distance from the contact is below this many times its distance from the
+nearest fixed link."""
 
-MOST = 300
-"""So many states of a motion are looked at, at most."""
+MOST_ORIGIN_STATES = 300
+"""The largest number of examined states of a motion for origins of links."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class LinkBehind:
     Attributes:
         constraint: The name of the constraint that has the surface.
         link: The name of the link's frame.
-        depth: How far its origin, or a corner of its shape, is behind the surface at most, in m.
-        time: When, in s.
-        since: When it is first behind, in s.
+        depth: The largest depth of its origin, or of a corner of its shape, in m.
+        time: The time of the largest depth, in s.
+        since: The first time at which it is behind the surface, in s.
     """
 
     constraint: str
@@ -63,25 +63,21 @@ def surface_distances(
 ) -> tuple[LeastDistance, ...]:
     """The link that comes closest to each surface along a motion.
 
-    Which links count is as for `links_behind`: not what is at the contact, nor what is farther from
-    it than from what stands still.
+    Links at the contact, and links farther from it than from fixed links, do not count, as for
+    `links_behind`.
 
     Args:
         model: The robot.
         times: The times of the motion in s, shape (k,).
         states: x at these times, shape (k, n).
         parameters: The values of all parameters at these times, shape (k, P).
-        shapes: The collision geometry of the links; without any a link is its origin.
+        shapes: The collision geometry of the links; without any, their origins.
     """
-    found, chosen = list[LeastDistance](), moments(len(times))
-    for constraint in model.constraints if len(times) else ():
-        touch = constraint.touch(model.links)
-        if touch is None:
-            continue
-        surface = _Surface(model, constraint.name, touch)
+    distances, chosen = list[LeastDistance](), sampled(len(times))
+    for surface in _surfaces(model, times):
         nearest = surface.nearest(times[chosen], states[chosen], parameters[chosen], shapes)
-        found += [nearest] if nearest is not None else []
-    return tuple(found)
+        distances += [nearest] if nearest is not None else []
+    return tuple(distances)
 
 
 def links_behind(
@@ -91,52 +87,54 @@ def links_behind(
     parameters: FloatArray,
     shapes: LinkShapes | None = None,
 ) -> tuple[LinkBehind, ...]:
-    """The deepest link behind each surface, along a motion.
+    """The deepest link behind each surface along a motion.
 
-    A link is where the origin of its frame is, and with `shapes` where corners of its collision
-    geometry are; its surface is asked for the distance there. A surface may end before it reaches
-    the robot's base, as a table does that the robot stands beside. So a link counts where it is not
-    farther from the contact than from what stands still; its shape also where that is in front of
-    the surface, if it is not the first link. The shapes of what is at the contact do not count.
+    The depth of a link is that of the origin of its frame, or with `shapes` of the corners of its
+    collision geometry. A real surface may end before it reaches the robot's base, such as a table
+    beside the robot. So a link counts only if it is not much farther from the contact than from
+    fixed links; its shape also if all fixed links are in front of the surface, except for the first
+    links. The shapes of links at the contact do not count.
 
     Args:
         model: The robot.
         times: The times of the motion in s, shape (k,).
         states: x at these times, shape (k, n).
         parameters: The values of all parameters at these times, shape (k, P).
-        shapes: The collision geometry of the links, if it is to be looked at.
+        shapes: The collision geometry of the links; None for origins alone.
     """
-    if not len(times):
-        return ()
-    found: list[LinkBehind] = []
-    for constraint in model.constraints:
-        touch, chosen = constraint.touch(model.links), moments(len(times), MOST)
-        if touch is None:
-            continue
-        surface = _Surface(model, constraint.name, touch)
-        tried = [surface.deepest(times[chosen], states[chosen], parameters[chosen])]
+    deepest: list[LinkBehind] = []
+    for surface in _surfaces(model, times):
+        chosen = sampled(len(times), MOST_ORIGIN_STATES)
+        candidates = [surface.deepest(times[chosen], states[chosen], parameters[chosen])]
         if shapes:
-            chosen = moments(len(times))
-            tried.append(
+            chosen = sampled(len(times))
+            candidates.append(
                 surface.deepest_shape(shapes, times[chosen], states[chosen], parameters[chosen])
             )
-        behind = [one for one in tried if one is not None]
-        found += [max(behind, key=lambda one: one.depth)] if behind else []
-    return tuple(found)
+        behind = [link for link in candidates if link is not None]
+        deepest += [max(behind, key=lambda link: link.depth)] if behind else []
+    return tuple(deepest)
+
+
+def _surfaces(model: RobotModel, times: FloatArray) -> Iterator["_Surface"]:
+    """The surfaces that a robot touches; none for a motion without times."""
+    for constraint in model.constraints if len(times) else ():
+        touch = constraint.touch(model.links)
+        if touch is not None:
+            yield _Surface(model, constraint.name, touch)
 
 
 class _Surface:
-    """What is behind a surface, along a motion."""
+    """The depths of links behind a surface along a motion."""
 
     def __init__(self, model: RobotModel, name: str, touch: Touch) -> None:
         links, self._name, self._touch = model.links, name, touch
         points = ca.horzsplit(links.landmarks())
-        moving = [ca.depends_on(point, links.q) for point in points]
-        pairs = list(zip(links.landmark_names, points, moving, strict=True))
-        self._links = [name for name, _, yes in pairs if yes]
-        of_links = [point for _, point, yes in pairs if yes]
-        # The world's own origin is no part of a robot that moves freely.
-        still = [point for name, point, yes in pairs if not yes and name != "world"]
+        named = dict(zip(links.landmark_names, points, strict=True))
+        moving = {name: point for name, point in named.items() if ca.depends_on(point, links.q)}
+        self._links, of_links = list(moving), list(moving.values())
+        # The world's origin is not part of a robot with a floating base.
+        fixed = [p for name, p in named.items() if name not in moving and name != "world"]
         contact = links.position(touch.frame, touch.point)
         self._nq = links.q.numel()
         inputs = {"q": links.q, "parameters": model.dae.parameter_symbol}
@@ -147,24 +145,28 @@ class _Surface:
             {
                 "depths": ca.densify(ca.vertcat(*depths)),
                 "to_contact": _distances(of_links, [contact]),
-                "to_base": _distances(of_links, still),
+                "to_base": _distances(of_links, fixed),
             },
         )
-        self._inputs, self._contact, self._still = inputs, contact, still
+        self._inputs, self._contact, self._fixed = inputs, contact, fixed
 
     @cached_property
     def _corner(self) -> ca.Function:
-        """From points (3, k), q and parameters to how deep they are, and their distances."""
+        """The function (point, q, parameters) -> the depths and distances of a corner.
+
+        They are its depth, its distances from the contact and from fixed links, and the largest
+        depth of fixed links.
+        """
         point, clearance = ca.SX.sym("point", 3), self._touch.clearance
-        of_still = [-clearance(each) for each in self._still]
+        fixed_depths = [-clearance(fixed) for fixed in self._fixed]
         return ca.Function(
             "corner",
             [point, *self._inputs.values()],
             [
                 -clearance(point),
                 ca.norm_2(point - self._contact),
-                _distances([point], self._still),
-                ca.mmax(ca.vertcat(-ca.inf, *of_still)),
+                _distances([point], self._fixed),
+                ca.mmax(ca.vertcat(-ca.inf, *fixed_depths)),
             ],
         )
 
@@ -172,11 +174,10 @@ class _Surface:
         self, times: FloatArray, states: FloatArray, parameters: FloatArray
     ) -> LinkBehind | None:
         """The link whose origin is deepest; None if none is behind."""
-        found = self._origins_along(states, parameters)
-        if found is None:
+        if not self._links:
             return None
-        depths, to_contact, counts = found
-        counts &= depths > SHARE * to_contact
+        depths, to_contact, counts = self._origins_along(states, parameters)
+        counts &= depths > ORIGIN_DEPTH * to_contact
         return self._worst(times, np.where(counts, depths, 0.0), self._links)
 
     def deepest_shape(
@@ -202,9 +203,11 @@ class _Surface:
             depths, of_origin = self._depths_of_shapes(shapes, states, parameters, False), False
             names = [shapes.name(index) for index in range(shapes.count)]
         if depths is None or not np.isfinite(depths).any():
-            found, names, of_origin = self._origins_along(states, parameters), self._links, True
-            depths = None if found is None else np.where(found[2], found[0], -np.inf)
-        if depths is None or not np.isfinite(depths).any():
+            if not self._links:
+                return None
+            of_origins, _, counts = self._origins_along(states, parameters)
+            depths, names, of_origin = np.where(counts, of_origins, -np.inf), self._links, True
+        if not np.isfinite(depths).any():
             return None
         row, column = divmod(int(np.argmax(depths)), len(names))
         distance, time = -float(depths[row, column]), float(times[row])
@@ -212,50 +215,51 @@ class _Surface:
 
     def _origins_along(
         self, states: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Booleans] | None:
-        """How deep origins of links are, how far from the contact, and which count, by states."""
-        if not self._links:
-            return None
+    ) -> tuple[FloatArray, FloatArray, Booleans]:
+        """The depths of origins, their distances from the contact, and which count, by states."""
         values = [
-            [value.ravel().copy() for value in self._origins(state[: self._nq], own)]
-            for state, own in zip(states, parameters, strict=True)
+            [value.ravel().copy() for value in self._origins(state[: self._nq], numbers)]
+            for state, numbers in zip(states, parameters, strict=True)
         ]
-        depths, to_contact, to_base = (np.array(each) for each in zip(*values, strict=True))
+        depths, to_contact, to_base = (np.array(table) for table in zip(*values, strict=True))
         counts = to_contact < NEARER * to_base
-        # What is at the contact itself is on the surface.
-        counts &= to_contact > SHARE * to_contact.max(axis=1, keepdims=True)
+        # Links at the contact itself are on the surface.
+        counts &= to_contact > ORIGIN_DEPTH * to_contact.max(axis=1, keepdims=True)
         return depths, to_contact, counts
 
     def _depths_of_shapes(
         self, shapes: LinkShapes, states: FloatArray, parameters: FloatArray, behind: bool
     ) -> FloatArray | None:
-        """How deep the shapes of links are, one row for each state; -inf where none counts.
+        """The depths of the shapes of links, one row for each state; -inf for links without any.
 
         Args:
             shapes: The shapes.
-            states: x, one row for each moment.
-            parameters: The values of all parameters, one row for each moment.
-            behind: Whether only shapes count that are behind the surface by more than they touch.
+            states: x, one row for each time.
+            parameters: The values of all parameters, one row for each time.
+            behind: Whether only shapes count that are certainly behind the surface.
+
+        Returns:
+            The depths, shape (k, links); None if all links are at the contact.
         """
-        at_contact, at_base, found = shapes.moved_with(self._touch.frame), shapes.at_base(), []
+        at_contact, at_base, rows = shapes.moved_with(self._touch.frame), shapes.at_base(), []
         if shapes.links <= at_contact:
             return None
-        for state, own in zip(states, parameters, strict=True):
+        for state, numbers in zip(states, parameters, strict=True):
             shapes.place(state)
             row = np.full(shapes.count, -np.inf)
             for index, points, radius in shapes.corners():
                 if index in at_contact:
                     continue
-                values = self._corner(points.T, state[: self._nq], own)
-                depth, to_contact, to_base, base = (np.array(each).ravel() for each in values)
+                values = self._corner(points.T, state[: self._nq], numbers)
+                depth, to_contact, to_base, base = (np.array(value).ravel() for value in values)
                 counts = to_contact < NEARER * to_base
                 if behind:
                     if index not in at_base:
                         counts |= base < TOUCHING
-                    counts &= depth + radius > np.maximum(TOUCHING, SHAPE * to_contact)
+                    counts &= depth + radius > np.maximum(TOUCHING, CORNER_DEPTH * to_contact)
                 row[index] = max(row[index], np.max(np.where(counts, depth + radius, -np.inf)))
-            found.append(row)
-        return np.array(found)
+            rows.append(row)
+        return np.array(rows)
 
     def _worst(
         self, times: FloatArray, depths: FloatArray, names: Sequence[str]
@@ -269,7 +273,7 @@ class _Surface:
 
 
 def _distances(points: Sequence[ca.SX], others: Sequence[ca.SX]) -> ca.SX:
-    """How far each point is from the nearest of some others, shape (k, 1); infinite without any."""
+    """The distance of each point from the nearest of others, shape (k, 1); infinite without any."""
     rows = [
         ca.mmin(ca.vertcat(ca.inf, *[ca.norm_2(point - other) for other in others]))
         for point in points

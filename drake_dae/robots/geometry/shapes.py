@@ -1,8 +1,9 @@
-"""The collision geometry of links, where a robot's file has any: which of them overlap."""
+"""The collision geometry of links, and overlaps of links along a motion."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -23,17 +24,19 @@ from drake_dae.arrays import FloatArray
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 
-ROWS = 60
-"""So many states of a motion are looked at, at most: within a link's width, as a rule."""
+MOST_STATES = 60
+"""The largest number of states of a motion that are examined: neighbours are usually closer than
+the width of a link."""
 
 TOUCHING = 1e-3
-"""Shapes that overlap by less than this, in m, touch."""
+"""Shapes that overlap by less than this, in m, only touch."""
 
 COARSE = 0.02
-"""So much, in m, shapes may overlap with one link between them: those of vendors do in use."""
+"""The allowed overlap, in m, of links with at most one link between them: vendors' shapes overlap
+there in normal use."""
 
 MOST_CORNERS = 200
-"""So many corners of a mesh are looked at, at most."""
+"""The largest number of examined corners of a mesh."""
 
 _RING = 2.0 * np.pi * np.arange(8) / 8
 
@@ -43,10 +46,10 @@ class Collision:
     """Two links whose shapes overlap.
 
     Attributes:
-        first, second: Their names; "world" for what stands still.
-        depth: By how much, at most, in m.
-        time: When, in s.
-        since: When they first do, in s.
+        first, second: Their names; "world" for anything fixed.
+        depth: The largest overlap, in m.
+        time: The time of the largest overlap, in s.
+        since: The time of the first overlap, in s.
     """
 
     first: str
@@ -62,14 +65,14 @@ class Collision:
 
 @dataclass(frozen=True)
 class LeastDistance:
-    """How near something of a robot comes to something else along a motion.
+    """The least distance of two links, or of a link and a surface, along a motion.
 
     Attributes:
         first, second: The names of two links, or of a link and of the constraint of a surface.
         is_surface: Whether `second` is that of a surface.
-        of_origin: Whether the link is its origin, since links have no shapes.
-        distance: The distance in m; below 0 if they overlap.
-        time: When, in s.
+        of_origin: Whether the distance is that of the link's origin, since links have no shapes.
+        distance: The distance in m; negative if they overlap.
+        time: The time of that distance, in s.
     """
 
     first: str
@@ -85,17 +88,17 @@ class LeastDistance:
         return f"{who} comes closest to {what} at {self.time:.4g} s, {self.distance:.3g} m"
 
 
-def moments(count: int, most: int = ROWS) -> np.ndarray:
-    """Which of so many states are looked at, evenly."""
+def sampled(count: int, most: int = MOST_STATES) -> np.ndarray:
+    """The evenly spaced indices of at most `most` among `count` items."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 class LinkShapes:
-    """The collision geometry of a robot's links, at one configuration after the other.
+    """The collision geometry of a robot's links in a current configuration; see `place`.
 
     Args:
         model: The robot.
-        scene_graph: The geometry of the plant that its links come from, or None.
+        scene_graph: The geometry of the plant of its links, or None.
 
     Attributes:
         model: The robot.
@@ -107,11 +110,10 @@ class LinkShapes:
         if scene_graph is None or plant is None or plant.get_source_id() is None:
             return
         self._plant, self._scene_graph = plant, scene_graph
-        self._of_plant = plant.CreateDefaultContext()
-        self._of_scene = scene_graph.CreateDefaultContext()
+        self._plant_context = plant.CreateDefaultContext()
+        self._scene_context = scene_graph.CreateDefaultContext()
         self._bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
-        still = plant.GetBodiesWeldedTo(plant.world_body())
-        self._still = {int(body.index()) for body in still}
+        self._fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
         self._body = {
             geometry: index
             for index, body in enumerate(self._bodies)
@@ -122,109 +124,114 @@ class LinkShapes:
         return bool(self._body)
 
     def place(self, state: FloatArray) -> None:
-        """Moves the links to the configuration that a state begins with."""
+        """Moves the links to the configuration of a state."""
         poses = FramePoseVector()
-        self._plant.SetPositions(self._of_plant, state[: self._plant.num_positions()])
+        self._plant.SetPositions(self._plant_context, state[: self._plant.num_positions()])
         for body in self._bodies[1:]:
             frame = self._plant.GetBodyFrameIdIfExists(body.index())
             if frame is not None:
-                poses.set_value(frame, self._plant.EvalBodyPoseInWorld(self._of_plant, body))
+                poses.set_value(frame, self._plant.EvalBodyPoseInWorld(self._plant_context, body))
         port = self._scene_graph.get_source_pose_port(self._plant.get_source_id())
-        port.FixValue(self._of_scene, poses)
+        port.FixValue(self._scene_context, poses)
 
     @property
     def count(self) -> int:
-        """How many links there are, the world among them."""
+        """The number of links, including the world."""
         return len(self._bodies)
 
     @property
     def links(self) -> set[int]:
         """The links that have shapes and move."""
-        return set(self._body.values()) - self._still
+        return set(self._body.values()) - self._fixed
 
     def at_base(self) -> set[int]:
-        """The links whose joints are on what stands still."""
+        """The links whose joints are fixed to the world."""
         return {
             int(joint.child_body().index())
             for joint in map(self._plant.get_joint, self._plant.GetJointIndices())
-            if int(joint.parent_body().index()) in self._still and joint.num_positions() < 3
+            if int(joint.parent_body().index()) in self._fixed and joint.num_positions() < 3
         }
 
     def overlaps(self) -> dict[tuple[int, int], float]:
-        """Pairs of links that overlap now -> by how much, in m.
+        """Pair of overlapping links -> their overlap in the current configuration, in m.
 
-        Drake leaves out neighbours at a joint, and what the robot's file says.
+        Drake excludes neighbours at a joint, and the pairs that the robot's file excludes.
         """
-        query = self._scene_graph.get_query_output_port().Eval(self._of_scene)
-        found: dict[tuple[int, int], float] = {}
-        for each in query.ComputePointPairPenetration():
-            first, second = (self._body.get(one, -1) for one in (each.id_A, each.id_B))
-            pair = min(first, second), max(first, second)
+        overlaps: dict[tuple[int, int], float] = {}
+        for contact in self._query().ComputePointPairPenetration():
+            pair = self._pair(contact)
             if pair[0] >= 0:
-                found[pair] = max(found.get(pair, 0.0), each.depth)
-        return found
+                overlaps[pair] = max(overlaps.get(pair, 0.0), contact.depth)
+        return overlaps
 
     def distances(self) -> dict[tuple[int, int], float]:
-        """Pairs of links -> their distance now, in m, below 0 where they overlap.
+        """Pair of links -> their distance in the current configuration, in m; negative overlaps.
 
         Raises:
             RuntimeError: Drake has no distance between two of the shapes.
         """
-        query = self._scene_graph.get_query_output_port().Eval(self._of_scene)
-        found: dict[tuple[int, int], float] = {}
-        for each in query.ComputeSignedDistancePairwiseClosestPoints():
-            first, second = (self._body.get(one, -1) for one in (each.id_A, each.id_B))
-            pair = min(first, second), max(first, second)
+        distances: dict[tuple[int, int], float] = {}
+        for nearest in self._query().ComputeSignedDistancePairwiseClosestPoints():
+            pair = self._pair(nearest)
             if pair[0] >= 0 and pair[0] != pair[1]:
-                found[pair] = min(found.get(pair, np.inf), each.distance)
-        return found
+                distances[pair] = min(distances.get(pair, np.inf), nearest.distance)
+        return distances
+
+    def _query(self) -> Any:
+        return self._scene_graph.get_query_output_port().Eval(self._scene_context)
+
+    def _pair(self, result: Any) -> tuple[int, int]:
+        """The links of a result of Drake, the lower index first; -1 for other geometry."""
+        first, second = (self._body.get(geometry, -1) for geometry in (result.id_A, result.id_B))
+        return min(first, second), max(first, second)
 
     def corners(self) -> Iterator[tuple[int, FloatArray, float]]:
-        """Of each shape that moves its link, points, and how far it goes beyond these, in m.
+        """For each shape of a moving link: the link, points of the shape, and a radius in m.
 
-        The points are where they are now in the world, shape (k, 3).
+        The shape lies within this radius of the convex hull of the points, which are in the world,
+        shape (k, 3).
         """
         inspector = self._scene_graph.model_inspector()
         for geometry, index in self._body.items():
             points, radius = _corners(inspector.GetShape(geometry))
-            body = self._plant.EvalBodyPoseInWorld(self._of_plant, self._bodies[index])
+            body = self._plant.EvalBodyPoseInWorld(self._plant_context, self._bodies[index])
             pose = body @ inspector.GetPoseInFrame(geometry)
-            if len(points) and index not in self._still:
+            if len(points) and index not in self._fixed:
                 yield index, pose.multiply(points.T).T, radius
 
     def held(self) -> set[tuple[int, int]]:
-        """Pairs of links that constraints bring together, with all that moves with them."""
-        found: set[tuple[int, int]] = set()
+        """The pairs of links that constraints bring together, and all links that move with them."""
+        held: set[tuple[int, int]] = set()
         for constraint in self.model.constraints:
-            for each in constraint.applications(self.model.links.kinematics()):
-                pairs = product(self.moved_with(each.frame_a), self.moved_with(each.frame_b))
-                found |= {(min(pair), max(pair)) for pair in pairs}
-        return found
+            for application in constraint.applications(self.model.links.kinematics()):
+                frames = application.frame_a, application.frame_b
+                held |= {(min(pair), max(pair)) for pair in product(*map(self.moved_with, frames))}
+        return held
 
     def name(self, index: int) -> str:
         """The name of a link."""
         return str(self._bodies[index].name())
 
     def moved_with(self, frame: str) -> set[int]:
-        """A frame's link, and those that the joint moves that it hangs on."""
+        """A frame's link, and all links that its joint moves."""
         body = int(frame_named(self._plant, frame).body().index())
         joints = self.joints_below(body)
         moved = self._plant.GetBodiesKinematicallyAffectedBy(joints[:1]) if joints else []
         return {body, *map(int, moved)}
 
     def joints_below(self, index: int) -> list[JointIndex]:
-        """The joints that move between a link and the world, its own one first."""
-        joints = [self._plant.get_joint(each) for each in self._plant.GetJointIndices()]
+        """The moving joints between a link and the world, that of the link first."""
+        joints = map(self._plant.get_joint, self._plant.GetJointIndices())
         inboard = {int(joint.child_body().index()): joint for joint in joints}
-        found = []
+        below = []
         while index in inboard:
             if inboard[index].num_positions():
-                found.append(inboard[index].index())
+                below.append(inboard[index].index())
             index = int(inboard[index].parent_body().index())
-        return found
+        return below
 
     def may_overlap(self, pair: tuple[int, int]) -> float:
-        """By how much two links may overlap as their shapes are made, in m."""
+        """The overlap of two links, in m, that may be due to coarse shapes."""
         first, second = map(self.joints_below, pair)
         return COARSE if len({*first} ^ {*second}) < 3 else TOUCHING
 
@@ -232,8 +239,9 @@ class LinkShapes:
 def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tuple[Collision, ...]:
     """Links that collide with each other along a motion, the deepest first.
 
-    Shapes that overlap all the time, and where the robot is by default, are how the file has them.
-    What a constraint brings together, as a hand and what it holds, is meant to touch.
+    Shapes that overlap along the whole motion and in the default configuration do not count: they
+    overlap in the robot's file. Links that a constraint brings together, such as a hand and the
+    object that it holds, do not count either.
 
     Args:
         shapes: The shapes of the links.
@@ -242,17 +250,17 @@ def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tup
     """
     if not shapes:
         return ()
-    chosen, found = moments(len(times)), dict[tuple[int, int], FloatArray]()
+    chosen, overlaps = sampled(len(times)), dict[tuple[int, int], FloatArray]()
     for row, index in enumerate(chosen):
         shapes.place(states[index])
         for pair, depth in shapes.overlaps().items():
-            found.setdefault(pair, np.zeros(len(chosen)))[row] = depth
-    if not found:
+            overlaps.setdefault(pair, np.zeros(len(chosen)))[row] = depth
+    if not overlaps:
         return ()
     shapes.place(shapes.model.links.default_positions)
     usual, held = shapes.overlaps(), shapes.held()
     collided = []
-    for pair, depths in found.items():
+    for pair, depths in overlaps.items():
         deep = depths > shapes.may_overlap(pair)
         if not deep.any() or (pair in usual and deep.all()) or pair in held:
             continue
@@ -260,47 +268,44 @@ def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tup
         first, second = map(shapes.name, pair)
         deepest, since = map(float, times[at])
         collided.append(Collision(first, second, float(depths.max()), deepest, since))
-    return tuple(sorted(collided, key=lambda one: -one.depth))
+    return tuple(sorted(collided, key=lambda collision: -collision.depth))
 
 
 def nearest_links(
     shapes: LinkShapes, times: FloatArray, states: FloatArray
 ) -> LeastDistance | None:
-    """The two links that come closest to each other along a motion.
+    """The two links that come closest to each other along a motion; None if there are none.
 
     Pairs with fewer than three joints between them, and those that a constraint brings together,
-    are close by design.
+    are close by design and do not count. None also if Drake has no distance between the shapes.
 
     Args:
         shapes: The shapes of the links.
         times: The times of the motion in s, shape (k,).
         states: x at these times, shape (k, n).
-
-    Returns:
-        None if no pair is left, or Drake has no distance between the shapes.
     """
-    found: LeastDistance | None = None
+    nearest: LeastDistance | None = None
     if not shapes:
         return None
     skipped = shapes.held()
-    for index in moments(len(times)):
+    for index in sampled(len(times)):
         shapes.place(states[index])
         try:
-            now = shapes.distances()
+            distances = shapes.distances()
         except RuntimeError:
             return None
-        for pair, distance in now.items():
+        for pair, distance in distances.items():
             if pair in skipped or shapes.may_overlap(pair) == COARSE:
                 continue
-            if found is None or distance < found.distance:
+            if nearest is None or distance < nearest.distance:
                 first, second = map(shapes.name, pair)
                 time = float(times[index])
-                found = LeastDistance(first, second, False, False, distance, time)
-    return found
+                nearest = LeastDistance(first, second, False, False, distance, time)
+    return nearest
 
 
 def _corners(shape: object) -> tuple[FloatArray, float]:
-    """Points of a shape, and how far it goes beyond these; none of a shape without an end."""
+    """Points of a shape, and its radius around these; no points for unbounded shapes."""
     corners = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
     match shape:
         case Sphere():
@@ -320,6 +325,6 @@ def _corners(shape: object) -> tuple[FloatArray, float]:
             return directions * [shape.a(), shape.b(), shape.c()], 0.0
         case Mesh() | Convex():
             hull = shape.GetConvexHull()
-            places = np.array([hull.vertex(index) for index in range(hull.num_vertices())])
-            return places[moments(len(places), MOST_CORNERS)], 0.0
+            vertices = np.array([hull.vertex(index) for index in range(hull.num_vertices())])
+            return vertices[sampled(len(vertices), MOST_CORNERS)], 0.0
     return np.zeros((0, 3)), 0.0

@@ -1,4 +1,4 @@
-"""How fast the points of a robot go that are in contact."""
+"""The speeds of a robot's contact points along a motion."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ class ContactSpeed:
 
     Attributes:
         constraint: The name of its constraint.
-        frame: The frame that the point is fixed in.
+        frame: The frame of the point.
         speed: |p_W'|, in the world, in m/s.
-        time: When, in s.
+        time: The time of that speed, in s.
     """
 
     constraint: str
@@ -42,7 +42,7 @@ def contact_speeds(
         states: x at these times, shape (k, n).
         parameters: The values of all parameters at these times, shape (k, P).
     """
-    links, found = model.links, list[ContactSpeed]()
+    links, largest = model.links, list[ContactSpeed]()
     nq, nv = links.q.numel(), links.v.numel()
     kinematics = links.kinematics()
     inputs = {"q": links.q, "v": links.v, "parameters": model.dae.parameter_symbol}
@@ -54,11 +54,11 @@ def contact_speeds(
         function = TracedFunction("contact speed", inputs, {"speed": ca.norm_2(velocity)})
         speeds = np.array(
             [
-                function(x[:nq], x[nq : nq + nv], own)[0].item()
-                for x, own in zip(states, parameters, strict=True)
+                function(x[:nq], x[nq : nq + nv], numbers)[0].item()
+                for x, numbers in zip(states, parameters, strict=True)
             ]
         )
         fastest = int(np.argmax(speeds))
         name, speed = constraint.name, float(speeds[fastest])
-        found.append(ContactSpeed(name, touch.frame, speed, float(times[fastest])))
-    return tuple(found)
+        largest.append(ContactSpeed(name, touch.frame, speed, float(times[fastest])))
+    return tuple(largest)

@@ -30,7 +30,7 @@ def compare_with_plant(
     Args:
         plant: A finalized plant.
         q, v: Symbols of positions and velocities.
-        parameters: What the terms depend on, with the plant's own values.
+        parameters: The parameters of the terms, with the plant's own values.
         terms: Expressions under the names in `_plant_terms`.
 
     Raises:

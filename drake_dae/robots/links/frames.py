@@ -61,10 +61,10 @@ class PlantFrames:
         Raises:
             ModelError: No frame, or more than one, has that name; or it belongs to another plant.
         """
-        found = frame_named(self._plant, frame) if isinstance(frame, str) else frame
-        if found.GetParentPlant() is not self._plant:
-            raise ModelError(f"frame '{found.name()}' belongs to another plant")
-        return found
+        resolved = frame_named(self._plant, frame) if isinstance(frame, str) else frame
+        if resolved.GetParentPlant() is not self._plant:
+            raise ModelError(f"frame '{resolved.name()}' belongs to another plant")
+        return resolved
 
     def pose(self, frame: Frame) -> tuple[ca.SX, ca.SX]:
         """R_WF, shape (3, 3), and p_WF in m, shape (3, 1), as expressions of q."""

@@ -165,10 +165,10 @@ def read_links(
             if isinstance(joint, WeldJoint):
                 X_LM = X_LF @ (joint.X_FM().inverse() if reverse else joint.X_FM())
             else:
-                found = elementary_joints(plant, joint, reverse)
-                X_FA = RigidTransform(RotationMatrix(found.rotation), np.zeros(3))
+                parts = elementary_joints(plant, joint, reverse)
+                X_FA = RigidTransform(RotationMatrix(parts.rotation), np.zeros(3))
                 start = X_LF @ X_FA
-                for elementary in found.sequence:
+                for elementary in parts.sequence:
                     links.append(TreeLink.moved(link, *constant_pose(start), elementary, q))
                     link, start = len(links) - 1, RigidTransform()
                 X_LM = X_FA.inverse()

@@ -85,8 +85,8 @@ class Reaction:
     def __add__(self, other: Self) -> "Reaction":
         wrenches = dict(self.wrenches)
         for frame, (force, moment) in other.wrenches.items():
-            own = wrenches.get(frame, (0, 0))
-            wrenches[frame] = (own[0] + force, own[1] + moment)
+            total = wrenches.get(frame, (0, 0))
+            wrenches[frame] = (total[0] + force, total[1] + moment)
         return Reaction(self.generalized + other.generalized, wrenches)
 
     def map(self, function: Callable[[ca.SX], ca.SX]) -> "Reaction":
@@ -165,11 +165,11 @@ class Kinematics(ABC):
             moment: The moment in the world, N m, shape (3, 1); none if None.
         """
         pushing = ca.SX.sym("force", 3)
-        acting, given = pushing, force
+        acting, values = pushing, force
         power = ca.dot(pushing, self.velocity(frame, point))
         if moment is not None:
             turning = ca.SX.sym("moment", 3)
-            acting, given = ca.vertcat(pushing, turning), ca.vertcat(force, moment)
+            acting, values = ca.vertcat(pushing, turning), ca.vertcat(force, moment)
             power += ca.dot(turning, self.angular_velocity(frame))
-        given = ca.densify(given)
-        return self.reaction(power).map(lambda part: ca.substitute(part, acting, given))
+        values = ca.densify(values)
+        return self.reaction(power).map(lambda part: ca.substitute(part, acting, values))

@@ -1,4 +1,4 @@
-"""What the links of a robot provide: M(q), H(q, v), and their frames."""
+"""The contract of the links of a robot: M(q), H(q, v), and their frames."""
 
 from typing import Any, Protocol
 

@@ -157,8 +157,8 @@ class MultibodyExpressions:
         for frame, wrench in reaction.wrenches.items():
             link, (_, origin) = self._frames.on_link(frame)[0], self._frames.pose(frame)
             twist = frame_jacobian(self._links, link, origin, self.v.numel())
-            both = ca.sparsify(kinematics.value(ca.vertcat(*wrench)))
-            result += ca.mtimes(twist.T, both)
+            stacked = ca.sparsify(kinematics.value(ca.vertcat(*wrench)))
+            result += ca.mtimes(twist.T, stacked)
         return result
 
     def inverse_dynamics(self, kinematics: TreeKinematics, reaction: Reaction) -> ca.SX:
@@ -173,8 +173,8 @@ class MultibodyExpressions:
             R_LW = self._frames.link_poses[index][0].T
             force = ca.mtimes(R_LW, kinematics.value(pull))
             moment = ca.mtimes(R_LW, kinematics.value(turn)) + ca.cross(ca.SX(lever), force)
-            own = wrenches.get(index, (ca.SX(3, 1), ca.SX(3, 1)))
-            wrenches[index] = own[0] + moment, own[1] + force
+            total = wrenches.get(index, (ca.SX(3, 1), ca.SX(3, 1)))
+            wrenches[index] = total[0] + moment, total[1] + force
         force = inverse_dynamics(
             self._links, kinematics.moving, self._gravity, self.v.numel(), wrenches
         )

@@ -99,9 +99,9 @@ class LinkExpressions:
             ("gear_ratios", (nu,)),
             ("default_positions", (nq,)),
         ):
-            found = getattr(self, key).shape
-            if found != shape:
-                raise ModelError(f"{key} has shape {found}, expected {shape}")
+            given = getattr(self, key).shape
+            if given != shape:
+                raise ModelError(f"{key} has shape {given}, expected {shape}")
 
     def rotation(self, frame: str) -> ca.SX:
         """R_WF(q), shape (3, 3): the orientation of a frame in the world.

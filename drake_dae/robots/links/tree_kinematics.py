@@ -79,40 +79,42 @@ class TreeKinematics(Kinematics):
         return position_of(self._pose(frame), point)
 
     def angular_velocity(self, frame: str | Frame) -> ca.SX:
-        own = self._moving(self._frames.find(frame))
-        return ca.SX.zeros(3) if own is None else own.spin
+        symbols = self._moving(self._frames.find(frame))
+        return ca.SX.zeros(3) if symbols is None else symbols.spin
 
     def velocity(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
-        own, offset = self._moving(self._frames.find(frame)), check_point(point)
-        return ca.SX.zeros(3) if own is None else own.velocity + own.rotation_rate @ ca.SX(offset)
+        symbols, offset = self._moving(self._frames.find(frame)), check_point(point)
+        if symbols is None:
+            return ca.SX.zeros(3)
+        return symbols.velocity + symbols.rotation_rate @ ca.SX(offset)
 
     def derivative(self, expression: ca.SX) -> ca.SX:
         moving = [(self.q, self._position_rate), (self.v, self.acceleration)]
-        for frame, own in self._symbols.values():
+        for frame, symbols in self._symbols.values():
             index, turn, lever = self._frames.on_link(frame)
             R_WL, link = self._frames.link_poses[index][0], self.moving[index]
             falling = link.acceleration + link.gradient @ ca.SX(lever)
             moving += [
-                (own.rotation, own.rotation_rate),
-                (own.rotation_rate, R_WL @ (link.gradient @ ca.SX(turn))),
-                (own.origin, own.velocity),
-                (own.velocity, R_WL @ falling + self._gravity),
-                (own.spin, R_WL @ link.spin_rate),
+                (symbols.rotation, symbols.rotation_rate),
+                (symbols.rotation_rate, R_WL @ (link.gradient @ ca.SX(turn))),
+                (symbols.origin, symbols.velocity),
+                (symbols.velocity, R_WL @ falling + self._gravity),
+                (symbols.spin, R_WL @ link.spin_rate),
             ]
         places, rates = (ca.vertcat(*map(ca.vec, column)) for column in zip(*moving, strict=True))
         return ca.jtimes(expression, places, rates)
 
     def reaction(self, power: ca.SX) -> Reaction:
         wrenches = {}
-        for frame, own in self._symbols.values():
-            velocities = ca.veccat(own.velocity, own.rotation_rate, own.spin)
+        for frame, symbols in self._symbols.values():
+            velocities = ca.veccat(symbols.velocity, symbols.rotation_rate, symbols.spin)
             if not ca.depends_on(power, velocities):
                 continue
-            slope = ca.gradient(power, own.rotation_rate)
-            moment = ca.gradient(power, own.spin)
+            slope = ca.gradient(power, symbols.rotation_rate)
+            moment = ca.gradient(power, symbols.spin)
             for k in range(3):
-                moment += ca.cross(own.rotation[:, k], slope[:, k])
-            wrenches[frame] = (ca.gradient(power, own.velocity), moment)
+                moment += ca.cross(symbols.rotation[:, k], slope[:, k])
+            wrenches[frame] = (ca.gradient(power, symbols.velocity), moment)
         return Reaction(ca.sparsify(ca.gradient(power, self.v)), wrenches)
 
     def joint_axis(self, position: str) -> JointAxis | None:
@@ -130,23 +132,25 @@ class TreeKinematics(Kinematics):
         symbols, values = ([ca.vec(pair[i]) for pair in pairs] for i in (0, 1))
         return ca.substitute(expression, ca.vertcat(*symbols), ca.vertcat(*values))
 
-    def _values(self, frame: Frame, own: _FrameSymbols) -> list[tuple[ca.SX, ca.SX]]:
+    def _values(self, frame: Frame, symbols: _FrameSymbols) -> list[tuple[ca.SX, ca.SX]]:
         """Each symbol of a frame, and its expression."""
         index, turn, lever = self._frames.on_link(frame)
         R_WL, link = self._frames.link_poses[index][0], self.moving[index]
         R_WF, p_WF = self._frames.pose(frame)
         return [
-            (own.rotation, R_WF),
-            (own.rotation_rate, R_WL @ (ca.skew(link.spin) @ ca.SX(turn))),
-            (own.origin, p_WF),
-            (own.velocity, R_WL @ (link.velocity + ca.cross(link.spin, ca.SX(lever)))),
-            (own.spin, R_WL @ link.spin),
+            (symbols.rotation, R_WF),
+            (symbols.rotation_rate, R_WL @ (ca.skew(link.spin) @ ca.SX(turn))),
+            (symbols.origin, p_WF),
+            (symbols.velocity, R_WL @ (link.velocity + ca.cross(link.spin, ca.SX(lever)))),
+            (symbols.spin, R_WL @ link.spin),
         ]
 
     def _pose(self, frame: str | Frame) -> tuple[ca.SX, ca.SX]:
-        found = self._frames.find(frame)
-        own = self._moving(found)
-        return self._frames.pose(found) if own is None else (own.rotation, own.origin)
+        resolved = self._frames.find(frame)
+        symbols = self._moving(resolved)
+        return (
+            self._frames.pose(resolved) if symbols is None else (symbols.rotation, symbols.origin)
+        )
 
     def _moving(self, frame: Frame) -> _FrameSymbols | None:
         """The symbols of a frame; None if it is fixed to the world."""

@@ -10,12 +10,7 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.surface import (
-    Surface,
-    Vector,
-    normalized,
-    triple,
-)
+from drake_dae.robots.surfaces.surface import Surface, Vector, normalized, triple
 from drake_dae.trace.formula import check_names, parse_formula
 from drake_dae.trace.given import numpy_explained, result_of
 

@@ -97,7 +97,7 @@ class HeightMap(_Map):
         point: The middle of the map, m, shape (3,).
         normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, m.
-        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+        resolution: The distance of the bell curves, m; finer details are smoothed. If None, a
             sixteenth of the longer side, but no less than the heights are apart.
 
     Raises:
@@ -119,11 +119,11 @@ class HeightMap(_Map):
         if self.heights is not None:
             rows = tuple(map(tuple, height_table("heights", self.heights).tolist()))
             object.__setattr__(self, "heights", rows)
-            found = _table_relief(rows, self.size, self.scale, self.resolution)
+            relief = _table_relief(rows, self.size, self.scale, self.resolution)
         else:
             source = _stamp(Path(str(self.file)))
-            found = _file_relief(source, self.size, self.scale, self.resolution)
-        object.__setattr__(self, "relief", found)
+            relief = _file_relief(source, self.size, self.scale, self.resolution)
+        object.__setattr__(self, "relief", relief)
 
     @property
     def remark(self) -> str:
@@ -147,7 +147,7 @@ class MeshSurface(_Map):
             shape (2,); that of the mesh if None.
         size: The lengths of the rectangle, m, shape (2,); those of the mesh if None.
         scale: The length of a unit of the mesh, m: 0.001 for millimetres.
-        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+        resolution: The distance of the bell curves, m; finer details are smoothed. If None, a
             sixteenth of the longer side.
 
     Raises:
@@ -166,8 +166,8 @@ class MeshSurface(_Map):
         _check(self)
         source = _stamp(Path(self.file))
         rectangle = self.middle, self.size
-        found = _mesh_relief(source, self.normal, rectangle, self.scale, self.resolution)
-        object.__setattr__(self, "relief", found)
+        relief = _mesh_relief(source, self.normal, rectangle, self.scale, self.resolution)
+        object.__setattr__(self, "relief", relief)
 
     @property
     def remark(self) -> str:
@@ -197,10 +197,10 @@ _Source = tuple[str, int, int]
 
 def _stamp(file: Path) -> _Source:
     try:
-        found = file.stat()
+        status = file.stat()
     except (OSError, ValueError):  # A null byte.
         raise ModelError(f"no file '{file}'") from None
-    return str(file), found.st_mtime_ns, found.st_size
+    return str(file), status.st_mtime_ns, status.st_size
 
 
 @lru_cache(maxsize=16)
@@ -233,10 +233,10 @@ def _mesh_relief(
     vertices, triangles = read_mesh(Path(source[0]))
     axes = np.column_stack([*tangents(normal), np.array(normal)])
     _check_lengths("vertices", scale * vertices)
-    seen = scale * vertices @ axes
+    vertices_along = scale * vertices @ axes
     if np.linalg.det(axes) < 0.0:
         triangles = triangles[:, ::-1]  # A reflection would show the back sides.
-    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    low, high = vertices_along[:, :2].min(axis=0), vertices_along[:, :2].max(axis=0)
     middle = (low + high) / 2 if rectangle[0] is None else np.array(rectangle[0])
     size = high - low if rectangle[1] is None else np.array(rectangle[1])
     if not np.all(size > 0.0):
@@ -246,7 +246,7 @@ def _mesh_relief(
         _along(center, length, 2 * max(ceil(length / resolution), 4) + 1)
         for center, length in zip(middle, size, strict=True)
     )
-    return fit_relief(x, y, heights_of_mesh(seen, triangles, x, y), resolution)
+    return fit_relief(x, y, heights_of_mesh(vertices_along, triangles, x, y), resolution)
 
 
 def _check_lengths(what: str, lengths: FloatArray) -> None:

@@ -92,8 +92,8 @@ def _read_other(file: Path) -> tuple[FloatArray, Triangles]:
             "pip install 'drake_dae[meshes]', or give the mesh as .obj"
         ) from None
     try:
-        found: Any = trimesh.load(file, force="mesh")
-        return np.array(found.vertices), np.array(found.faces)
+        mesh: Any = trimesh.load(file, force="mesh")
+        return np.array(mesh.vertices), np.array(mesh.faces)
     except Exception as error:  # trimesh has no exceptions of its own.
         raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
 

@@ -132,9 +132,7 @@ class Surface(ABC):
         p = ca.SX.sym("p", 3)
         distance = self.distance(p)
         function = TracedFunction(
-            "distance",
-            {"offset": p},
-            {"distance": distance, "gradient": ca.gradient(distance, p)},
+            "distance", {"offset": p}, {"distance": distance, "gradient": ca.gradient(distance, p)}
         )
 
         def linearize(point: FloatArray) -> NewtonModel | None:
@@ -142,9 +140,9 @@ class Surface(ABC):
             return shortest_steps(gradient[None], lambda x: function(x)[0])
 
         def foot(point: FloatArray) -> FloatArray:
-            found, solved = newton(point, linearize)
-            near = solved and np.linalg.norm(found - point) <= size
-            return found if near else np.full(3, np.nan)
+            nearest, solved = newton(point, linearize)
+            near = solved and np.linalg.norm(nearest - point) <= size
+            return nearest if near else np.full(3, np.nan)
 
         middle = foot(center)
         if not np.all(np.isfinite(middle)):
@@ -167,12 +165,12 @@ def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Paramet
         name: The name of the constraint that has the parameters.
         surface: The surface.
     """
-    made = tuple(
+    parameters = tuple(
         Parameter(f"{name}.{key}", np.array([value])) for key, value in surface.shape.items()
     )
-    if not made:
+    if not parameters:
         return surface, ()
-    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in made))), made
+    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in parameters))), parameters
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -5,86 +5,25 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, InputPort, LeafSystem, System
+from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import GainError
-from drake_dae.running.export.steps.words import distinct, parameters_of_block
+from drake_dae.running.bench.inputs import PUSH, Inputs
 from drake_dae.systems.control.command_filter import SPEED
 from drake_dae.systems.control.commanded import CommandedReferences
-from drake_dae.systems.control.contract import SIGNAL
+from drake_dae.systems.control.contract import SIGNAL, Controller
+from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.task.phases.by_hand import BY_HAND
 
-PUSH = "push."
-"""Begins the names of the wrenches that push links."""
-
+SLOW = 0.05
+"""How fast a surface moves that no law knows, in m/s."""
 
 _ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
 """The order of sliders; others follow."""
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """The numeric parameters of the blocks of a loop, below each other, and signals it waits for.
-
-    Attributes:
-        blocks: The blocks, each with numeric parameter 0, and where its entries begin.
-        ports: The signals for which a task waits: input port of the diagram -> its entry.
-        names, units: Those of each entry.
-    """
-
-    blocks: Mapping[System, int]
-    ports: Mapping[InputPort, int]
-    names: Sequence[str]
-    units: Sequence[str]
-
-    @classmethod
-    def of(cls, loop: ClosedLoop) -> "Inputs":
-        """Those of generators, plant and controller."""
-        context = loop.diagram.CreateDefaultContext()
-        sources = loop.generator, loop.exogenous, loop.plant_exogenous
-        made = (*sources, loop.plant, loop.controller, loop.plant.pushes)
-        blocks, signals = dict[System, int](), list[Signal]()
-        for block in made:
-            # Drake's own contact is a Diagram, whose numbers are those of many blocks.
-            if not isinstance(block, LeafSystem):
-                continue
-            own = block.GetMyContextFromRoot(context)
-            if own.num_numeric_parameter_groups():
-                blocks[block] = len(signals)
-                signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
-        diagram, ports = loop.diagram, dict[InputPort, int]()
-        for i in range(diagram.num_input_ports()):
-            port = diagram.get_input_port(i)
-            if port.get_name().startswith(SIGNAL):
-                ports[port] = len(signals)
-                signals.append(Signal(port.get_name()))
-        found = distinct(signals)
-        return cls(blocks, ports, [s.name for s in found], [s.unit for s in found])
-
-    def values(self, context: Context) -> FloatArray:
-        """Their values in a context of the loop's diagram."""
-        own = (block.GetMyContextFromRoot(context) for block in self.blocks)
-        parts = [each.get_numeric_parameter(0).CopyToVector() for each in own]
-        given = [port.Eval(context) if port.HasValue(context) else [0.0] for port in self.ports]
-        return np.concatenate([*parts, *given])
-
-    def set(self, context: Context, changes: Mapping[int, float]) -> None:
-        """Changes entries in a context."""
-        for block, first in self.blocks.items():
-            own = block.GetMyMutableContextFromRoot(context)
-            size = own.get_numeric_parameter(0).size()
-            mine = {i - first: x for i, x in changes.items() if first <= i < first + size}
-            if mine:
-                values = own.get_numeric_parameter(0).CopyToVector()
-                values[list(mine)] = list(mine.values())
-                own.get_mutable_numeric_parameter(0).SetFromVector(values)
-        for port, place in self.ports.items():
-            if place in changes:
-                port.FixValue(context, [changes[place]])
 
 
 @dataclass(frozen=True)
@@ -92,12 +31,13 @@ class Control:
     """A slider, or something that is dragged, and the inputs that it sets.
 
     Attributes:
-        kind: "speed", "reference", "surface", "signal", "plant" or "pole".
+        kind: "speed", "reference", "surface", "signal", "plant", "pole", "parameter" or "input".
         label, unit: What it is called.
         low, high, value: The ends of the slider, and where it begins.
         inputs: The entries of `Inputs` that it sets.
         known: Those of the law's model with the same meaning, which it sets if the law is to know.
         powers: For poles: each input is `factors[i] * |value| ** powers[i]`.
+        rate: How fast it changes at most, in its unit per s; 0 for at once.
     """
 
     kind: str
@@ -110,6 +50,7 @@ class Control:
     known: tuple[int, ...] = ()
     factors: tuple[float, ...] = ()
     powers: tuple[int, ...] = ()
+    rate: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,24 +83,29 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
     inputs = Inputs.of(loop)
     values = inputs.values(context)
     found = _commands(loop, inputs, context, size) + _surfaces(loop, inputs, 0.2 * size)
+    found += _unknown_surfaces(loop.plant, inputs, values, 0.2 * size)
     found += [
-        Control("signal", port.get_name().removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (place,))
+        Control("signal", name, "", 0.0, 1.0, 0.0, (place,))
         for port, place in inputs.ports.items()
+        if not (name := port.get_name().removeprefix(SIGNAL)).startswith(BY_HAND)
     ]
-    found += _plant(loop, inputs, values) + _pole(loop, inputs, values)
-    places = _places(loop.plant.dae, inputs.blocks.get(loop.plant))
-    pushes = {
-        name.removeprefix(PUSH).removesuffix(".force.0"): place
-        for name, place in places.items()
-        if name.startswith(PUSH) and name.endswith(".force.0")
-    }
-    if loop.plant.pushes in inputs.blocks:
-        first, end = inputs.blocks[loop.plant.pushes], f".{PUSH}"
-        for place in range(first, len(inputs.names)):
-            _, is_push, name = inputs.names[place].partition(end)
-            if is_push and name.endswith(".force[0]"):
-                pushes[name.removesuffix(".force[0]")] = place
-    return Controls(inputs, found, pushes)
+    plant, controller = loop.plant, loop.controller
+    found += of_plant(plant, controller, inputs, values) + of_pole(controller, inputs, values)
+    return Controls(inputs, found, pushes_of([plant], inputs))
+
+
+def pushes_of(plants: Sequence[Plant], inputs: Inputs) -> dict[str, int]:
+    """Name of a link that can be pushed -> the first of its six inputs."""
+    found = dict[str, int]()
+    for plant in plants:
+        for name, place in _places(plant.dae, inputs.blocks.get(plant)).items():
+            if name.startswith(PUSH) and name.endswith(".force.0"):
+                found[name.removeprefix(PUSH).removesuffix(".force.0")] = place
+    for place, name in enumerate(inputs.names):
+        _, is_push, link = name.partition(f".{PUSH}")
+        if is_push and link.endswith(".force[0]"):
+            found.setdefault(link.removesuffix(".force[0]"), place)
+    return found
 
 
 def _places(dae: DaeSystem, first: int | None) -> dict[str, int]:
@@ -172,10 +118,19 @@ def _places(dae: DaeSystem, first: int | None) -> dict[str, int]:
     }
 
 
-def _plant(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]:
-    """Frictions and masses: first frictions, then links from the tool on."""
-    plant, first = loop.plant, inputs.blocks.get(loop.plant)
-    known = _places(loop.controller.law.system, inputs.blocks.get(loop.controller))
+def of_plant(
+    plant: Plant, controller: Controller | None, inputs: Inputs, values: FloatArray
+) -> list[Control]:
+    """Frictions and masses: first frictions, then links from the tool on.
+
+    Args:
+        plant: The plant.
+        controller: The one whose law may know them; None without one.
+        inputs, values: All inputs, and their values.
+    """
+    first, known = inputs.blocks.get(plant), dict[str, int]()
+    if controller is not None:
+        known = _places(controller.law.system, inputs.blocks.get(controller))
     places = _places(plant.dae, first)
     if first is not None:
         further = plant.further_parameters.items()
@@ -185,10 +140,10 @@ def _plant(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control
         unit, value, label = inputs.units[place], float(values[place]), name.removesuffix(".0")
         given = (place,), (known[name],) if name in known else ()
         if label.endswith((".friction", ".viscous_friction")):
-            most = _round(max(0.6, 2.0 * value))
+            most = rounded(max(0.6, 2.0 * value))
             frictions.append(Control("plant", label, unit, 0.0, most, value, *given))
         elif label.endswith(".mass") and unit == "kg":
-            most = _round(max(3.0 * value, 1.0))
+            most = rounded(max(3.0 * value, 1.0))
             masses.append(Control("plant", label, unit, 0.5 * value, most, value, *given))
     return frictions + masses
 
@@ -207,7 +162,7 @@ def _commands(loop: ClosedLoop, inputs: Inputs, context: Context, size: float) -
         found.append(Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,)))
     for i, signal in enumerate(generator.commands[start:]):
         reach = {"m": 0.15 * size, "N": max(abs(now[i]), 10.0), "N m": max(abs(now[i]), 1.0)}
-        most = _round(reach.get(signal.unit, 0.5))
+        most = rounded(reach.get(signal.unit, 0.5))
         place = (first + start + i,)
         found.append(Control("reference", signal.name, signal.unit, -most, most, 0.0, place))
     return sorted(found, key=lambda each: _ORDER.get((each.kind, each.unit), 3))
@@ -221,7 +176,7 @@ def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
         if isinstance(generator, CommandedReferences):
             for i, signal in enumerate(generator.commands):
                 found.setdefault(signal.name, []).append(inputs.blocks[generator] + i)
-    most = _round(reach)
+    most = rounded(reach)
     return [
         Control("surface", name, inputs.units[places[0]], -most, most, 0.0, tuple(places))
         for name, places in found.items()
@@ -229,9 +184,30 @@ def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
     ]
 
 
-def _pole(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]:
+def _unknown_surfaces(
+    plant: Plant, inputs: Inputs, values: FloatArray, reach: float
+) -> list[Control]:
+    """The positions of the surfaces of a compliant contact, which no law knows.
+
+    They are parameters of the plant, and so change in steps: slow ones, which are small.
+    """
+    if plant.is_ideal or plant.model is None or plant not in inputs.blocks:
+        return []
+    places, moving = _places(plant.dae, inputs.blocks[plant]), plant.dae.exogenous.moving
+    known, most, found = {one.name for one in moving}, rounded(reach), list[Control]()
+    for constraint in plant.model.constraints:
+        name = f"{constraint.name}.position"
+        for k in range(3) if f"{name}.0" in places and name not in known else ():
+            place = places[f"{name}.{k}"]
+            value, label = float(values[place]), inputs.names[place].partition(".")[2]
+            limits = value - most, value + most, value
+            found.append(Control("surface", label, "m", *limits, (place,), rate=SLOW))
+    return found
+
+
+def of_pole(controller: Controller, inputs: Inputs, values: FloatArray) -> list[Control]:
     """One pole for all errors, where the gains are those of one pole."""
-    controller, law = loop.controller, loop.controller.law
+    law = controller.law
     if not controller.follows or controller not in inputs.blocks:
         return []
     first = inputs.blocks[controller]
@@ -250,11 +226,11 @@ def _pole(loop: ClosedLoop, inputs: Inputs, values: FloatArray) -> list[Control]
     if not np.allclose(values[places], factors * own**powers, rtol=1e-9):
         return []
     given = tuple(places), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
-    most = _round(max(4.0 * own, 20.0))
+    most = rounded(max(4.0 * own, 20.0))
     return [Control("pole", "pole of all errors", "1/s", -most, -0.5, -own, *given)]
 
 
-def _round(value: float) -> float:
+def rounded(value: float) -> float:
     """A number of one or two digits near a value."""
     return float(f"{value:.1g}")
 

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.running.bench.description import bench_of
-from drake_dae.running.bench.page import page_of, web_text
+from drake_dae.running.bench.page import page_of, title_of, web_text
 from drake_dae.running.bench.run import HandRun, Sampler
 
 HOST = "127.0.0.1"
@@ -48,6 +48,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         address: The address of the page.
         run: The present run.
+        lock: Held while the run advances.
 
     Raises:
         ModelError: The plant is no robot.
@@ -58,8 +59,8 @@ class Server(ThreadingHTTPServer):
 
     def __init__(
         self,
-        loop: ClosedLoop,
-        context: Context,
+        loop: ClosedLoop | Diagram,
+        context: Context | None = None,
         config: SimulatorConfig | None = None,
         title: str = "",
         notes: Sequence[str] = (),
@@ -75,10 +76,12 @@ class Server(ThreadingHTTPServer):
             text = what if error.errno == errno.EADDRINUSE else f"port {port}: {error.strerror}"
             raise OSError(error.errno, text) from None
         try:
-            bench = bench_of(loop, context, title or loop.plant.dae.name, notes)
+            diagram = loop if isinstance(loop, Diagram) else loop.diagram
+            context = diagram.CreateDefaultContext() if context is None else context
+            bench = bench_of(loop, context, title or title_of(loop), notes)
             self._sampler = Sampler(bench)
             self._made = loop, context, config
-            self._save, self._lock = save, threading.Lock()
+            self._save, self.lock = save, threading.Lock()
             self.path = f"/{secrets.token_urlsafe(12)}/"
             self.address = f"http://{HOST}:{self.server_port}{self.path}"
             self.page = page_of(
@@ -101,7 +104,7 @@ class Server(ThreadingHTTPServer):
             ModelError: It asks for what there is not.
             DrakeDaeError: The loop cannot go on.
         """
-        with self._lock:  # A browser keeps several connections, each of which has a thread.
+        with self.lock:  # A browser keeps several connections, each of which has a thread.
             return self._answer(what, told)
 
     def _answer(self, what: str, told: Any) -> dict[str, Any]:
@@ -172,8 +175,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 @checked(ModelError)
 def live(
-    loop: ClosedLoop,
-    context: Context,
+    loop: ClosedLoop | Diagram,
+    context: Context | None = None,
     config: SimulatorConfig | None = None,
     folder: str | Path = "live",
     title: str = "",
@@ -184,12 +187,16 @@ def live(
     tell: Callable[[str], None] = print,
     save: Callable[[HandRun], str] | None = None,
 ) -> None:
-    """Runs a loop of a robot in real time, with a page in the browser to change it, until Ctrl-C.
+    """Runs a loop or diagram in real time, with a page in the browser to change it, until Ctrl-C.
 
     The page is that of `write_page`, but the loop runs here, by Drake's Simulator, so that it may
     have what no export has: Drake's own contact, contacts that open, tasks, blocks of your own.
     Only this machine reaches the page. What is changed takes effect at the next 1/120 s; "save"
     writes the record and the commands, which `replay` runs again.
+
+    Any diagram with an output port of a vector has a bench, see `write_page`. Bodies that its
+    SceneGraph poses are drawn, and links of a MultibodyPlant whose port `applied_spatial_force` is
+    free are pushed.
 
     Args:
         loop, context, config, title, notes: As of `write_page`; of the settings all are used
@@ -201,7 +208,7 @@ def live(
         save: What saves a run, and says so in words; into the folder if None.
 
     Raises:
-        ModelError: The plant is no robot.
+        ModelError: The plant of a loop is no robot; or a diagram has no output port with a vector.
         OSError: The port is in use.
     """
 

@@ -9,16 +9,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
 from drake_dae.files import read_text
-from drake_dae.running.bench.controls import Inputs
+from drake_dae.running.bench.any_diagram import parts_of_diagram, vector_outputs
 from drake_dae.running.bench.description import TICK, Bench, shown_function
-from drake_dae.simulation.records.record import Record
+from drake_dae.running.bench.inputs import Inputs, started
+from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.functions import TracedFunction
 
@@ -84,10 +85,10 @@ class Commands:
 
 
 class HandRun:
-    """A run of a loop by Drake's Simulator, tick by tick, with changes between ticks.
+    """A run by Drake's Simulator, tick by tick, with changes between ticks.
 
     Args:
-        loop: The loop.
+        loop: The loop, or any diagram.
         context: The context of its diagram at the start; not changed.
         config: Drake's settings of the integrator.
         tick: The length of a tick, in s.
@@ -95,23 +96,27 @@ class HandRun:
 
     def __init__(
         self,
-        loop: ClosedLoop,
+        loop: ClosedLoop | Diagram,
         context: Context,
         config: SimulatorConfig | None = None,
         tick: float = TICK,
     ) -> None:
-        self.loop, self.inputs, self.tick = loop, Inputs.of(loop), tick
+        self.loop, self.inputs, self.tick = loop, Inputs.of(loop, context), tick
+        diagram = loop if isinstance(loop, Diagram) else loop.diagram
         self._start = context.get_time()
-        config, own = config or SimulatorConfig(), context.Clone()
+        config = config or SimulatorConfig()
+        own = started(loop, context) if isinstance(loop, Diagram) else context.Clone()
         check_config(config)
         own.SetAccuracy(config.accuracy)  # For witness functions, as in `simulate`.
-        self._simulator = Simulator(loop.diagram, own)
+        self._simulator = Simulator(diagram, own)
         ApplySimulatorConfig(config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
         self.count = 0
         self._failure: Exception | None = None
         self._log: list[tuple[int, str, float]] = []
+        self._rows = list[tuple[float, dict[str, FloatArray]]]()
+        self._keep()
 
     @property
     def context(self) -> Context:
@@ -145,6 +150,7 @@ class HandRun:
             self._failure = error
             raise
         self.count += 1
+        self._keep()
 
     @property
     def commands(self) -> Commands:
@@ -152,13 +158,27 @@ class HandRun:
         return Commands(tuple(self._log), self.count, self.tick)
 
     def record(self) -> Record:
-        """The record so far."""
-        return self.loop.record(self.context)
+        """The record so far: of a loop what it logs, of a diagram its output ports at each tick."""
+        if not isinstance(self.loop, Diagram):
+            return self.loop.record(self.context)
+        ports, found = parts_of_diagram(self.loop, self.context), dict[str, Recorded]()
+        left = list(ports.signals)
+        for name in ports.outputs:
+            values = np.array([row[name] for _, row in self._rows])
+            own, left = left[: values.shape[1]], left[values.shape[1] :]
+            found[name] = Recorded(values, tuple(own))
+        return Record(np.array([time for time, _ in self._rows]), found)
+
+    def _keep(self) -> None:
+        """Keeps a row of a diagram, which logs nothing by itself."""
+        if isinstance(self.loop, Diagram):
+            row = {name: np.array(p.Eval(self.context)) for name, p in vector_outputs(self.loop)}
+            self._rows.append((self.context.get_time(), row))
 
 
 @checked(ModelError)
 def replay(
-    loop: ClosedLoop,
+    loop: ClosedLoop | Diagram,
     context: Context,
     commands: Commands,
     config: SimulatorConfig | None = None,
@@ -166,7 +186,7 @@ def replay(
     """The record of a run with given commands: on the same machine, the same numbers.
 
     Args:
-        loop: The loop that was commanded, or one with inputs of the same names.
+        loop: The loop or diagram that was commanded, or one with inputs of the same names.
         context: The context of its diagram at the start; not changed.
         commands: What was changed, as a live bench or a page saved it.
         config: Drake's settings, as in that run.
@@ -198,19 +218,10 @@ class Sampler:
     """
 
     def __init__(self, bench: Bench) -> None:
-        loop, self._bench = bench.loop, bench
-        diagram = loop.diagram
-        names = [
-            "state",
-            "constraint_force",
-            "reference",
-            "integral",
-            "exogenous",
-            "known_exogenous",
-        ]
-        self._ports = {n: diagram.GetOutputPort(n) for n in names if diagram.HasOutputPort(n)}
+        self._bench, inputs = bench, bench.controls.inputs
+        self._ports = dict(bench.ports)
         columns = {name: ca.SX.sym(name, port.size()) for name, port in self._ports.items()}
-        given = ca.SX.sym("inputs", len(bench.controls.inputs.names))
+        given = ca.SX.sym("inputs", len(inputs.names))
         value = {"shown": shown_function(bench, columns, given)}
         self._function = TracedFunction("bench", {**columns, "inputs": given}, value)
         count = bench.data["prediction"]
@@ -218,24 +229,39 @@ class Sampler:
 
     def __call__(self, context: Context) -> dict[str, Any]:
         """The sample, as plain data; what has no value is None."""
-        loop = self._bench.loop
-        values = [port.Eval(context) for port in self._ports.values()]
-        shown = self._function(*values, self._bench.controls.inputs.values(context))[0]
-        z, r = self._compared(context)
+        bench = self._bench
+        values = {
+            name: port.Eval(port.get_system().GetMyContextFromRoot(context))
+            for name, port in self._ports.items()
+        }
+        shown = self._function(*values.values(), bench.controls.inputs.values(context))[0]
+        posed = bench.scene.posed.poses(context)
+        shown[: posed.size] = posed
+        z, r, phase, place = self._compared(context, values)
         size = len(shown) - self._count
-        changes = loop.changes(context)
         return {
             "time": context.get_time(),
             "z": _plain(z),
             "r": _plain(r),
             "scene": _plain(shown[:size]),
             "coordinates": _plain(shown[size:]),
-            "phase": changes[-1].phase if changes else "",
+            "phase": phase,
+            "place": place,
         }
 
-    def _compared(self, context: Context) -> tuple[FloatArray, FloatArray]:
-        """z and r."""
+    def _compared(
+        self, context: Context, values: Mapping[str, FloatArray]
+    ) -> tuple[FloatArray, FloatArray, str, int]:
+        """z and r, which a diagram does not know, and the name and the place of the phase."""
         loop = self._bench.loop
+        if isinstance(loop, Diagram):
+            z = np.concatenate([values[name] for name in self._bench.outputs])
+            return z, np.full(z.size, np.nan), "", 0
+        changes = loop.changes(context)
+        now = (changes[-1].phase, changes[-1].place) if changes else ("", 0)
+        return *self._of_loop(loop, context), *now
+
+    def _of_loop(self, loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
         z = loop.diagram.GetOutputPort("controlled_output").Eval(context)
         own = loop.controller.GetMyContextFromRoot(context)
         if "reference" in self._ports:

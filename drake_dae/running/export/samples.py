@@ -65,7 +65,7 @@ def samples(
         }
         if whole is not None:
             at_start, of_blocks = whole.start(context), whole.values(context)
-            held = whole.begun(context.get_time(), *at_start, of_blocks)
+            held = whole.initialized(context.get_time(), *at_start, of_blocks)
             values |= whole_values(whole, (at_start[0], held), state)
             values["loop_parameters"] = of_blocks
         for name, call in calls.items():

@@ -12,7 +12,7 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
 from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
-from drake_dae.systems.blocks.trials import SLOWEST
+from drake_dae.systems.blocks.trials import LEAST_PROGRESS
 
 WINDOW = 1e-13
 """A moment is found to within this time, in s."""
@@ -51,7 +51,7 @@ class _Changes:
         # Plants that need the moments of changes ask whether they are sought.
         self.context.SetAccuracy(WINDOW)
         given = problem.state, problem.held, problem.parameters
-        compiled.put(self.context, problem.times[0], *given)
+        compiled.set_context(self.context, problem.times[0], *given)
         start, nowhere = float(problem.times[0]), np.full_like(problem.state, np.nan)
         counts, none = (
             (0, 0, start, start, np.inf, nowhere),
@@ -136,7 +136,7 @@ class _Changes:
     def ended(self, run: Run) -> Context:
         """A context of the diagram at the end of a run."""
         given = run.time, run.state, run.held, self.problem.parameters
-        self.fused.program.compiled.put(self.context, *given)
+        self.fused.program.compiled.set_context(self.context, *given)
         return self.context
 
     def react(
@@ -152,7 +152,7 @@ class _Changes:
         self, time: float, state: FloatArray, held: FloatArray, systems: Sequence[System]
     ) -> tuple[FloatArray, FloatArray, bool]:
         compiled, goes_on = self.fused.program.compiled, True
-        compiled.put(self.context, time, state, held, self.problem.parameters)
+        compiled.set_context(self.context, time, state, held, self.problem.parameters)
         after = self.context.Clone()
         for system in systems:
             guard = compiled.blocks[system].guard
@@ -257,7 +257,7 @@ def run_with_changes(
         rows.append(run.rows)
         count += 1
         if count % MOST == 0 and piece is not None:
-            if run.time - mark < SLOWEST * (run.time - problem.times[0]):
+            if run.time - mark < LEAST_PROGRESS * (run.time - problem.times[0]):
                 run = replace(run, ending=RunEnding.SLOW, mark=mark)
                 break
             mark = run.time

@@ -17,7 +17,7 @@ from drake_dae.systems.blocks.failures import (
     spoilt_step,
 )
 from drake_dae.systems.blocks.traced import HELD, STATE, TIME, Block
-from drake_dae.systems.blocks.trials import STEPS
+from drake_dae.systems.blocks.trials import PACE_STEPS
 from drake_dae.systems.plants.contract import Plant
 
 STATES = (STATE, "estimated_state")
@@ -44,7 +44,7 @@ def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> Simula
             except InconsistentStateError as error:
                 return off_manifold(run.time, state, error)
         case RunEnding.SLOW:
-            return endless_steps(name, STEPS, run.mark, run.time, state)
+            return endless_steps(name, PACE_STEPS, run.mark, run.time, state)
         case RunEnding.SPOILT:
             return spoilt_step(name, run.time, run.next, state, str(trial or ""))
         case RunEnding.STUCK if trial is not None:

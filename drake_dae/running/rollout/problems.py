@@ -46,7 +46,7 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
         own.SetAccuracy(1e-9)
         program.compiled.diagram.ExecuteInitializationEvents(own)
         held = np.where(np.isnan(held), program.compiled.start(own)[1], held)
-    held = program.compiled.begun(context.get_time(), state, held, values)
+    held = program.compiled.initialized(context.get_time(), state, held, values)
     return np.concatenate([state, held[program.kept_places]]), values
 
 

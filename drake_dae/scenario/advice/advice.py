@@ -26,19 +26,22 @@ from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 
 _SOFTER = 5.0
-"""A free robot's poles of positions are so many times as fast as those of the distance."""
+"""The ratio of the poles of positions to those of the distance, of a robot without contact."""
 
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 
-def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> parts.Coefficients:
-    """The gains of the free robot of a task, soft along the distance: see `TaskController`."""
+def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
+    """The gains of a task without contact, soft along the distance: see `TaskController`."""
     constraint = opening_contact(scenario, model)
     names = [signal.name for signal in model.dae.constraint_input_signals]
     place = names.index(constraint.force_signals[0].name)
-    distance, rate = model.dae.constraint_output_signals[place].name, found.position_rate / _SOFTER
-    gains = {signal.name: found.position_gains(2) for signal in model.position_signals}
+    distance, rate = (
+        model.dae.constraint_output_signals[place].name,
+        contact.position_rate / _SOFTER,
+    )
+    gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
     gains[distance] = [rate**2, 2.0 * rate]
     return parts.Coefficients(
         outputs={name: [rounded(gain) for gain in each] for name, each in gains.items()}
@@ -46,14 +49,13 @@ def _free_gains(scenario: Scenario, model: RobotModel, found: ContactGains) -> p
 
 
 def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """The force of the hardest touch, F + v (sqrt(k / A) + k t), also where it is tried again.
+    """A note on the largest force when contact is made, F + v (sqrt(k / A) + k t).
 
-    The law pushes with the force F that ends the phase from when it is felt; the root stops the
-    mass 1 / A at the tool, and the last term is how far the tool goes in the time t until the law
-    reacts.
+    F is the force that ends the phase. The contact of stiffness k stops the effective mass 1 / A of
+    the tool from the speed v, and in the time t until the law reacts the tool moves on by v t.
     """
     peaks = []
-    for phase in () if task is None else task.made().phases:
+    for phase in () if task is None else task.make().phases:
         if task is not None and (speed := phase.speed_of_approach):
             added = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
             peaks.append((phase.felt(task.contact_force) + added, speed, phase.name))
@@ -65,15 +67,13 @@ def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, la
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """The scenario with gains by `advised_gains`, or `contact_gains`, where they are left out.
+    """Computes gains and other settings that a scenario in Drake's own contact leaves out.
 
-    With encoders and rigid joints the gains are those for their noise, with an estimate of the
-    state; otherwise those of `contact_gains`, and of `contact_gains_behind` for a cascade.
-
-    Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
-    and of points, constraint damping, an observer of disturbance and friction, and measured force
-    are set, each if it is left out. A task also gets gains of its free robot, soft along the
-    distance.
+    It computes gains, integrals of forces and of points, constraint damping, an observer of
+    disturbance and friction, and measured force, each if it is left out; and for a task the gains
+    without contact, soft along the distance. With encoders and rigid joints the gains are those of
+    `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`, or for a
+    cascade of `contact_gains_behind`. A scenario with `gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -81,23 +81,21 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         structure: The structure of the model's system.
 
     Returns:
-        The scenario, unchanged if nothing is left out, and the choices in words.
+        The scenario, and the choices in words.
 
     Raises:
-        ScenarioError: There are no default gains with a task, or with stages of actuation, or none
-            are smooth and stable enough; or a roughness is given that nothing uses.
+        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
+            enough; or `largest_roughness` is given and not used.
     """
     material = scenario.plant.material
     is_advised = material is not None and scenario.is_advised
     if scenario.largest_roughness is not None:
         if not is_advised or scenario.encoders is None or scenario.is_cascade:
-            raise ScenarioError(
-                (
-                    "largest_roughness",
-                    "it limits gains that are computed for rigid joints and the noise of encoders "
-                    "in Drake's contact; leave it out, or leave the gains out and give encoders",
-                )
+            text = (
+                "it is used only for gains that are computed for rigid joints with encoders in "
+                "Drake's contact; leave it out, or leave `gains` out and give encoders"
             )
+            raise ScenarioError(("largest_roughness", text))
         if not scenario.largest_roughness > 0.0:
             value = f"must be positive, got {scenario.largest_roughness:g} N m"
             raise ScenarioError(("largest_roughness", value))
@@ -107,39 +105,35 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if material is None or not is_advised:
         return Completed(scenario)
     if model.stages:
-        raise ScenarioError(
-            (
-                "gains",
-                "for Drake's own contact no gains are recommended with motors or valves, or with "
-                "the tracking law and springs; give them, with integral and observer, as in the "
-                "scenario wall_flexible_contact, or for springs leave `law` out",
-            )
+        text = (
+            "for Drake's own contact no gains are computed if the robot has motors or valves, or "
+            "springs with the tracking law. Give gains, integral and observer, as in the scenario "
+            "wall_flexible_contact. For springs you can leave out `law` instead"
         )
+        raise ScenarioError(("gains", text))
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
     if not period:
-        raise ScenarioError(
-            (
-                "gains",
-                "for a continuous compliant plant without `sampling` no gains are recommended; "
-                "give some, or a sampling",
-            )
+        text = (
+            "for a continuous compliant plant without `sampling` no gains are computed; give some, "
+            "or a sampling"
         )
+        raise ScenarioError(("gains", text))
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_at(_FORCE)
     fast, noise = None, velocity_noise(scenario, period)
     known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
-    loop = None if scenario.law is None else scenario.law.loop()
+    loop = scenario.spring_loop
     if loop is not None:
-        found = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
+        contact = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
     elif scenario.encoders is None:
-        found = contact_gains(stiffness, mobility, period, late, NOISE)
+        contact = contact_gains(stiffness, mobility, period, late, NOISE)
     else:
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
         with at("gains"):
             best = advised_gains(sensed, largest_roughness(scenario, model))
-        found, fast = best.gains, best.state_rate
+        contact, fast = best.gains, best.state_rate
         known_by, outlook = "these encoders", f". {predicted(best)}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
@@ -151,28 +145,30 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     if not force.is_measured:
         force = parts.MeasuredForce(sample_period=period)
     # A force of degree 0 has a gain only if it is integrated.
-    of_forces = {name: [rounded(found.force_gain)] for name in forces.tolist() if name in integral}
+    of_forces = {
+        name: [rounded(contact.force_gain)] for name in forces.tolist() if name in integral
+    }
     of_positions = {
-        name: [rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
+        name: [rounded(gain) for gain in contact.position_gains(3 if name in integral else 2)]
         for name in positions.tolist()
     }
     gains = parts.Coefficients(outputs=of_positions | of_forces)
     damping = scenario.constraint_damping
-    if damping is None and found.constraint_damping:
-        damping = parts.Poles(all=[-rounded(found.constraint_damping)])
+    if damping is None and contact.constraint_damping:
+        damping = parts.Poles(all=[-rounded(contact.constraint_damping)])
     observer = scenario.observer
     if observer is None:
         frictional = [c.name for c in model.constraints if c.friction_parameter]
         observer = parts.Observer(
-            rate=rounded(found.observer_rate),
-            force_rate=rounded(found.observer_force_rate),
-            friction_rate=rounded(found.friction_rate),
+            rate=rounded(contact.observer_rate),
+            force_rate=rounded(contact.observer_force_rate),
+            friction_rate=rounded(contact.friction_rate),
             identify_friction=frictional,
             state_rate=None if fast is None else rounded(fast),
         )
     task = scenario.task
     if task is not None and task.gains is None:
-        task = replace(task, gains=_free_gains(scenario, model, found))
+        task = replace(task, gains=_free_gains(scenario, model, contact))
     chosen = replace(
         scenario,
         task=task,
@@ -188,9 +184,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and {known_by}: Butterworth's poles of positions "
-        f"at {rounded(found.position_rate):g} 1/s, and of forces one at "
-        f"{-rounded(found.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
-        f"of the constraint {rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"at {rounded(contact.position_rate):g} 1/s, and of forces one at "
+        f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
+        f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}{estimated}"
         f"{loop_note(scenario)}{outlook}"
         f"{_touch_note(task, stiffness, mobility, period * (1 + late))}"

@@ -1,4 +1,4 @@
-"""What the choice of gains needs of the sensors of a scenario, and what it predicts."""
+"""The data on robot, contact and sensors for the choice of gains, and its prediction."""
 
 import casadi as ca
 import numpy as np
@@ -12,7 +12,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.scenario import Scenario
 
 _SHARE = 0.003
-"""The default of the largest roughness, as a share of the largest effort limit."""
+"""The default of the largest roughness, as a fraction of the largest effort limit."""
 
 
 def _largest(deviation: ArrayLike) -> float:
@@ -26,13 +26,13 @@ def sensed_contact(
     timing: tuple[float, int],
     stiffness: float,
 ) -> SensedContact:
-    """What the choice of gains needs of a robot, its contact and its sensors.
+    """Collects the data on a robot, its contact and its sensors for the choice of gains.
 
     Args:
         scenario: The scenario, with encoders.
         model, structure: Its robot.
         timing: The period in s and the delay in samples.
-        stiffness: That of the contact in N/m.
+        stiffness: The stiffness of the contact in N/m.
     """
     system, state, encoders = model.dae, structure.states[0], scenario.encoders
     assert encoders is not None
@@ -71,7 +71,7 @@ def sensed_contact(
 
 
 def predicted(best: AdvisedGains) -> str:
-    """What gains are predicted to come to, as a sentence."""
+    """The predicted errors of gains, as a sentence."""
     by_noise = f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N"
     return (
         f"Predicted rms errors: {1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N "
@@ -81,7 +81,7 @@ def predicted(best: AdvisedGains) -> str:
 
 
 def largest_roughness(scenario: Scenario, model: RobotModel) -> float:
-    """The largest change of controls from sample to sample that computed gains may make, in N m.
+    """The largest permitted change of the controls from sample to sample by noise, in N m.
 
     Args:
         scenario: The scenario.

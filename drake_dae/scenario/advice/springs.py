@@ -1,4 +1,4 @@
-"""The numbers of a cascade for springs where a scenario leaves them out."""
+"""The numbers of a cascade for springs that a scenario leaves out."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _DIGITS = 3
 
 
 def rounded(value: float) -> float:
-    """A recommended number, as it is written."""
+    """A recommended number, rounded to three digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
@@ -34,20 +34,17 @@ def velocity_noise(scenario: Scenario, period: float) -> float:
 
 def loop_note(scenario: Scenario) -> str:
     """The numbers of a cascade in words; empty without one."""
-    loop = None if scenario.law is None else scenario.law.loop()
-    if loop is None:
-        return ""
-    return f"; a cascade with a loop of {loop.rate:g} rad/s around the springs"
+    loop = scenario.spring_loop
+    return f"; a cascade with a loop of {loop.rate:g} rad/s around the springs" if loop else ""
 
 
 def with_loop(scenario: Scenario) -> Scenario:
-    """The scenario with all numbers of the loop around its springs."""
+    """Computes the numbers of the loop around springs that a scenario leaves out."""
     law, sampling = scenario.law, scenario.sampling
-    if not isinstance(law, parts.SpringCascade):
-        law = parts.SpringCascade()
+    if not isinstance(law, parts.SpringCascadeForm):
+        law = parts.SpringCascadeForm()
     if sampling is None:
         return replace(scenario, law=law.filled(SpringLoop(1.0)))  # law_robot refuses it.
-    found = spring_loop(sampling.period, sampling.late_samples, law.damping)
-    numbers = (rounded(each) for each in (found.rate, found.current_rate))
-    rate, current_rate = numbers
+    loop = spring_loop(sampling.period, sampling.late_samples, law.damping)
+    rate, current_rate = rounded(loop.rate), rounded(loop.current_rate)
     return replace(scenario, law=law.filled(SpringLoop(rate, law.damping, rate, current_rate)))

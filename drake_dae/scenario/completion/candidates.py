@@ -19,13 +19,13 @@ from drake_dae.robots.outputs import (
 from drake_dae.scenario.completion.postures import Posture
 from drake_dae.scenario.completion.tool_axis import ToolAxis, tool_axis
 from drake_dae.scenario.parts.families import Output
-from drake_dae.scenario.parts.written import TiltFromNormal, made
+from drake_dae.scenario.parts.written import TiltFromNormalForm, make
 from drake_dae.scenario.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)
 class _ToolContact:
-    """A contact of a robot: the constraint's name, the point, and the tool's axis there."""
+    """A contact of a tool: the constraint's name, the contact, and the tool's axis there."""
 
     constraint: str
     touch: Touch
@@ -33,12 +33,12 @@ class _ToolContact:
 
 
 class Candidates:
-    """The given rows, then those that may complete them, one output each.
+    """The rows of the scenario's outputs, then the rows that may complete them, one output each.
 
     Args:
         scenario: The scenario.
         links: Its robot.
-        given: The given outputs.
+        given: The outputs of the scenario.
         bound: The constraints.
 
     Attributes:
@@ -70,7 +70,7 @@ class Candidates:
         def add(forms: Iterable[Output]) -> list[int]:
             first = len(self.signals)
             for form in forms:
-                output = made(form, bound.constraints)
+                output = make(form, bound.constraints)
                 rows.append(output.expression(links))
                 self._forms.append(form)
                 self.signals += output.signals(links)
@@ -106,42 +106,40 @@ class Candidates:
 def _points(place: _ToolContact, taken: set[str]) -> list[Output]:
     frame, point = place.touch.frame, place.touch.point
     # Names are unique: the constraint's name is used if the frame's is taken.
-    named = ((axis, f"{frame}.{axis}" in taken) for axis in "xyz")
+    other = f"{place.constraint}_point"
     return [
-        PointCoordinates(frame, axis, point, f"{place.constraint}_point" if is_taken else "")
-        for axis, is_taken in named
+        PointCoordinates(frame, axis, point, other if f"{frame}.{axis}" in taken else "")
+        for axis in "xyz"
     ]
 
 
 def _tilts(place: _ToolContact) -> list[Output]:
     axis = place.axis.axis
-    others = "xyz".replace(axis, "")
-    return [TiltFromNormal(place.constraint, axis, one) for one in others]
+    return [TiltFromNormalForm(place.constraint, axis, other) for other in "xyz".replace(axis, "")]
 
 
 def _directions(place: _ToolContact) -> list[Output]:
-    return [AxisCoordinates(place.touch.frame, place.axis.axis, one) for one in "xyz"]
+    axis = place.axis.axis
+    return [AxisCoordinates(place.touch.frame, axis, component) for component in "xyz"]
 
 
 _JOINED = {
     PointCoordinates: "axes",
     AxisCoordinates: "components",
-    TiltFromNormal: "components",
+    TiltFromNormalForm: "components",
     JointPositions: "joints",
 }
 """Which attribute of an output holds its rows."""
 
 
 def merged(forms: Iterable[Output]) -> list[Output]:
-    """The same rows in fewer outputs: those that differ in what rows they have become one."""
-    found: list[Any] = []
+    """The same rows in fewer outputs: neighbours that differ only in their rows are joined."""
+    outputs: list[Any] = []
     for form in forms:
         key = _JOINED[type(form)]
-        own = getattr(form, key)
-        if found and type(found[-1]) is type(form):
-            first = getattr(found[-1], key)
-            if replace(form, **{key: first}) == found[-1]:
-                found[-1] = replace(form, **{key: first + own})
-                continue
-        found.append(form)
-    return found
+        last = outputs[-1] if outputs else None
+        if type(last) is type(form) and replace(form, **{key: getattr(last, key)}) == last:
+            outputs[-1] = replace(form, **{key: getattr(last, key) + getattr(form, key)})
+        else:
+            outputs.append(form)
+    return outputs

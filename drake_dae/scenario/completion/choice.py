@@ -1,4 +1,4 @@
-"""The rows that complete a task: independent ones, and the best joints."""
+"""The choice of rows that complete a task: independent rows, and positions of joints."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -25,7 +25,7 @@ def first_independent(
     candidates: Sequence[int],
     room: int,
 ) -> list[int]:
-    """The first of some rows that are independent of others, and of each other, at a posture."""
+    """The first candidates, at most `room`, that are independent of rows and of each other."""
     chosen: list[int] = []
     for candidate in candidates:
         if len(chosen) < room and posture.independence([*rows, *chosen, candidate]) > INDEPENDENT:
@@ -41,20 +41,20 @@ def best_joints(
     count: int,
     path: FloatArray,
 ) -> tuple[int, ...] | None:
-    """The positions of joints to hold beside a task.
+    """Chooses the joints whose positions complete a task.
 
     Args:
         postures: The robot.
         posture: The start.
         rows: The rows of the task.
-        joints: The rows of positions.
-        count: How many to choose.
+        joints: The rows of positions of joints.
+        count: The number of joints to choose.
         path: Values of the first rows of the task at some times, shape (k, r); the other rows
-            hold what they start with.
+            keep their initial values.
 
     Returns:
-        Those with the largest least `quality` along the path; of all sets that leave the robot
-        regular at the start, the best ones there are followed. None if no set does.
+        The set of joints whose least `quality` along the path is largest, among the best sets at
+        the start; None if B is singular there for all sets.
     """
 
     def start_quality(chosen: Sequence[int]) -> float:
@@ -64,22 +64,22 @@ def best_joints(
         return posture.independence([*rows, *chosen]) > INDEPENDENT / 10
 
     if comb(len(joints), count) <= _SETS:
-        sets = [one for one in combinations(joints, count) if is_regular(one)]
+        sets = list(combinations(joints, count))
     else:
-        one_by_one: list[int] = []
+        greedy: list[int] = []
         for _ in range(count):
-            left = [joint for joint in joints if joint not in one_by_one]
-            one_by_one.append(max(left, key=lambda j: start_quality([*one_by_one, j])))
-        sets = [one for one in [tuple(sorted(one_by_one))] if is_regular(one)]
-    shortlist = sorted(sets, key=start_quality, reverse=True)[:_SHORTLIST]
+            rest = [joint for joint in joints if joint not in greedy]
+            greedy.append(max(rest, key=lambda j: start_quality([*greedy, j])))
+        sets = [tuple(sorted(greedy))]
+    shortlist = sorted(filter(is_regular, sets), key=start_quality, reverse=True)[:_SHORTLIST]
     if len(shortlist) < 2:
         return shortlist[0] if shortlist else None
-    # Of equal ones along the path the best at the start.
-    return max(shortlist, key=lambda one: _least(postures, posture, [*rows, *one], path))
+    # Of sets that are equal along the path, the best one at the start.
+    return max(shortlist, key=lambda chosen: _least(postures, posture, [*rows, *chosen], path))
 
 
 def _least(postures: Postures, posture: Posture, rows: Sequence[int], path: FloatArray) -> float:
-    """The least quality along a path; 0 where it cannot be followed."""
+    """The least quality along a path; 0 if the path cannot be followed."""
     q, least = posture.q, postures.quality(posture, rows)
     for values in path:
         wanted = posture.rows[list(rows)]

@@ -18,7 +18,7 @@ from drake_dae.scenario.completion.referred import ReferredRows, value_at
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
 from drake_dae.scenario.completion.shortage import check_independent, why_none
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.written import made
+from drake_dae.scenario.parts.written import make
 from drake_dae.scenario.scenario import Scenario
 
 REGULAR = 1e-3
@@ -30,11 +30,11 @@ _DIGITS = 4
 
 @dataclass(frozen=True)
 class Completed:
-    """A completed scenario.
+    """A scenario with all outputs and a start.
 
     Attributes:
         scenario: The scenario.
-        notes: The choices, a line each; empty if there were none.
+        notes: The library's choices, one line each.
     """
 
     scenario: Scenario
@@ -50,41 +50,42 @@ def complete(
 ) -> Completed:
     """Chooses the missing outputs of a scenario, and the start.
 
-    Outputs are missing if there are fewer outputs than actuators. They are completed as described
-    for `complete_scenario`.
+    Outputs are missing if there are fewer outputs than actuators. They are chosen as described for
+    `complete_scenario`.
 
-    The robot starts where its default configuration, with start.positions, leads by Newton's method
-    within its limits; or else, of 60 tries for the positions that are not given, in the posture of
-    best `quality` with the first values of the references.
+    Newton's method finds a start from the default configuration with start.positions. If it finds
+    none within the limits of joints, it is repeated from 60 random guesses of the joints that are
+    not in start.positions, and the posture of best `quality` is taken.
 
     Args:
         scenario: The scenario.
         links: Its robot.
         constraints: Its constraints.
-        of_plant: Those that the robot's file has.
+        of_plant: The constraints in the robot's file.
         guess: The default configuration with start.positions, shape (nq,).
 
     Raises:
         ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
     bound = ConstraintSet([*constraints, *of_plant])
-    given = [made(form, constraints) for form in scenario.outputs]
+    given = [make(form, constraints) for form in scenario.outputs]
     size = sum(len(output.signals(links)) for output in given)
     steered = force_outputs(scenario.forces, bound)
     names = [signal.name for output in steered for signal in output.signals(bound)]
     S = force_rows(steered, bound, links)
     actuators = len(links.actuator_signals) + len(bound.motors)
     missing = actuators - size - S.shape[0]
-    if not (size or S.shape[0] or scenario.references):
-        return Completed(scenario)  # A robot that is only simulated.
-    if scenario.task is not None:
-        return Completed(scenario)
-    if scenario.control_weights or scenario.compliances is not None:
-        return Completed(scenario)
-    if np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals):
-        return Completed(scenario)  # The model refuses it.
     is_placed = len(scenario.start.positions) == len(links.position_signals)
-    if missing < 0 or (missing == 0 and is_placed):
+    if (
+        not (size or S.shape[0] or scenario.references)  # A robot that is only simulated.
+        or scenario.task is not None
+        or scenario.control_weights
+        or scenario.compliances is not None
+        # The model refuses such actuators.
+        or np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals)
+        or missing < 0
+        or (missing == 0 and is_placed)
+    ):
         return Completed(scenario)
     candidates = Candidates(scenario, links, given, bound)
     with at("plant_parameters or exogenous"):
@@ -112,7 +113,7 @@ def complete(
 def _with_start(
     scenario: Scenario, referred: ReferredRows, postures: Postures, guess: FloatArray
 ) -> Completed:
-    """The scenario with a start, if its default configuration leads to none."""
+    """Adds a start to a scenario whose default configuration leads to none."""
     rows = referred.rows
     wanted = referred.at_start(rows)
     near = near_posture(postures, rows, wanted, guess)
@@ -123,12 +124,12 @@ def _with_start(
     ):
         return Completed(scenario)
     if is_given:
-        best = best_posture(postures, rows, wanted, list(_guesses(referred, postures, guess)))
-        if best is None:  # The start reports it.
+        posture = best_posture(postures, rows, wanted, list(_guesses(referred, postures, guess)))
+        if posture is None:  # The start reports it.
             return Completed(scenario)
-        return Completed(_started(scenario, referred, best), (_start_note(referred, best),))
-    found = _found(referred, postures, rows, wanted, guess)
-    return Completed(_started(scenario, referred, found), (_start_note(referred, found),))
+    else:
+        posture = _search(referred, postures, rows, wanted, guess)
+    return Completed(_started(scenario, referred, posture), (_start_note(referred, posture),))
 
 
 def _with_outputs(
@@ -138,7 +139,7 @@ def _with_outputs(
     guess: FloatArray,
     forces: Sequence[str],
 ) -> Completed:
-    """The scenario with all outputs and a start; `forces` names those of the constraints."""
+    """Adds the missing outputs and a start; `forces` are the names of all constraint forces."""
     candidates, named = referred.candidates, referred.rows
     posture, is_normal = _posture(referred, postures, named, guess)
     # The completing outputs, in order of preference.
@@ -148,33 +149,32 @@ def _with_outputs(
     rows = [*named, *along]
     room -= len(along)
     axes = [row for row in candidates.axes if row not in rows]
-    held = first_independent(posture, rows, axes, len(axes))
-    held = held if len(held) <= room else []
-    rows += held
+    directions = first_independent(posture, rows, axes, len(axes))
+    directions = directions if len(directions) <= room else []
+    rows += directions
     wanted = [referred.wanted(time)[: len(named)] for time in referred.times()]
     free = [row for row in candidates.joints if row not in rows]
-    joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
+    joints = best_joints(postures, posture, rows, free, room - len(directions), np.array(wanted))
     if joints is None:
         why = why_none(posture, rows, free, referred.missing, referred.given, forces)
         if why is not None:
             raise ScenarioError(why)
         names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
-        raise ScenarioError(
-            (
-                "outputs",
-                f"{referred.missing} are missing, and no positions of joints beside {names} leave "
-                "B(x) regular; name others under outputs",
-            )
+        text = (
+            f"{referred.missing} are missing, and no positions of joints beside {names} leave "
+            "B(x) regular; name others under outputs"
         )
-    chosen, resting = [*named[referred.given :], *along, *held, *joints], [*along, *held, *joints]
+        raise ScenarioError(("outputs", text))
+    resting = [*along, *directions, *joints]
+    chosen = [*named[referred.given :], *resting]
     values = _rounded(posture.rows)
     if is_normal:
         values[candidates.tilts] = 0.0
-    held_values = {candidates.signals[row].name: float(values[row]) for row in resting}
+    constants = {candidates.signals[row].name: float(values[row]) for row in resting}
     completed = replace(
         scenario,
         outputs=[*scenario.outputs, *merged(candidates.form(row) for row in chosen)],
-        references={**scenario.references, **held_values},
+        references={**scenario.references, **constants},
     )
     names = ", ".join(candidates.signals[row].name for row in chosen)
     reason = " (joints so that B(x) is best conditioned)" if joints else ""
@@ -183,7 +183,7 @@ def _with_outputs(
 
 
 def _movable(postures: Postures) -> list[int]:
-    """The rows that can change: a planar arm has constant ones."""
+    """The rows that vary with q; those of a planar arm may be constant."""
     some = [postures.at(q).gradients for q in postures.guesses(4)]
     return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
 
@@ -194,7 +194,7 @@ def _posture(
     rows: Sequence[int],
     guess: FloatArray,
 ) -> tuple[Posture, bool]:
-    """The start, and whether the tools are normal to their surfaces there."""
+    """The posture at the start, and whether the tools are normal to their surfaces there."""
     candidates, wanted = referred.candidates, referred.at_start(rows)
     both = [*rows, *candidates.tilts]
     goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
@@ -204,35 +204,35 @@ def _posture(
             if near is not None and near.independence(rows) > REGULAR:
                 return near, len(chosen) > len(rows)
     if candidates.tilts:
-        found = best_posture(postures, both, goal, [guess, *_guesses(referred, postures, guess)])
-        if found is not None:
-            return found, True
-    return _found(referred, postures, rows, wanted, guess), False
+        posture = best_posture(postures, both, goal, [guess, *_guesses(referred, postures, guess)])
+        if posture is not None:
+            return posture, True
+    return _search(referred, postures, rows, wanted, guess), False
 
 
 def _guesses(referred: ReferredRows, postures: Postures, guess: FloatArray) -> FloatArray:
-    """Configurations to try: random for joints without start.positions, shape (TRIES, nq)."""
+    """Random guesses of the joints without start.positions, shape (TRIES, nq)."""
     names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
     given = [name in referred.scenario.start.positions for name in names]
     return np.where(given, guess, postures.guesses(TRIES))
 
 
-def _found(
+def _search(
     referred: ReferredRows,
     postures: Postures,
     rows: Sequence[int],
     wanted: FloatArray,
     guess: FloatArray,
 ) -> Posture:
-    """The best posture with wanted values of rows.
+    """The best posture with these values of outputs.
 
     Raises:
-        ScenarioError: There is none; the message has the remaining errors of the nearest.
+        ScenarioError: There is none; the message has the remaining errors of the nearest one.
     """
     guesses = [guess, *_guesses(referred, postures, guess)]
-    found = best_posture(postures, rows, wanted, guesses)
-    if found is not None:
-        return found
+    best = best_posture(postures, rows, wanted, guesses)
+    if best is not None:
+        return best
     nearest = nearest_posture(postures, rows, wanted, guesses)
     polished = near_posture(postures, rows, wanted, nearest.q)
     if polished is not None:
@@ -247,14 +247,12 @@ def _found(
     residual = float(np.max(np.abs(nearest.left), initial=0.0))
     if residual > 1e-6:
         missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
-    raise ScenarioError(
-        (
-            "references" if len(rows) else "constraints",
-            "the robot cannot start there within its joint limits; the nearest start found has: "
-            f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
-            "references, start.errors or the surface's place, or give start.positions",
-        )
+    text = (
+        "the robot cannot start there within its joint limits; the nearest start found has: "
+        f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
+        "references, start.errors or the surface's place, or give start.positions"
     )
+    raise ScenarioError(("references" if len(rows) else "constraints", text))
 
 
 def _started(scenario: Scenario, referred: ReferredRows, posture: Posture) -> Scenario:
@@ -279,12 +277,10 @@ def _start_note(referred: ReferredRows, posture: Posture) -> str:
 
 
 def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
-    """Parameter name -> value at the start, where it is not the default."""
+    """Parameter name -> value at the start, for the parameters that differ from their defaults."""
     begin = scenario.integrator.start_time
-    moving = {
-        name: np.concatenate(
-            [np.zeros(0), *(value_at(one, getattr(one, "size", 1), begin) for one in references)]
-        )
-        for name, references in scenario.exogenous.items()
-    }
-    return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}
+    values = {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
+    for name, references in scenario.exogenous.items():
+        entries = [value_at(r, getattr(r, "size", 1), begin) for r in references]
+        values[name] = np.concatenate([np.zeros(0), *entries])
+    return values

@@ -33,12 +33,14 @@ _BELOW = 0.02
 class Posture:
     """A configuration with its properties.
 
+    A row is one scalar function of q that may be an output.
+
     Attributes:
         q: The configuration, shape (nq,).
-        rows: The values of all rows that may be outputs, shape (c,).
+        rows: The values of all rows, shape (c,).
         left: The residual of the constraints, shape (k,).
         slopes: The gradients of the rows with respect to q, shape (c, nq).
-        constraint_slopes: Those of the constraints, shape (k, nq).
+        constraint_slopes: The gradients of the constraints with respect to q, shape (k, nq).
         gradients: The rates of the rows per unit of v, shape (c, nv).
         constraints: The rates of the constraints per unit of v, shape (m, nv).
         forces: S of the force outputs, shape (s, m).
@@ -64,12 +66,11 @@ class Posture:
     leans: FloatArray
 
     def independence(self, rows: Sequence[int]) -> float:
-        """The independence of some rows and the force outputs under the controls.
+        """How independently the controls act on some rows and the force outputs, from 0 to 1.
 
-        It is the smallest singular value of B(x) of (16) with M^(1/2) v and M^(-1/2) B_u in the
-        place of v and u, whose unit is that of kinetic energy: each row is normalized to its length
-        without constraints, so that units and lever lengths do not matter. It is 1 for fully
-        independent rows, and 0 if the robot is singular.
+        It is the smallest singular value of B(x) of (16), in coordinates M^(1/2) v and M^(-1/2) B_u
+        in place of v and B_u. Each row is divided by its length without constraints, so that units
+        and lever lengths do not matter. It is 1 for fully independent rows, and 0 if B is singular.
         """
         lower = np.linalg.cholesky(self.mass)
 
@@ -87,10 +88,10 @@ class Posture:
 
 
 def _value_of(parameter: Parameter, values: Mapping[str, FloatArray]) -> FloatArray:
-    """The value of a parameter, where one number may stand for all.
+    """The value of a parameter; a single number is the value of all its entries.
 
     Raises:
-        ModelError: There are more or fewer.
+        ModelError: The size is wrong.
     """
     value, size = values.get(parameter.name, parameter.value), parameter.value.size
     if value.size not in (1, size):
@@ -99,7 +100,7 @@ def _value_of(parameter: Parameter, values: Mapping[str, FloatArray]) -> FloatAr
 
 
 def _one_long(rows: FloatArray, scaled: FloatArray) -> FloatArray:
-    """Rows divided by given lengths; zero where these are zero."""
+    """Divides `scaled` by the lengths of `rows`, row by row; 0 where a length is 0."""
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return scaled / np.where(length > 1e-9, length, np.inf)
 
@@ -114,7 +115,7 @@ class Postures:
         forces: S of the force outputs, shape (s, m).
         touches: The contacts with a free side, with the outward axis of the tool in the world,
             shape (3, 1).
-        values: Parameter name -> value, where that is not the default.
+        values: Parameter name -> value, for the parameters that differ from their defaults.
 
     Attributes:
         low, high: The limits of q, shape (nq,) each.
@@ -165,9 +166,9 @@ class Postures:
         self.size = float(np.max(np.ptp(points, axis=1))) or 1.0
 
     def _values(self, q: FloatArray) -> dict[str, FloatArray]:
-        found = self._function(q, self._parameters)
+        results = self._function(q, self._parameters)
         nq = q.size
-        values = dict(zip(self._function.output_names, found, strict=True))
+        values = dict(zip(self._function.output_names, results, strict=True))
         # A matrix of one row or column comes as a vector.
         for name in ("slopes", "constraint_slopes", "gradients", "constraints", "mass"):
             values[name] = values[name].reshape(-1, nq)
@@ -182,39 +183,39 @@ class Postures:
         return Posture(q=q, **values)
 
     def solve(self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray) -> FloatArray:
-        """The configuration on the constraints with wanted values of some rows, near a guess.
+        """Solves for a configuration on the constraints in which some rows have given values.
 
         Args:
             rows: The rows.
             wanted: Their values.
-            guess: Where Newton's method starts, shape (nq,).
+            guess: The initial guess of Newton's method, shape (nq,).
 
         Returns:
-            q, shape (nq,); check it with `left`.
+            q, shape (nq,). It may not be a solution: check it with `left`.
         """
         chosen = list(rows)
 
         def residual(q: FloatArray) -> FloatArray:
-            found = self._values(q)
-            return np.concatenate([found["left"], found["rows"][chosen] - wanted])
+            values = self._values(q)
+            return np.concatenate([values["left"], values["rows"][chosen] - wanted])
 
         def linearize(q: FloatArray) -> NewtonModel | None:
-            found = self._values(q)
-            gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
+            values = self._values(q)
+            gradients = np.vstack([values["constraint_slopes"], values["slopes"][chosen]])
             return shortest_steps(gradients, residual)
 
         q = newton(guess, linearize, _NEWTON_STEPS)[0]
         turned = self._turned_back(q)
-        # If a row is the position of a joint, whole turns matter.
+        # If a row is the position of a joint, whole turns are no other solution.
         return turned if np.max(np.abs(residual(turned)), initial=0.0) < EXACT else q
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
-        """The residual of the constraints and of wanted values of rows, shape (k + len(rows),)."""
-        found = self._values(q)
-        return np.concatenate([found["left"], found["rows"][list(rows)] - wanted])
+        """The residual of the equations of `solve`, shape (k + len(rows),)."""
+        values = self._values(q)
+        return np.concatenate([values["left"], values["rows"][list(rows)] - wanted])
 
     def _turned_back(self, q: FloatArray) -> FloatArray:
-        """The same configuration with as few whole turns as possible, within limits."""
+        """Removes whole turns from a configuration, as far as the limits permit."""
         turned = q - 2 * np.pi * np.round(q / (2 * np.pi)) * self._turns
         for shift in (-2 * np.pi, 2 * np.pi):
             moved = turned + shift * self._turns
@@ -239,9 +240,9 @@ class Postures:
         return float(np.clip(np.min(share, initial=1.0), 0.0, 1.0))
 
     def quality(self, posture: Posture, rows: Sequence[int]) -> float:
-        """The quality of a posture for a task: independence of the rows, reduced near limits.
+        """The quality of a posture for a task: `independence` of the rows times `margin`.
 
-        It is low if a body is behind a surface, or a tool points away from its surface.
+        A body behind a surface, or a tool that points away from its surface, reduces it to a tenth.
         """
         quality = posture.independence(rows) * self.margin(posture.q)
         if np.min(posture.clearances, initial=0.0) < -_BELOW * self.size:
@@ -251,7 +252,7 @@ class Postures:
         return quality
 
     def guesses(self, count: int) -> FloatArray:
-        """Configurations between the limits, shape (count, nq): the same ones each time."""
+        """Random configurations within the limits, shape (count, nq); the same in each call."""
         random = np.random.default_rng(0)
         reach = np.where(self._turns, np.pi, self.size)
         low, high = np.maximum(self.low, -reach), np.minimum(self.high, reach)

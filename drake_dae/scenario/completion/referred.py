@@ -1,4 +1,4 @@
-"""The outputs, given or still to be chosen, of the references of a scenario."""
+"""The outputs to which the references of a scenario refer."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,9 @@ class ReferredRows:
 
     Attributes:
         scenario, candidates: The arguments.
-        given: The number of given rows.
-        missing: How many are missing.
-        rows: The rows with references: given ones, then completing ones that references name.
+        given: The number of rows of the scenario's outputs.
+        missing: The number of missing rows.
+        rows: The rows of the scenario's outputs, then completing rows that references name.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class ReferredRows:
         Args:
             scenario: The scenario.
             candidates: Its rows.
-            given: The number of given rows.
-            missing: How many are missing.
+            given: The number of rows of the scenario's outputs.
+            missing: The number of missing rows.
             forces: The names of the force outputs.
             along: The rows along the surfaces, near the start.
 
@@ -64,14 +64,14 @@ class ReferredRows:
 
     def _named(self, name: str) -> list[int | None]:
         """The rows of a key of the references; None for a force."""
-        key, found = f"references.{name}", list[int | None]()
+        key, rows = f"references.{name}", list[int | None]()
         for part in map(str.strip, name.split(",")):
-            found += self._meant(part, key)
+            rows += self._meant(part, key)
         reference = self.scenario.references[name]
-        if isinstance(reference, Reference) and reference.size != len(found):
-            text = f"{reference.size} values for {len(found)} outputs"
+        if isinstance(reference, Reference) and reference.size != len(rows):
+            text = f"{reference.size} values for {len(rows)} outputs"
             raise ScenarioError((key, text))
-        return found
+        return rows
 
     def _meant(self, name: str, key: str) -> Sequence[int | None]:
         signals = [signal.name for signal in self.candidates.signals]
@@ -84,23 +84,23 @@ class ReferredRows:
                 raise ScenarioError((key, str(error))) from None
         else:
             return [place if place < self.given else None for place in places]
-        # Not yet an output: one of the rows that may complete them.
+        # Not yet an output: one of the rows that may complete the outputs.
         along = [signals[row] for row in self._along]
-        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
-        own = [one for one in along if one.rpartition(".")[0] == name]
+        others = [*along, *(signal for signal in signals[self.given :] if signal not in along)]
+        of_point = [signal for signal in along if signal.rpartition(".")[0] == name]
         try:
-            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
+            chosen = of_point or [others[k] for k in meant(name, others, [2] * len(others))]
         except ReferenceSignalError:
-            text = unknown_name("output", name, [*known, *beside])
+            text = unknown_name("output", name, [*known, *others])
             raise ScenarioError((key, text)) from None
-        return [signals.index(one) for one in chosen]
+        return [signals.index(signal) for signal in chosen]
 
     def wanted(self, time: float) -> FloatArray:
         """The values of the referred rows at a time in s, shape (referred,)."""
         values: dict[int | None, float] = {}
         for name, rows in self._meanings.items():
-            found = value_at(self.scenario.references[name], len(rows), time)
-            values.update(zip(rows, found.tolist(), strict=True))
+            r = value_at(self.scenario.references[name], len(rows), time)
+            values.update(zip(rows, r.tolist(), strict=True))
         return np.array([values[row] for row in self.rows])
 
     def times(self) -> FloatArray:

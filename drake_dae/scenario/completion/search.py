@@ -11,19 +11,19 @@ TRIES = 60
 """The number of guesses; an arm of seven joints has about forty solutions among them."""
 
 PATIENCE = 20
-"""A search ends after this many guesses without a result, since failed ones take long."""
+"""A search ends after this many guesses without a solution, since a failed guess takes long."""
 
 _CLOSEST = 3
 """The number of guesses for the nearest posture of an unreachable target."""
 
-_HARD = 100.0
-"""The weight of constraints relative to outputs if not all can be satisfied."""
+_CONSTRAINT_WEIGHT = 100.0
+"""The weight of constraints relative to outputs if not all equations can be satisfied."""
 
 
 def near_posture(
     postures: Postures, rows: Sequence[int], wanted: FloatArray, guess: FloatArray
 ) -> Posture | None:
-    """The posture near a guess with wanted values of some rows; None if none is within limits."""
+    """The posture near a guess with given values of some rows; None if none is within limits."""
     q = postures.solve(rows, wanted, guess)
     left = postures.left(rows, wanted, q)
     is_found = np.all(np.isfinite(left)) and np.max(np.abs(left), initial=0.0) < EXACT
@@ -33,7 +33,7 @@ def near_posture(
 def best_posture(
     postures: Postures, rows: Sequence[int], wanted: FloatArray, guesses: Sequence[FloatArray]
 ) -> Posture | None:
-    """The best posture with wanted values of some rows that Newton's method finds.
+    """The best posture with given values of some rows that Newton's method finds.
 
     Args:
         postures: The robot.
@@ -42,22 +42,22 @@ def best_posture(
         guesses: The guesses.
 
     Returns:
-        The one with the largest `quality`, the first of equal ones; None if the first `PATIENCE`
-        guesses give none.
+        The posture with the largest `quality`; None if none is found from the first `PATIENCE`
+        guesses.
     """
-    found: list[Posture] = []
+    reached: list[Posture] = []
     for count, guess in enumerate(guesses):
-        if count == PATIENCE and not found:
+        if count == PATIENCE and not reached:
             break
         posture = near_posture(postures, rows, wanted, guess)
-        found += [posture] if posture is not None else []
-    return max(found, key=lambda one: postures.quality(one, rows), default=None)
+        reached += [posture] if posture is not None else []
+    return max(reached, key=lambda posture: postures.quality(posture, rows), default=None)
 
 
 def nearest_posture(
     postures: Postures, rows: Sequence[int], wanted: FloatArray, guesses: Sequence[FloatArray]
 ) -> Posture:
-    """The posture within limits that comes nearest to wanted values, by least squares.
+    """The posture within limits that is nearest to given values of rows, by least squares.
 
     The arguments are those of `best_posture`.
     """
@@ -69,16 +69,16 @@ def nearest_posture(
 
     def residual(q: FloatArray) -> FloatArray:
         left = postures.left(rows, wanted, q)
-        left[: left.size - len(chosen)] *= _HARD
+        left[: left.size - len(chosen)] *= _CONSTRAINT_WEIGHT
         return np.nan_to_num(left, nan=1e6, posinf=1e6, neginf=-1e6)
 
     def gradient(q: FloatArray) -> FloatArray:
         posture = postures.at(q)
-        return np.vstack([_HARD * posture.constraint_slopes, posture.slopes[chosen]])
+        return np.vstack([_CONSTRAINT_WEIGHT * posture.constraint_slopes, posture.slopes[chosen]])
 
     tried = sorted(guesses, key=lambda q: float(np.sum(residual(np.clip(q, low, high)) ** 2)))
-    found = [
+    fits = [
         least_squares(residual, np.clip(q, low, high), gradient, (low, high), max_nfev=50)
         for q in tried[:_CLOSEST]
     ]
-    return postures.at(min(found, key=lambda one: float(one.cost)).x)
+    return postures.at(min(fits, key=lambda fit: float(fit.cost)).x)

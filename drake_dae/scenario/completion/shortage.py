@@ -1,4 +1,4 @@
-"""Reasons why outputs cannot be completed: dependent force outputs, or too few positions."""
+"""The reasons why outputs cannot be completed: dependent force outputs, or too few positions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,14 +14,14 @@ _ZERO = 1e-6
 
 
 def check_independent(names: Sequence[str], posture: Posture) -> None:
-    """Refuses force outputs z_2 = S lambda that depend on each other.
+    """Checks that the force outputs z_2 = S lambda are independent.
 
     Args:
         names: Their names.
         posture: A configuration on the constraints.
 
     Raises:
-        ScenarioError: They do; the message names them.
+        ScenarioError: They depend on each other; the message names them.
     """
     if not len(posture.forces):
         return
@@ -52,18 +52,18 @@ def why_none(
     given: int,
     forces: Sequence[str],
 ) -> tuple[str, str] | None:
-    """The key and text of the problem if outputs must be forces, for lack of positions.
+    """The key and text of the problem if some of the missing outputs must be forces.
 
     Args:
         posture: The start.
-        rows: The rows of positions that are given, named or chosen.
+        rows: The rows of positions that are outputs already.
         joints: The rows of positions of joints.
-        missing: How many outputs are missing.
-        given: How many positions the scenario gives.
+        missing: The number of missing outputs.
+        given: The number of position outputs in the scenario.
         forces: The names of the constraint forces.
 
     Returns:
-        None if there are enough positions.
+        The key and the text; None if there are enough independent positions.
     """
     ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
     lacking = given + missing - ways

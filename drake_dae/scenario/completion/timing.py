@@ -23,7 +23,7 @@ class TimedScenario:
 
     Attributes:
         reference: Its reference, for all outputs.
-        governed: The robot's own limits, within which a governor slows it; None without one.
+        governed: The robot's limits, which a governor keeps during the run; None without governor.
     """
 
     reference: TimeOptimalReference
@@ -31,16 +31,16 @@ class TimedScenario:
 
 
 LATE = 0.5
-"""How much longer a run with a governor lasts than the motion, in s."""
+"""The time in s by which a run with a governor is longer than the motion."""
 
 MOST_CAUSES = 3
-"""The number of limits that a note names."""
+"""The largest number of limits in a note."""
 
 
 def timed(
     scenario: Scenario, model: RobotModel, structure: Structure
 ) -> tuple[Completed, TimedScenario | None]:
-    """A scenario with the duration of its time-optimal motion, and this.
+    """Computes the time-optimal motion of a scenario.
 
     Args:
         scenario: A completed scenario.
@@ -48,13 +48,14 @@ def timed(
         structure: The structure of the model's system.
 
     Returns:
-        The scenario as it is, and None, without the key `time_optimal`.
+        The scenario with the duration of the motion, and the motion. Without the key `time_optimal`
+        the scenario unchanged, and None.
 
     Raises:
         ScenarioError: There is no such motion; the message says why.
     """
-    wanted = scenario.time_optimal
-    if wanted is None:
+    settings = scenario.time_optimal
+    if settings is None:
         return Completed(scenario), None
     if scenario.task is not None:
         raise ScenarioError(("time_optimal", "a task plans its own motion: it has no path to time"))
@@ -62,39 +63,38 @@ def timed(
         outputs = [signal.name for signal in model.dae.output_signals]
         references = references_by_name(scenario.references, outputs, structure.output_degrees)
     begin = scenario.integrator.start_time
-    until = begin + scenario.duration if wanted.until is None else wanted.until
+    until = begin + scenario.duration if settings.until is None else settings.until
     with at("time_optimal"):
-        contacts: dict[str, Any] = {"forces": wanted.forces, "cones": wanted.cones}
+        contacts: dict[str, Any] = {"forces": settings.forces, "cones": settings.cones}
         limits = robot_motion_limits(
             model,
-            efforts=wanted.efforts,
-            joint_speeds=wanted.joint_speeds,
-            joint_accelerations=wanted.joint_accelerations,
+            efforts=settings.efforts,
+            joint_speeds=settings.joint_speeds,
+            joint_accelerations=settings.joint_accelerations,
             **contacts,
         )
         profile = PathTiming(structure, limits).profile(
             references,
             until,
             begin=begin,
-            largest_rate=wanted.largest_rate,
-            points=wanted.points,
+            largest_rate=settings.largest_rate,
+            points=settings.points,
         )
     reference = TimeOptimalReference(profile)
     why_not = _why_not_governed(scenario, reference)
-    if wanted.governor and why_not:
+    if settings.governor and why_not:
         raise ScenarioError(("time_optimal.governor", why_not))
-    is_governed = not why_not and wanted.governor is not False
-    if wanted.until is None:
-        own = replace(wanted, until=until)
+    is_governed = not why_not and settings.governor is not False
+    if settings.until is None:
         duration = profile.duration + (LATE if is_governed else 0.0)
-        scenario = replace(scenario, time_optimal=own, duration=duration)
+        scenario = replace(scenario, time_optimal=replace(settings, until=until), duration=duration)
     causes = [f"{name} {share:.0%}" for name, share in profile.shares.items() if share >= 0.005]
     note = (
         f"time-optimal: {profile.duration:.4g} s for the references up to {until:.4g} s; limited "
         f"by {', '.join(causes[:MOST_CAUSES])}" + (", ..." if len(causes) > MOST_CAUSES else "")
     )
     notes = [note]
-    if why_not and wanted.governor is None:
+    if why_not and settings.governor is None:
         notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
     governed = robot_motion_limits(model, **contacts) if is_governed else None
     return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)

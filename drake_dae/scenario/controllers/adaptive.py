@@ -12,10 +12,10 @@ from drake_dae.systems.adaptive.law import AdaptiveLaw
 
 
 def check_adaptive(scenario: Scenario) -> None:
-    """Refuses keys that an adaptive law has no use for.
+    """Checks that a scenario with an adaptive law has no keys that this law does not use.
 
     Raises:
-        ScenarioError: There is such a key.
+        ScenarioError: There are such keys.
     """
     law, force = scenario.law, scenario.force_feedback
     if not isinstance(law, Adaptive):
@@ -42,6 +42,6 @@ def check_adaptive(scenario: Scenario) -> None:
 def adaptive_controller(
     law: Adaptive, model: RobotModel, structure: Structure, period: float
 ) -> AdaptiveController:
-    """The controller of an adaptive law, whose estimates have the period of samples in s."""
-    given = law.parameters, law.rate, law.damping, law.force_rate
-    return AdaptiveController(AdaptiveLaw(model, *given, structure), period)
+    """The controller of an adaptive law, with the period of its samples in s."""
+    settings = law.parameters, law.rate, law.damping, law.force_rate
+    return AdaptiveController(AdaptiveLaw(model, *settings, structure), period)

@@ -11,31 +11,25 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.controller import TaskController
 from drake_dae.systems.task.open_contact import open_contact
 
-_SETTINGS = {
-    "exogenous": "exogenous",
-    "tolerances": "tolerances",
-}
-"""Key of a scenario -> the setting of the loop."""
-
 
 def check_task(scenario: Scenario) -> None:
-    """Refuses keys that a task does not support.
+    """Checks that the keys of a scenario fit its task.
 
     Raises:
         ScenarioError: A key does not fit a task, or start.positions are missing.
     """
     refused = {"references": "a task has the references of its phases; leave them out"}
-    refused |= {key: TaskController.refused[name] for key, name in _SETTINGS.items()}
-    found = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
+    refused |= {key: TaskController.refused[key] for key in ("exogenous", "tolerances")}
+    problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
-        names = [name for name in task.made().signals if name not in task.signals]
-        found += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
+        names = [name for name in task.make().signals if name not in task.signals]
+        problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
     if scenario.start.errors:
-        found.append(("start.errors", "a task begins at start.positions; leave them out"))
+        problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if not scenario.start.positions:
-        found.append(("start.positions", "needed: where the task begins, joint by joint"))
-    if found:
-        raise ScenarioError(*found)
+        problems.append(("start.positions", "needed: where the task begins, joint by joint"))
+    if problems:
+        raise ScenarioError(*problems)
 
 
 def task_controller(
@@ -68,13 +62,13 @@ def task_controller(
     with at("task.gains" if task.gains else "gains"):
         free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
     with at("task"):
-        return TaskController(task.made(noise), law, free_law, sample_period=period)
+        return TaskController(task.make(noise), law, free_law, sample_period=period)
 
 
 def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
     """The constraint that opens and closes."""
     assert scenario.task is not None
-    fitting = {one.name: one for one in model.constraints if one.is_unilateral == (True,)}
+    fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
     name = scenario.task.contact
     with at("task.contact"):
         if name:

@@ -39,7 +39,7 @@ MOST_SAMPLES = 20_000
 """The largest number of examined times along a reference that varies fast."""
 
 _STRAIGHT = 0.01
-"""The allowed deviation of a reference from a straight line between two times, relative to its
+"""The allowed deviation of a reference from linear interpolation between two times, relative to its
 range."""
 
 _SHORTEST = 1e-6
@@ -50,9 +50,9 @@ _SLACK = 1e-9
 
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
-    """Analyzes the robot of a scenario, and the requirements of its reference.
+    """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
 
-    The figures are those of the law's model without errors: the minimum requirements.
+    All numbers are those of the law's model without errors: the minimum requirements.
 
     Args:
         scenario: What `load_scenario` returns.
@@ -73,18 +73,22 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
     laws = None
-    if scenario.actuation and scenario.actuation[0].is_spring:
-        whole, own = model, scenario
-        if scenario.is_cascade:
-            # What the links need, as if they were rigid.
-            model, structure = law_robot(scenario, model, structure)
-            rigid = replace(scenario, law=Tracking(), gains=Poles(all=[-4.0]), integral=[])
-            scenario = replace(rigid, plant_parameters={})  # Their names may be those of springs.
-            laws = spring_laws(own, whole, model, structure)
-        elif scenario.sampling is not None:
-            links = link_side(model)
-            laws = spring_laws(own, whole, links, find_structure(links.dae))
-    # The law's model alone, without differences of the plant.
+    if scenario.is_cascade:
+        # The requirements of the links, as if they were rigid.
+        links, structure = law_robot(scenario, model, structure)
+        laws = spring_laws(scenario, model, links, structure)
+        model = links
+        scenario = replace(
+            scenario,
+            law=Tracking(),
+            gains=Poles(all=[-4.0]),
+            integral=[],
+            plant_parameters={},  # Their names may be those of springs.
+        )
+    elif scenario.actuation and scenario.actuation[0].is_spring and scenario.sampling is not None:
+        links = link_side(model)
+        laws = spring_laws(scenario, model, links, find_structure(links.dae))
+    # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
         plant=IdealConstraints(),
@@ -129,17 +133,17 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 def sample_times(
     reference: Callable[[float], FloatArray], begin: float, end: float
 ) -> tuple[FloatArray, bool]:
-    """Times between which a reference is nearly straight.
+    """Sample times between which a reference is nearly linear.
 
-    Equidistant times alone would miss a sinusoid whose period fits between them. Each interval is
-    tested at a random time, until a whole round finds nothing new.
+    Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
+    a random time and divided if the reference is not linear there, until no interval is divided.
 
     Args:
         reference: The function t -> R(t).
         begin, end: The first and the last time, in s.
 
     Returns:
-        Between SAMPLES and MOST_SAMPLES increasing times in s, and whether these are enough.
+        From SAMPLES to MOST_SAMPLES increasing times in s, and whether these suffice.
     """
     random = np.random.default_rng(0)
     times = np.linspace(begin, end, SAMPLES)
@@ -147,19 +151,20 @@ def sample_times(
     while True:
         share = random.uniform(0.3, 0.7, times.size - 1)
         tried = times[:-1] + share * np.diff(times)
-        found = np.array([reference(time) for time in tried])
-        known = np.concatenate([values, found])
+        new_values = np.array([reference(time) for time in tried])
+        all_values = np.concatenate([values, new_values])
         # A constant varies by round-off.
-        allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
-        off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
-        is_long = np.diff(times) > _SHORTEST * (end - begin)  # The second derivative may jump.
+        allowed = _STRAIGHT * np.ptp(all_values, axis=0) + 1e-9 * np.abs(all_values).max(axis=0)
+        off = np.abs(new_values - values[:-1] - share[:, None] * np.diff(values, axis=0))
+        # At a jump of the derivative no division suffices.
+        is_long = np.diff(times) > _SHORTEST * (end - begin)
         new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
         room = MOST_SAMPLES - times.size
         is_resolved = new.size <= room
         if not is_resolved:
             new = np.sort(random.choice(new, room, replace=False))
         times = np.insert(times, new + 1, tried[new])
-        values = np.insert(values, new + 1, found[new], axis=0)
+        values = np.insert(values, new + 1, new_values[new], axis=0)
         if not (new.size and is_resolved):
             return times, is_resolved
 
@@ -173,36 +178,29 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
     def ranges(
         signals: Sequence[Signal], values: FloatArray, low: FloatArray, high: FloatArray
     ) -> tuple[SignalRange, ...]:
-        columns = zip(signals, values.T, low, high, strict=True)
+        columns = zip(signals, values.T, low, high, strict=False)
         return tuple(_range(s, motion.times, v, float(a), float(b)) for s, v, a, b in columns)
 
     highest, reactions = model.control_limits, dae.force_signals
     least = np.array([-np.inf if limits.can_pull(signal) else 0.0 for signal in reactions])
-    found = {
+    unlimited = np.full(least.size, np.inf)
+    ranges_of = {
         "controls": ranges(dae.control_signals, motion.controls, -highest, highest),
-        "constraint_forces": ranges(
-            reactions, _forces(dae, motion), least, np.full(least.size, np.inf)
-        ),
+        "constraint_forces": ranges(reactions, _forces(dae, motion), least, unlimited),
     }
     if model.joint_force is not None:
         effort = model.links.effort_limits
         forces = _along(model, model.joint_force, motion.states)
-        found["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
+        ranges_of["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
+    joints: tuple[SignalRange, ...] = ()
     if limits.state is not None:
-        low, high = limits.state
-        bounded = np.isfinite(low) | np.isfinite(high)
-        chosen = [s for s, yes in zip(dae.state_signals, bounded, strict=False) if yes]
-        values = motion.states[:, : low.size][:, bounded]
-        found["joints"] = ranges(chosen, values, low[bounded], high[bounded])
+        joints += ranges(dae.state_signals, motion.states, *limits.state)
     if limits.loops is not None:
-        low, high = limits.loops
-        bounded = np.isfinite(low) | np.isfinite(high)
         loops = model.loop_joints
-        chosen = [s for s, yes in zip(loops.signals, bounded, strict=True) if yes]
-        values = _along(model, loops.state, motion.states)[:, bounded]
-        own = ranges(chosen, values, low[bounded], high[bounded])
-        found["joints"] = (*found.get("joints", ()), *own)
-    return found
+        states = _along(model, loops.state, motion.states)
+        joints += ranges(loops.signals, states, *limits.loops)
+    ranges_of["joints"] = tuple(r for r in joints if np.isfinite(r.low) or np.isfinite(r.high))
+    return ranges_of
 
 
 def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:

@@ -19,7 +19,7 @@ WRONG_SIDE = (
 """The remedy for a link behind a surface."""
 
 IN_EACH_OTHER = ": begin in another configuration, by start.positions, or choose another path"
-"""What to do about links that collide."""
+"""The remedy for links that collide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class SignalRange:
 class Feasibility:
     """The analysis of a scenario's robot, and the requirements of its reference.
 
-    The figures are those of the law's model without errors: the least that the scenario asks for.
+    All numbers are those of the law's model without errors: the minimum requirements.
 
     Attributes:
         analysis: The result of `analyze`, around the start and along the reference.
@@ -81,7 +81,7 @@ class Feasibility:
             known.
         behind: Links that move behind a contact surface, and links that collide; see `links_behind`
             and `collisions`.
-        laws: What two laws for springs ask for; None without springs or samples.
+        laws: The requirements of two laws for springs; None without springs or samples.
     """
 
     analysis: Analysis
@@ -98,8 +98,8 @@ class Feasibility:
     def wrong_sides(self) -> tuple[str, ...]:
         """The problems with links behind a surface, or in each other."""
         return tuple(
-            f"{one}{IN_EACH_OTHER if isinstance(one, Collision) else WRONG_SIDE}"
-            for one in self.behind
+            f"{link}{IN_EACH_OTHER if isinstance(link, Collision) else WRONG_SIDE}"
+            for link in self.behind
         )
 
     @property
@@ -114,8 +114,8 @@ class Feasibility:
         )
 
     def __repr__(self) -> str:
-        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
-        return f"Feasibility('{self.analysis.system.name}': {found})"
+        text = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Feasibility('{self.analysis.system.name}': {text})"
 
     def __str__(self) -> str:
         return to_text(self._parts())
@@ -134,7 +134,7 @@ class Feasibility:
                 key: [r.to_dict() for r in getattr(self, key)]
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
-            "behind": [asdict(one) for one in self.behind],
+            "behind": [asdict(link) for link in self.behind],
             "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "problems": list(self.problems),
         }

@@ -1,4 +1,4 @@
-"""Which law for springs in the joints the noise and the sample time can bear."""
+"""The laws for springs in the joints that are possible with given noise and sample time."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,16 +17,16 @@ from drake_dae.systems.cascade.torque_loop import stages_of
 ROUGH = 0.05
 """The allowed change of a control from sample to sample by noise, in effort limits."""
 
-_USUAL = 30.0
-"""The slowest poles of a tracking law behind springs that is of use, in 1/s."""
+_SLOWEST_POLES = 30.0
+"""The slowest poles of a tracking law behind springs that is useful, in 1/s."""
 
-_FIRM = 2.0
-"""The factor by which springs may be stiffer or softer than believed, for a loop that is borne."""
+_STIFFNESS_MARGIN = 2.0
+"""The factor by which springs may be stiffer or softer than in the model of an acceptable loop."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpringLaws:
-    """What two laws for springs in the joints ask for.
+    """The requirements of two laws for springs in the joints.
 
     Attributes:
         noise: The standard deviation of velocities, rad/s.
@@ -58,16 +58,13 @@ class SpringLaws:
     def bears_cascade(self) -> bool:
         """Whether the cascade is stable with a margin, and not too rough."""
         low, high = self.scales or (np.inf, 0.0)
-        return low <= 1.0 / _FIRM and high >= _FIRM and self.cascade_rough <= ROUGH
+        is_robust = low <= 1.0 / _STIFFNESS_MARGIN and high >= _STIFFNESS_MARGIN
+        return is_robust and self.cascade_rough <= ROUGH
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain numbers and lists."""
+        """The requirements as plain numbers and lists."""
         return {
-            **{
-                name: getattr(self, name)
-                for name in ("noise", "late", "swing", "pole", "rough", "cascade_rough")
-            },
-            "loop": asdict(self.loop),
+            **asdict(self),
             "scales": None if self.scales is None else list(self.scales),
             "bears_tracking": self.bears_tracking,
             "bears_cascade": self.bears_cascade,
@@ -75,7 +72,7 @@ class SpringLaws:
 
     @property
     def lines(self) -> list[str]:
-        """The same in words."""
+        """The requirements in words."""
         scales = "unstable for these springs"
         if self.scales is not None:
             low, high = self.scales
@@ -97,20 +94,21 @@ class SpringLaws:
             f"!SpringCascade a loop of {self.loop.rate:.3g} rad/s, {scales}; controls change by "
             f"{100 * self.cascade_rough:.2g} %",
             f"Noise and sample time bear {verdict} (allowed: {100 * ROUGH:g} %, and a factor of "
-            f"{_FIRM:g} of the springs)",
+            f"{_STIFFNESS_MARGIN:g} of the springs)",
         ]
 
 
 def spring_laws(
     scenario: Scenario, model: RobotModel, links: RobotModel, structure: Structure
 ) -> SpringLaws | None:
-    """What the laws ask for, for a scenario with springs and samples; None for any other.
+    """The requirements of the laws for a scenario with springs and sampling; None for any other.
 
-    About the start, with M of the links, K and B, a joint has W^2 = K (1 / M + 1 / B). Four equal
-    poles at -p of the tracking law are stable if 20 p > W^2 t, see `FlexibleJoints`; its gains of
-    velocities are B K^-1 M 4 p^3 of the links and 4 p B of the springs' rates, with p = 30 1/s or
-    more. The cascade has those of the shafts, 2 zeta w B, and of the rigid law and its observer as
-    recommended, M (2 p + k_o), times B K^-1 w^2 (1 + 4 zeta).
+    Near the start, with the mass M of the links, the stiffness K and the inertia B of the shafts, a
+    joint oscillates at W^2 = K (1 / M + 1 / B). Four equal poles of the tracking law at -p are
+    stable if 20 p > W^2 t, see `FlexibleJoints`. Its velocity gains are B K^-1 M 4 p^3 for links
+    and 4 p B for spring rates, with p = 30 1/s or more. The velocity gains of the cascade are
+    2 zeta w B for shafts and, for links, those of the recommended rigid law and observer, M (2 p +
+    k_o), times B K^-1 w^2 (1 + 4 zeta).
 
     Args:
         scenario: The scenario.
@@ -125,15 +123,14 @@ def spring_laws(
     p = model.dae.num_controls
     numbers = model.dae.trace("springs", {"K": spring.stiffness, "B": spring.inertia}, often=False)
     dae, values = model.dae, model.dae.parameter_values
-    K, B = (np.array(each).reshape(p, p) for each in numbers(dae.nominal_state, values))
+    K, B = (np.array(entries).reshape(p, p) for entries in numbers(dae.nominal_state, values))
     mass, mobilities = _mobilities(links, structure)
     noise = velocity_noise(scenario, sampling.period)
     late = sampling.delay + sampling.period / 2.0
     swing = float(np.sqrt(np.max(np.linalg.eigvals((np.linalg.inv(B) + mobilities[0]) @ K).real)))
     pole = swing**2 * late / 20.0
-    used = max(pole, _USUAL)
-    loop = None if scenario.law is None else scenario.law.loop()
-    loop = loop or spring_loop(sampling.period, sampling.late_samples)
+    used = max(pole, _SLOWEST_POLES)
+    loop = scenario.spring_loop or spring_loop(sampling.period, sampling.late_samples)
     w, zeta = loop.rate, loop.damping
     shaped = B @ np.linalg.inv(K)
     limits = np.where(np.isfinite(links.control_limits), links.control_limits, np.inf)

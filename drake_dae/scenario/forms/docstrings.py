@@ -1,4 +1,4 @@
-"""Texts of classes and attributes from their docstrings, for users of scenarios."""
+"""Texts on classes and attributes from their docstrings, for users of scenarios."""
 
 import inspect
 import re

@@ -1,7 +1,7 @@
 """Dataclasses as forms of plain data, checked by pydantic with all problems at once.
 
-A dataclass is its own form: its fields, defaults and checks apply to the data. A type that is not
-plain data is `written` as another one; a member of a family is chosen by a tag.
+A dataclass is its own form: its fields, defaults and checks apply to the data. A field whose type
+is not plain data is `written` as another type. A tag chooses among the classes of a family.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -19,20 +19,20 @@ from drake_dae.scenario.forms.typed_yaml import TAG
 T = TypeVar("T")
 
 PLAIN = {str: "text", float: "a number"}
-"""The name of plain values among choices by tag."""
+"""The names of plain values in a choice by tag."""
 
 
 MOST_KNOWN = 1000
-"""So many parts are kept while scenarios are read that have parts in common."""
+"""The largest number of parts in the cache of a `ReadingContext`."""
 
 
 class ReadingContext(NamedTuple):
-    """What reading depends on besides the data.
+    """The context in which data are read.
 
     Attributes:
         folder: The folder of relative file names; None for the working directory.
-        known: What parts of data have been read into, for scenarios that have most of them in
-            common; None to read all anew.
+        known: The cache of parts that were read already, for many scenarios that have most parts in
+            common; None for no cache.
     """
 
     folder: Path | None = None
@@ -44,12 +44,12 @@ class Form:
     """Annotates a dataclass, or a Drake class with `__fields__`: data have the keys of its fields.
 
     Attributes:
-        written: Annotation of a field -> the type that stands for it in data.
-        defaults: Name of a field -> value where data leave it out, if not that of the class.
+        written: Annotation of a field -> the type of its data.
+        defaults: Name of a field -> its default in data, if it differs from that of the class.
         tag: The tag that chooses the class, "!Sphere"; empty if there is no choice.
-        needs_tag: Whether data without a tag mean another class.
+        needs_tag: Whether the tag is required: without it another class is chosen.
         texts: Name of a field -> its text, if the docstring of the class has none.
-        is_part: Whether it is a part of another one, so that it may be known from before.
+        is_part: Whether it is a part of another form, so that it can be in the cache.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
@@ -104,18 +104,18 @@ class Form:
         if not self.is_part:
             return made
 
-        def known(given: Any, read: Callable[[Any], Any], info: Any) -> Any:
-            parts = info.context.known if info.context is not None else None
-            if parts is None:
-                return read(given)
-            key = id(self), source, repr(given)
-            if key not in parts:
-                if len(parts) >= MOST_KNOWN:
-                    parts.clear()
-                parts[key] = read(given)
-            return parts[key]
+        def read_once(part: Any, read: Callable[[Any], Any], info: Any) -> Any:
+            cache = info.context.known if info.context is not None else None
+            if cache is None:
+                return read(part)
+            key = id(self), source, repr(part)
+            if key not in cache:
+                if len(cache) >= MOST_KNOWN:
+                    cache.clear()
+                cache[key] = read(part)
+            return cache[key]
 
-        return core_schema.with_info_wrap_validator_function(known, made)
+        return core_schema.with_info_wrap_validator_function(read_once, made)
 
     def _fields(self, source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
         for name, hint, default in _fields_of(source):
@@ -151,7 +151,7 @@ class _Explained:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a default is plain data; an object has defaults of its own."""
+    """Whether a default is plain data, and not an object."""
     if isinstance(value, (list, tuple)):
         return all(map(_is_plain, value))
     return value is None or value == {} or isinstance(value, (bool, int, float, str))
@@ -179,8 +179,9 @@ def _members(hint: Any) -> set[Any]:
 class Choice:
     """Annotates a Union of dataclasses: a tag chooses one, by default the first.
 
-    The tag is the name of the class. A member that is annotated with a `Form` has its tag and its
-    defaults. Members `str` and `float` are plain text and a number.
+    The tag is "!" and the name of the class, without a "Form" at its end. A member annotated with a
+    `Form` has the tag and the defaults of that `Form`. Members `str` and `float` are plain text and
+    a number.
 
     Attributes:
         written: The types that stand for others in data, as in `Form`, for all members.
@@ -194,9 +195,9 @@ class Choice:
         forms: dict[type[Any], Form] = {}
         members = get_args(source)
         for member in (member for member in members if member not in PLAIN):
-            cls, own = get_args(member) or (member, Form())
-            tag = own.tag or f"!{cls.__name__}"
-            forms[cls] = replace(own, written=self.written, tag=tag, needs_tag=bool(forms))
+            cls, form = get_args(member) or (member, Form())
+            tag = form.tag or f"!{cls.__name__.removesuffix('Form')}"
+            forms[cls] = replace(form, written=self.written, tag=tag, needs_tag=bool(forms))
         first = next(iter(forms.values())).tag
 
         def chosen(value: Any) -> str | None:

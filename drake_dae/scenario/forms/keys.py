@@ -13,7 +13,7 @@ S = TypeVar("S")
 
 @contextmanager
 def at(key: str) -> Iterator[None]:
-    """Adds the key of the scenario to errors in the block."""
+    """Converts errors in the block to a ScenarioError with the key of the scenario."""
     try:
         yield
     except ScenarioError:
@@ -23,7 +23,7 @@ def at(key: str) -> Iterator[None]:
 
 
 def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
-    """The results for each item; errors get the key and the item's index."""
+    """Applies a function to each item; errors get the key with the index of the item."""
     results = []
     for index, item in enumerate(items):
         with at(f"{key}.{index}"):
@@ -57,11 +57,11 @@ _REMEDIES = {
         "configuration"
     ),
 }
-"""The remedies of violations that differ from those in Python."""
+"""The remedies for violations, where a scenario's differ from those in Python."""
 
 
 def violated(error: AssumptionError) -> ScenarioError:
-    """The error of a scenario whose robot violates an assumption of the theory."""
+    """The exception to raise for a scenario whose robot violates an assumption of the theory."""
     key, text = "constraints" if error.assumption <= 3 else "outputs", str(error)
     if isinstance(error.violation, Violation):
         cause = error.violation.cause

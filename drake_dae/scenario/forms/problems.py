@@ -13,7 +13,7 @@ from drake_dae.scenario.forms.values import shown
 
 
 def problem(schema: Mapping[str, Any], details: ErrorDetails, data: Any) -> tuple[str, str]:
-    """The dotted key and the text of a problem that pydantic finds."""
+    """The dotted key and the text of a problem that pydantic reports."""
     kind, loc, value = details["type"], details["loc"], details["input"]
     if TAG in loc:
         place = _place(loc[: loc.index(TAG)], schema, data)
@@ -32,7 +32,7 @@ def problem(schema: Mapping[str, Any], details: ErrorDetails, data: Any) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class _DataPlace:
-    """A place in data: its dotted key, its schema, and the tag that chose it, with all tags."""
+    """A value in data: its dotted key, its schema, its tag, and all possible tags."""
 
     key: str
     schema: Mapping[str, Any]
@@ -42,11 +42,11 @@ class _DataPlace:
 
 
 _PARTS = {"oneOf", "items", "properties", "additionalProperties"}
-"""The schema entries of data with parts."""
+"""The entries of a schema that describe parts."""
 
 
 def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _DataPlace:
-    """The place of pydantic's location, in which a chosen tag is a part."""
+    """The place of a location of pydantic's, which contains the chosen tags."""
     keys: list[str] = []
     tag = tags = ""
     for part in loc:
@@ -65,7 +65,7 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _D
 
 
 def with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The schema of an optional value with parts; otherwise the schema itself."""
+    """The inner schema of an optional value with parts; any other schema unchanged."""
     inside = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
     return inside[0] if len(inside) == 1 and not _PARTS.isdisjoint(inside[0]) else schema
 
@@ -85,7 +85,7 @@ def _wrong_key(place: _DataPlace, name: str, value: Any, is_missing: bool) -> st
 
 
 def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
-    """The text for a value: what the schema expects instead."""
+    """The text for a wrong value: what the schema expects."""
     if "oneOf" in schema:
         expected = f"one of {_tags(schema)}"
     elif "properties" in schema:
@@ -100,7 +100,7 @@ def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
     return text
 
 
-_IN_WORDS = {
+TYPES = {
     "number": "a number",
     "integer": "a whole number",
     "boolean": "true or false",
@@ -112,20 +112,20 @@ _IN_WORDS = {
 
 
 def _in_words(schema: Mapping[str, Any]) -> str:
-    """The description of a plain value."""
+    """The values that a schema allows, in words."""
     if "anyOf" in schema:
         return " or ".join(map(_in_words, schema["anyOf"]))
     if "oneOf" in schema:
         return f"one of {_tags(schema)}"
     if "enum" in schema or "const" in schema:
         return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
-    return _IN_WORDS.get(schema.get("type", ""), "something else")
+    return TYPES.get(schema.get("type", ""), "something else")
 
 
 def without_tags(schema: Any) -> Any:
-    """The schema of the same data as a plain YAML reader gives them: without the entries "_tag".
+    """The schema of data without the entries "_tag", as a plain reader of YAML returns them.
 
-    Without the tag any of the forms may match, so "oneOf" becomes "anyOf".
+    Without a tag any of the forms may match, so "oneOf" becomes "anyOf".
     """
     if isinstance(schema, list):
         return [without_tags(one) for one in schema]

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Reader(Generic[T]):
-    """Reads a dataclass from plain data, and writes it."""
+    """Reads a dataclass from plain data, and converts it to plain data."""
 
     def __init__(self, form: type[T]) -> None:
         whole = Annotated[form, Form(is_part=False)]  # type: ignore[valid-type]
@@ -25,21 +25,19 @@ class Reader(Generic[T]):
         self.free_names = set(_free_names(self.schema, ""))
 
     def read(self, data: Any, folder: Path | None = None, known: dict[Any, Any] | None = None) -> T:
-        """The dataclass that plain data describe.
+        """Makes the dataclass of plain data.
 
         Args:
             data: The plain data.
             folder: The folder of relative file names; None for the working directory.
-            known: As of `ReadingContext`.
+            known: The cache of a `ReadingContext`.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
                 listed.
         """
-        # What repr shows as it is has no such letter, and most data have none.
-        suspicious = "\\ud" in repr(data)
-        unwritable = dict.fromkeys(_unwritable(data, "")) if suspicious else {}
-        if unwritable:
+        # A fast test: repr shows half of a letter as \ud...
+        if "\\ud" in repr(data) and (unwritable := dict.fromkeys(_unwritable(data, ""))):
             text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
             raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
@@ -52,20 +50,17 @@ class Reader(Generic[T]):
             raise ScenarioError(*problems) from None
 
     def write(self, value: T) -> Any:
-        """The plain data of a value, the inverse of `read`."""
+        """Converts a value to plain data, the inverse of `read`."""
         return self._adapter.dump_python(value, mode="json")
 
 
 def _unwritable(data: Any, key: str) -> Iterator[str]:
-    """The dotted keys of texts in plain data that no file can hold."""
+    """The dotted keys of texts in plain data that cannot be written to a file."""
     if isinstance(data, str) and not can_be_written(data):
         yield key
-    pairs: Iterator[tuple[Any, Any]] = iter(())
-    if isinstance(data, Mapping):
-        pairs = iter(data.items())
-    elif isinstance(data, (list, tuple)):
-        pairs = iter(enumerate(data))
-    for name, inner in pairs:
+    if isinstance(data, (list, tuple)):
+        data = dict(enumerate(data))
+    for name, inner in data.items() if isinstance(data, Mapping) else ():
         if isinstance(name, str) and not can_be_written(name):
             yield key
         yield from _unwritable(inner, f"{key}.{name}" if key else str(name))

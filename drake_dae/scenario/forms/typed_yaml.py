@@ -13,18 +13,19 @@ TAG = "_tag"
 """The key under which a mapping holds its tag."""
 
 
-_READ_HERE = ("int", "float", "timestamp")
+_REDEFINED = ("int", "float", "timestamp")
+"""The types of YAML 1.1 whose forms are replaced below."""
 
 MOST_VALUES, MOST_TEXT, MOST_LEVELS = 100_000, 1_000_000, 50
-"""Limits of a file, with each alias counted as often as it is used. The shipped scenarios have 200
-values in 4,000 characters."""
+"""The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
+in 4,000 characters."""
 
 
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 with numbers as in JSON, unique text keys, and tags."""
 
     yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _READ_HERE]
+        first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _REDEFINED]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
@@ -47,9 +48,9 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def _check_size(self, node: yaml.Node, known: dict[int, int]) -> int:
-        """The number of values of a node."""
+        """Counts the values of a node, at most `MOST_VALUES`."""
         if id(node) not in known:
-            known[id(node)] = MOST_VALUES  # Of an alias inside of itself.
+            known[id(node)] = MOST_VALUES  # For an alias inside itself.
             parts = node.value if isinstance(node, yaml.CollectionNode) else []
             if isinstance(node, yaml.MappingNode):
                 parts = [part for pair in parts for part in pair]
@@ -150,7 +151,7 @@ def dump_yaml(data: Any, on_one_line: bool = False) -> str:
 
 
 def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
-    """Changes plain data by "a.b.0.c=value".
+    """Sets an entry of plain data by a text "a.b.0.c=value".
 
     Args:
         data: Lists and dictionaries; changed in place.
@@ -159,7 +160,7 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
             of a list.
 
     Raises:
-        ScenarioError: There is no such place, or the YAML is broken.
+        ScenarioError: There is no such entry, or the YAML is broken.
     """
     key, separator, text = setting.partition("=")
     if not separator or not all(key.split(".")):
@@ -168,17 +169,16 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
 
 
 def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> None:
-    """Changes plain data at a dotted key, "a.b.0.c".
+    """Sets an entry of plain data at a dotted key, "a.b.0.c".
 
     Args:
         data: Lists and dictionaries; changed in place.
         key: The key.
         value: Plain data.
-        names: Dotted keys of dictionaries whose names may have dots themselves; "*" is any entry
-            of a list.
+        names: As for `set_entry`.
 
     Raises:
-        ScenarioError: There is no such place.
+        ScenarioError: There is no such entry.
     """
     parts = key.split(".")
     if not all(parts):
@@ -207,7 +207,7 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
 
 
 def _name_length(data: Any, parts: list[str]) -> int:
-    """The number of parts of the name: all, except keys inside an existing entry."""
+    """The number of parts of a dotted key that form a name with dots."""
     for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
         name = ".".join(parts[:count])
         if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from drake_dae.scenario.forms.problems import TYPES
 from drake_dae.scenario.forms.typed_yaml import TAG, load_yaml
 from drake_dae.scenario.scenario import scenario_schema
 
@@ -36,7 +37,7 @@ class ManualKey:
     Attributes:
         name: The key.
         text: Its meaning.
-        takes: The values that it takes, in words.
+        takes: The values that it accepts, in words.
         unit: The unit of its numbers; empty for none.
         default: Its default as plain data, `OWN`, or `NOTHING` if it must be given.
         is_number: Whether it takes numbers.
@@ -59,9 +60,9 @@ class ManualEntry:
         where: Its first dotted key in the scenario; "*" is any name or number.
         text: Its meaning.
         keys: Its keys.
-        examples: Examples, which have all of its keys together.
-        data: A scenario as plain data around it.
-        path: Where it stands in that.
+        examples: Examples, which together contain all of its keys.
+        data: The plain data of a scenario that contains the form.
+        path: The path of the form in these data.
     """
 
     title: str
@@ -73,13 +74,13 @@ class ManualEntry:
     path: tuple[str | int, ...]
 
     def scenario(self, value: Any) -> Any:
-        """A scenario as plain data with a value of this form."""
+        """The plain data of a scenario with a value of this form."""
         return _with(self.data, self.path, value)
 
 
 @cache
 def entries() -> tuple[ManualEntry, ...]:
-    """Each form of a scenario once, in the order in which they stand."""
+    """Each form of a scenario once, in the order of the scenario's keys."""
     examples = load_yaml(EXAMPLES.read_text("utf-8"), EXAMPLES.name)
     return tuple(_entries(scenario_schema(), None, (), examples, set()))
 
@@ -91,9 +92,9 @@ def _entries(
     examples: Mapping[str, Any],
     seen: set[str],
 ) -> Iterator[ManualEntry]:
-    """The forms within a schema, whose value stands in data at a path, but those seen before."""
-    for one in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
-        yield from _entries(one, data, path, examples, seen)
+    """The forms in the schema of the data at a path, except those seen before."""
+    for member in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
+        yield from _entries(member, data, path, examples, seen)
     if "items" in schema:
         yield from _entries(schema["items"], _with(data, path, [None]), (*path, 0), examples, seen)
     if isinstance(schema.get("additionalProperties"), dict):
@@ -107,8 +108,8 @@ def _entries(
     if title in seen:
         return
     seen.add(title)
-    given = examples.get(title, {})
-    given = tuple({**tag, **example} for example in (given if isinstance(given, list) else [given]))
+    example = examples.get(title, {})
+    variants = tuple({**tag, **v} for v in (example if isinstance(example, list) else [example]))
     required = [name for name in schema.get("required", ()) if name != TAG]
     keys = tuple(
         ManualKey(
@@ -123,38 +124,28 @@ def _entries(
         if name != TAG
     )
     where = ".".join("*" if part in (0, "any") else str(part) for part in path)
-    yield ManualEntry(title, where, schema["description"], keys, given, data, path)
+    yield ManualEntry(title, where, schema["description"], keys, variants, data, path)
     for name, inner in properties.items():
         if name != TAG:
-            inside = _with(data, path, {**given[0], name: None})
+            inside = _with(data, path, {**variants[0], name: None})
             yield from _entries(inner, inside, (*path, name), examples, seen)
 
 
 def unit_of(text: str) -> str:
     """The unit in a text, "in N m" or "..., m, ..."; empty if there is none."""
-    found = _UNIT.search(text)
-    return (found[1] or found[2]) if found else ""
+    match = _UNIT.search(text)
+    return (match[1] or match[2]) if match else ""
 
 
 def _with(data: Any, path: tuple[str | int, ...], value: Any) -> Any:
     """Plain data with another value at a path."""
     if not path:
         return value
-    changed = deepcopy(data)
-    place = changed
+    changed = inner = deepcopy(data)
     for part in path[:-1]:
-        place = place[part]
-    place[path[-1]] = value
+        inner = inner[part]
+    inner[path[-1]] = value
     return changed
-
-
-_WORDS = {
-    "number": "a number",
-    "integer": "a whole number",
-    "boolean": "true or false",
-    "string": "text",
-    "null": "nothing",
-}
 
 
 def _takes(schema: Mapping[str, Any]) -> str:
@@ -176,10 +167,10 @@ def _takes(schema: Mapping[str, Any]) -> str:
         return {"a number": "a list of numbers"}.get(inner, f"a list: {inner}")
     if isinstance(schema.get("additionalProperties"), dict):
         return f"names, each with {_takes(schema['additionalProperties'])}"
-    return _WORDS.get(schema.get("type", ""), "any value")
+    return TYPES.get(schema.get("type", ""), "any value")
 
 
 def _is_number(schema: Mapping[str, Any]) -> bool:
     """Whether a schema has numbers outside of forms of their own."""
     inner = [*schema.get("anyOf", ()), schema.get("items"), schema.get("additionalProperties")]
-    return schema.get("type") == "number" or any(_is_number(one) for one in inner if one)
+    return schema.get("type") == "number" or any(_is_number(part) for part in inner if part)

@@ -28,7 +28,7 @@ from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 
-_SHARES = (1.0, 0.5, 0.2)
+_FRACTIONS = (1.0, 0.5, 0.2)
 """The fractions of the usual circle and force that are tried at each place."""
 
 _BESIDE = "B(x) is singular beside the reference, not along it: `drake-dae analyze` says where"
@@ -45,15 +45,15 @@ def new_scenario(
     point: Vector = (0.0, 0.0, 0.0),
     folder: str | Path = "",
 ) -> tuple[Scenario, str]:
-    """A scenario in which a robot presses on a surface and moves in a circle, within its limits.
+    """Makes a scenario in which a robot presses on a surface and moves in a circle on it.
 
-    The base is the free root body of the file. The chain is the longest without mimic joints,
-    grippers and wheels, or that to `tip`; all other joints are locked. The surface is placed where
-    the tip reaches it with its axis along the normal, with the best independence of the task's
-    directions. If its joint does not move the tip, the far end of the link is used. Outputs and
-    start are those of `complete_scenario`. Circle and force keep a margin to the joints' limits,
-    and `find_feasibility` finds no problem, except possibly states off the reference where B(x) is
-    singular; the text then says so.
+    The base is the free root body of the file. The working chain is the longest one without mimic
+    joints, grippers and wheels, or the one that ends at `tip`; all other joints are locked. The
+    surface is placed where the tip reaches it with its axis along the normal, and where the
+    directions of the task are most independent. If the last joint does not move the tip, the far
+    end of the link is the tip. `complete_scenario` chooses outputs and start. Circle and force keep
+    a margin to the limits of the joints. `find_feasibility` finds no problem; it may find states
+    off the reference where B(x) is singular, and then the text says so.
 
     Args:
         file: The robot's file, as a scenario has it.
@@ -63,12 +63,12 @@ def new_scenario(
         folder: The folder of the text: a robot's file below it gets a relative name.
 
     Returns:
-        The scenario, and its text with a comment to each choice; `load_scenario` makes the same
-        scenario of it.
+        The scenario, and its text with a comment on each choice; `load_scenario` reads the same
+        scenario from it.
 
     Raises:
-        ScenarioError: The file cannot be read, has no such tip, or no place is reached; the message
-            has what was tried.
+        ScenarioError: The file cannot be read or has no such tip, or no place is reached; the
+            message lists the places that were tried.
     """
     is_url = file.startswith("package://")
     robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
@@ -76,17 +76,17 @@ def new_scenario(
     tried: list[str] = []
     usable: tuple[Scenario, NewTask, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
-    for share, place in product(_SHARES, places):
-        task = circle(place, surface, share)
+    for fraction, place in product(_FRACTIONS, places):
+        task = circle(place, surface, fraction)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RobotFileWarning)  # The links are reported.
                 whole = complete_scenario(_scenario(robot, task, links)).scenario
-                found = find_feasibility(whole)
-            problems = found.problems
-            deeper = usable is not None and _depth(found) >= _depth(usable[2])
-            if not deeper and not set(problems) - {*_beside(found), *found.wrong_sides}:
-                usable = whole, task, found
+                report = find_feasibility(whole)
+            problems = report.problems
+            deeper = usable is not None and _depth(report) >= _depth(usable[2])
+            if not deeper and not set(problems) - {*_beside(report), *report.wrong_sides}:
+                usable = whole, task, report
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
@@ -95,41 +95,38 @@ def new_scenario(
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
     if usable is not None:
-        whole, task, found = usable
-        remarks = {"outputs": _BESIDE} if _beside(found) else {}
-        if found.wrong_sides:
-            remarks["constraints"] = "; ".join(map(str, found.behind))
+        whole, task, report = usable
+        remarks = {"outputs": _BESIDE} if _beside(report) else {}
+        if report.wrong_sides:
+            remarks["constraints"] = "; ".join(map(str, report.behind))
         robot = replace(robot, remarks={**robot.remarks, **remarks})
         return whole, scenario_text(whole, robot, task, Path(folder).resolve())
-    raise ScenarioError(
-        (
-            "robot",
-            f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
-            + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
-            + ". Give another tip, or copy a shipped scenario",
-        )
+    text = (
+        f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
+        + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
+        + ". Give another tip, or copy a shipped scenario"
     )
+    raise ScenarioError(("robot", text))
 
 
-def _depth(found: Feasibility) -> float:
-    """How far links are behind surfaces or in each other, all together, in m."""
-    return sum(one.depth for one in found.behind)
+def _depth(report: Feasibility) -> float:
+    """The sum of the depths of links behind surfaces and in each other, in m."""
+    return sum(link.depth for link in report.behind)
 
 
-def _beside(found: Feasibility) -> tuple[str, ...]:
-    """The problems with states near the start but off the reference."""
-    analysis = found.analysis
+def _beside(report: Feasibility) -> tuple[str, ...]:
+    """The problems with states near the start that are not on the reference."""
+    analysis = report.analysis
     if analysis.structure is None or analysis.motion is None or analysis.motion.ending:
         return ()
-    rank = (assumption for assumption in analysis.assumptions if assumption.number == 5)
-    return tuple(assumption.reason for assumption in rank)
+    return tuple(a.reason for a in analysis.assumptions if a.number == 5)
 
 
 def _scenario(robot: NewRobot, task: NewTask, links: Links) -> Scenario:
-    """The task of a robot, its outputs left open."""
+    """The scenario of a robot's task, without the outputs that will complete it."""
     names = [signal.name for signal in links.position_signals]
     stem = Path(robot.robot.file).name.split(".")[0]
-    along = "".join("xyz"[way] for way in task.place.ways)
+    along = "".join("xyz"[axis] for axis in task.place.ways)
     near = dict(zip(names, (np.round(task.place.q, 4) + 0.0).tolist(), strict=True))
     touching = PointOnSurface(robot.tip, task.surface, robot.point, task.name)
     return Scenario(

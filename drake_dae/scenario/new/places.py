@@ -36,8 +36,8 @@ _PATIENCE = 8
 _SLANTED = 0.3
 """The weight of a posture with a tool that is not normal to the surface."""
 
-_SLOW = 0.3
-"""The fraction of speed limits for a path, and of effort limits for a force."""
+_FRACTION = 0.3
+"""The fraction of speed limits that a path may use; half of it for effort limits and a force."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,17 +71,16 @@ class TipPlace:
     @property
     def normal(self) -> Vector:
         """The normal toward the robot."""
-        normal = [0.0, 0.0, 0.0]
-        normal[self.axis] = self.sign
-        return (normal[0], normal[1], normal[2])
+        x, y, z = (self.sign if k == self.axis else 0.0 for k in range(3))
+        return (x, y, z)
 
 
 def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
-    """The best place for each direction of a surface, in order of preference.
+    """Finds the best place of a surface for each direction of its normal, the best place first.
 
-    Each is the best of some postures with the tool normal to the surface, where that can be had: by
-    the independence of the task's directions, off joint limits, with bodies on the free side, the
-    base beside the tip, and half of the torques left when the robot stands still.
+    Each is the best of some postures, if possible with the tool normal to the surface. A posture is
+    good if the task's directions are independent, joints are away from their limits, all bodies are
+    on the free side, the base is beside the tip, and gravity takes less than half of the torques.
 
     Args:
         links: The robot.
@@ -89,10 +88,12 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
         point: The point in it, m.
     """
     search = _PlaceSearch(links, tip, point)
-    found = [search.best(axis, sign) for axis, sign, _ in _NORMALS]
-    ranked = [(place, liked) for place, (_, _, liked) in zip(found, _NORMALS, strict=True) if place]
-    ranked.sort(key=lambda pair: -pair[0].quality * pair[0].directions * pair[1])
-    return [place for place, _ in ranked]
+    ranked = [
+        (place, place.quality * place.directions * preference)
+        for axis, sign, preference in _NORMALS
+        if (place := search.best(axis, sign)) is not None
+    ]
+    return [place for place, _ in sorted(ranked, key=lambda pair: -pair[1])]
 
 
 class _PlaceSearch:
@@ -103,7 +104,7 @@ class _PlaceSearch:
         touch = PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
         axis = tool_axis(links, touch)
         rotation, place = links.rotation(tip), links.position(tip, point)
-        # The tip's place, and for each axis of the world the two components across the tool's.
+        # The tip's position, and of each axis of the world the two components across the tool.
         across = [k for k in range(3) if k != axis.column]
         rows = ca.vertcat(place, *[rotation[k, across].T for k in range(3)])
         self._postures = Postures(links, ConstraintSet(()), rows, ca.SX(0, 0), [], {})
@@ -140,12 +141,13 @@ class _PlaceSearch:
             posture = near_posture(self._postures, tilts, np.zeros(2), guess)
             aligned += [] if posture is None else [posture]
         slanted = [self._postures.at(guess) for guess in self._guesses]
-        found = [self._place(axis, sign, posture, 1.0) for posture in aligned]
-        found += [self._place(axis, sign, posture, _SLANTED) for posture in slanted]
-        good = [place for place in found if place is not None]
-        return max(good, key=lambda one: one.quality * one.directions, default=None)
+        postures = [(posture, 1.0) for posture in aligned]
+        postures += [(posture, _SLANTED) for posture in slanted]
+        places = (self._place(axis, sign, posture, weight) for posture, weight in postures)
+        reached = [place for place in places if place is not None]
+        return max(reached, key=lambda place: place.quality * place.directions, default=None)
 
-    def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> TipPlace | None:
+    def _place(self, axis: int, sign: float, posture: Posture, weight: float) -> TipPlace | None:
         """The place of a posture; None if the tip cannot move along the surface."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
         first = [k for k in range(3) if k != axis]
@@ -154,7 +156,7 @@ class _PlaceSearch:
         if axis not in rows or not ways:
             return None
         quality = posture.independence(rows) * self._postures.margin(posture.q)
-        quality *= worth * self._surroundings(posture, axis, sign)
+        quality *= weight * self._surroundings(posture, axis, sign)
         return TipPlace(
             posture.rows[:3],
             axis,
@@ -169,7 +171,7 @@ class _PlaceSearch:
         )
 
     def _surroundings(self, posture: Posture, axis: int, sign: float) -> float:
-        """A factor of 0.1 for each disadvantage of a posture."""
+        """The factor of the quality of a posture: 0.1 for each disadvantage."""
         outward, moving, still, weight = self._function(posture.q, self._values)
         place, size = posture.rows[:3], self._postures.size
         behind = sign * (moving.reshape(3, -1)[axis] - place[axis])
@@ -179,23 +181,23 @@ class _PlaceSearch:
         # A table may be as high as the base; a wall must not cut it.
         in_front = axis == 2 or sign * (roots[axis] - place[axis]) > 0.1 * size
         is_beside = axis != 2 or np.linalg.norm(beside) > 0.2 * size
-        doubts = (
+        disadvantages = (
             bool(np.min(behind) < -0.02 * size),
             bool(sign * outward[axis] > -0.5),
             not in_front,
             not is_beside,
             bool(np.any(np.abs(weight) > 0.5 * self._efforts)),
         )
-        return float(0.1 ** sum(doubts))
+        return float(0.1 ** sum(disadvantages))
 
     def _speed(self, posture: Posture, rows: list[int], ways: int) -> float:
         """The largest speed of the tip in all directions along the surface."""
         inverse = np.linalg.pinv(posture.gradients[rows])[:, 1 : 1 + ways]
         fastest = np.max(np.abs(inverse) / self._speeds[:, None], initial=0.0)
-        return float(_SLOW / fastest) if fastest > 0.0 else np.inf
+        return float(_FRACTION / fastest) if fastest > 0.0 else np.inf
 
     def _force(self, posture: Posture, axis: int) -> float:
         """The largest force of the tip."""
         lever = np.abs(posture.gradients[axis])
-        share = np.max(lever / self._efforts, initial=0.0)
-        return float(_SLOW / 2 / share) if share > 0.0 else np.inf
+        torque = np.max(lever / self._efforts, initial=0.0)
+        return float(_FRACTION / 2 / torque) if torque > 0.0 else np.inf

@@ -19,6 +19,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
+from drake_dae.analysis.tables import count_of
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError, RobotFileWarning
 from drake_dae.robots.surfaces.surface import Vector
@@ -26,7 +27,7 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.new.far_end import far_end
 from drake_dae.scenario.new.tree import Tree
 from drake_dae.scenario.robot_file.changes import finalize
-from drake_dae.scenario.robot_file.loops import closing_joints
+from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints
 from drake_dae.scenario.robot_file.packages import find_packages
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import LeftOut, Robot, RobotPlacement
@@ -52,11 +53,11 @@ class NewRobot:
     """A robot with a working chain of joints, all others locked.
 
     Attributes:
-        robot: What the scenario has under `robot`.
-        chain: The joints that move, from the base to the tip.
+        robot: The value of the scenario's key `robot`.
+        chain: The names of the joints that move, from the base to the tip.
         tip: The frame at the end of the chain.
-        point: The point in it that touches, m, shape (3,).
-        remarks: Key under `robot`, or "tip" -> the reason.
+        point: The contact point in that frame, m, shape (3,).
+        remarks: Key under `robot`, or "tip" -> why this value was chosen.
     """
 
     robot: Robot
@@ -67,10 +68,10 @@ class NewRobot:
 
 
 def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewRobot:
-    """Finds the data of a robot that its file does not contain but a scenario needs.
+    """Finds what a scenario needs of a robot and its file does not contain: base, chain and tip.
 
-    The chain is the longest of joints that turn or slide, without those that mimic others, grasp or
-    roll; or that which leads to a tip that is given.
+    The chain is the longest one of revolute and prismatic joints, without mimic joints, grippers
+    and wheels; or, if a tip is given, the chain that ends there.
 
     Args:
         file: The robot's file, as a scenario has it.
@@ -78,18 +79,14 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
         point: The point in it.
 
     Raises:
-        ScenarioError: The file cannot be read, has no such tip, or nothing that can move it.
+        ScenarioError: The file cannot be read, has no such tip, or no joint can move it.
     """
     with at("robot.file"):
         tree, robot = _read(file)
-        plant = tree.plant
-        robot, remarks = _held(tree, robot)
+        robot, remarks = _with_base(tree, robot)
         chain, end = _chain(tree, tip)
-        remarks["tip"] = (
-            f"at the end of {_count(len(chain), 'joint')}"
-            if tip
-            else f"the end of the longest chain, of {_count(len(chain), 'joint')}"
-        )
+        where = "at the end of" if tip else "the end of the longest chain, of"
+        remarks["tip"] = f"{where} {count_of(len(chain), 'joint')}"
         if not (tip or any(point)) and tree.directions(chain, end, point) < min(len(chain), 3):
             point = far_end(robot, tree.bodies[end], chain[-1], tree.size) or point
             remarks["point"] = "in that frame, m: its far end, where no frame of the file is"
@@ -98,10 +95,7 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
         locked = _locked(tree, chain)
         if locked:
             remarks["locked"] = "m or rad; all that is not of the chain, or mimics"
-        driven = {
-            plant.get_joint_actuator(index).joint().index()
-            for index in plant.GetJointActuatorIndices()
-        }
+        driven = {actuator.joint().index() for actuator in actuators_of(tree.plant)}
         actuators = None
         if any(joint.index() not in driven for joint in chain):
             actuators = "all"
@@ -113,10 +107,6 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
             point,
             remarks,
         )
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _read(file: str) -> tuple[Tree, Robot]:
@@ -168,18 +158,14 @@ def _finished(robot: Robot) -> MultibodyPlant:
 
 def _folders_above(file: str) -> dict[str, str]:
     """Unknown packages -> folders of that name above the file or beside it."""
+    folders: dict[str, str] = {}
     with suppress(RuntimeError, ValueError, OSError):  # The reader of the file reports it.
-        _, missing = find_packages(file, PackageMap())
         above = list(Path(file).resolve().parents)
-        return {
-            name: str(folder)
-            for name in missing
-            for folder in [
-                *(one for one in above if one.name == name),
-                *(one / name for one in above[:2] if (one / name).is_dir()),
-            ][:1]
-        }
-    return {}
+        for name in find_packages(file, PackageMap())[1]:
+            beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
+            candidates = [*(folder for folder in above if folder.name == name), *beside]
+            folders.update({name: str(candidates[0])} if candidates else {})
+    return folders
 
 
 def _check_reach(tree: Tree, chain: Sequence[Joint], tip: str, point: Vector) -> None:
@@ -194,13 +180,13 @@ def _check_reach(tree: Tree, chain: Sequence[Joint], tip: str, point: Vector) ->
     names = ", ".join(tree.names[joint.index()] for joint in chain)
     way = "in one direction alone" if directions else "nowhere"
     raise ModelError(
-        f"the tip '{tip}' moves {way} by {_count(len(chain), 'joint')} ({names}), and a contact "
+        f"the tip '{tip}' moves {way} by {count_of(len(chain), 'joint')} ({names}), and a contact "
         "takes one direction to press and another to move along; give another tip, as "
         "--tip LINK:x,y,z, at the end of two joints or more"
     )
 
 
-def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
+def _with_base(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
     """The robot with its base fixed to the world, and remarks."""
     remarks: dict[str, str] = {}
     if robot.packages:
@@ -208,9 +194,8 @@ def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
     if robot.leave_out:
         remarks["leave_out"] = "what the file has and the equations have not"
     floating = QuaternionFloatingJoint | RpyFloatingJoint
-    free = [j for j in tree.joints if isinstance(j, floating)]
-    names = {body.index(): name for name, body in tree.bodies.items()}
-    roots = [names[joint.child_body().index()] for joint in free]
+    free = {j.child_body().index() for j in tree.joints if isinstance(j, floating)}
+    roots = [name for name, body in tree.bodies.items() if body.index() in free]
     if len(roots) > 1:
         raise ModelError(
             f"{len(roots)} bodies are held by nothing ({', '.join(roots[:8])}), and a new scenario "
@@ -250,13 +235,12 @@ def _chain(tree: Tree, tip: str) -> tuple[list[Joint], str]:
         ]
         return max(paths, key=len, default=[])
 
-    works = tree.works
     arms = [
         joint
-        for joint in works
+        for joint in tree.works
         if not _NOT_OF_AN_ARM.search(joint.name()) and not _FINGER.search(joint.child_body().name())
     ]
-    chain = longest(arms) or longest(works)
+    chain = longest(arms) or longest(tree.works)
     if not chain:
         raise ModelError(_why_none(tree))
     return chain, _tip(tree, chain)
@@ -265,12 +249,8 @@ def _chain(tree: Tree, tip: str) -> tuple[list[Joint], str]:
 def _why_none(tree: Tree) -> str:
     """The reason why there is no working joint, and the remedy."""
     text = "no joint turns or slides for itself, so that there is nothing to drive"
-    kinds = {joint.type_name() for joint in tree.joints} - {
-        "weld",
-        "quaternion_floating",
-        "rpy_floating",
-    }
-    if not kinds:
+    still = {"weld", "quaternion_floating", "rpy_floating"}
+    if not {joint.type_name() for joint in tree.joints} - still:
         return f"{text}: the file has no joints that move; take one of a robot that has"
     coupled = ", ".join(sorted(tree.coupled))
     if coupled:
@@ -296,19 +276,15 @@ def _tip(tree: Tree, chain: Sequence[Joint]) -> str:
 
 
 def _locked(tree: Tree, chain: Sequence[Joint]) -> dict[str, float]:
-    """The locked positions of joints outside the chain; mimic joints follow."""
-    moving = {joint.index() for joint in chain}
-    followers = {one.follower for one in tree.couplings}
-    return {
-        tree.names[joint.index()]: _resting(joint)
-        for joint in tree.joints
-        if isinstance(joint, RevoluteJoint | PrismaticJoint)
-        and joint.index() not in moving
-        and tree.names[joint.index()] not in followers
-    }
-
-
-def _resting(joint: Joint) -> float:
-    """Zero, or the nearest value within limits."""
-    low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-    return float(min(max(0.0, low), high))
+    """The positions of joints outside the chain: 0, or the nearest limit. Mimic joints follow."""
+    skipped = {tree.names[joint.index()] for joint in chain}
+    skipped |= {coupling.follower for coupling in tree.couplings}
+    locked = {}
+    for joint in tree.joints:
+        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+            continue
+        name = tree.names[joint.index()]
+        if name not in skipped:
+            low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+            locked[name] = float(min(max(0.0, low), high))
+    return locked

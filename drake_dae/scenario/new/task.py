@@ -28,11 +28,11 @@ class NewTask:
     """A circle on a surface.
 
     Attributes:
-        place: Where.
+        place: The place of the surface.
         name: The name of the surface.
         surface: The surface.
         center: The point of the surface in the middle, m, rounded.
-        radius: Of the circle, seen along the normal, m.
+        radius: The radius of the circle, seen along the normal, m.
         period: The duration of a turn, s.
         force: The force of the tip, N.
     """
@@ -62,30 +62,29 @@ class NewTask:
         return "circle" if len(self.place.ways) > 1 else "line"
 
 
-def circle(place: TipPlace, kind: SurfaceKind, share: float) -> NewTask:
-    """A circle at a place, of a share of the usual radius and force."""
+def circle(place: TipPlace, kind: SurfaceKind, fraction: float) -> NewTask:
+    """A circle at a place, with a fraction of the usual radius and force."""
     decimals = 2 if place.size > 0.3 else 3
     x, y, z = (round(float(value), decimals) + 0.0 for value in place.point)
     center = (x, y, z)
-    radius = _round_number(share * _RADIUS * place.size)
-    force = _round_number(share * min(_FORCE, place.force))
+    radius = _round_number(fraction * _RADIUS * place.size)
+    force = _round_number(fraction * min(_FORCE, place.force))
     period = SHORTEST
     if isfinite(place.speed):
         period = max(period, float(ceil(2 * pi * radius / place.speed)))
     bend = round(_BEND * place.size, decimals)
     middle = np.round(np.array(center) - bend * np.array(place.normal), decimals) + 0.0
     inner = (float(middle[0]), float(middle[1]), float(middle[2]))
-    if kind == "cylinder":
-        axis = [0.0, 0.0, 0.0]
-        axis[place.ways[-1]] = 1.0  # A planar robot moves around it.
-        if len(place.ways) == 1:
-            axis = [float(k not in (place.axis, *place.ways)) for k in range(3)]
-        surface: Surface = Cylinder(inner, (axis[0], axis[1], axis[2]), bend)
-        return NewTask(place, "pipe", surface, center, radius, period, force)
-    if kind == "sphere":
-        return NewTask(place, "ball", Sphere(inner, bend), center, radius, period, force)
+    surface: Surface = Plane(center, place.normal)
     name = {1.0: "table", -1.0: "ceiling"}[place.sign] if place.axis == 2 else "wall"
-    return NewTask(place, name, Plane(center, place.normal), center, radius, period, force)
+    if kind == "sphere":
+        name, surface = "ball", Sphere(inner, bend)
+    elif kind == "cylinder":
+        # A planar robot moves around the cylinder, others also along it.
+        along = place.ways[-1] if len(place.ways) > 1 else 3 - place.axis - place.ways[0]
+        i, j, k = np.eye(3)[along].tolist()
+        name, surface = "pipe", Cylinder(inner, (i, j, k), bend)
+    return NewTask(place, name, surface, center, radius, period, force)
 
 
 def _round_number(value: float) -> float:

@@ -59,49 +59,49 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[
     for key in ("packages", "base", "locked", "actuators", "leave_out"):
         value = data["robot"][key]
         if value:
-            yield from _said(f"  {key}: {_flow(_short(value))}", robot.remarks[key])
+            yield from _with_reason(f"  {key}: {_flow(_short(value))}", robot.remarks[key])
     yield "constraints:"
     yield f"- name: {_flow(task.name)}"
-    yield from _said(f"  frame: {_flow(robot.tip)}", robot.remarks["tip"])
+    yield from _with_reason(f"  frame: {_flow(robot.tip)}", robot.remarks["tip"])
     if any(robot.point):
-        yield from _said(f"  point: {_flow(list(robot.point))}", robot.remarks["point"])
+        yield from _with_reason(f"  point: {_flow(list(robot.point))}", robot.remarks["point"])
     (constraint,) = data["constraints"]
     free = (
         f"where {task.place.directions} directions of motion are free of each other by "
         f"{task.place.quality:.2g}: 1 is best, 0 singular"
     )
-    yield from _said(f"  surface: {_flow(_short(constraint['surface']))}", free)
+    yield from _with_reason(f"  surface: {_flow(_short(constraint['surface']))}", free)
     singular = robot.remarks.get("outputs")
-    yield from _said("outputs:", singular) if singular else ["outputs:"]
+    yield from _with_reason("outputs:", singular) if singular else ["outputs:"]
     for output in data["outputs"]:
-        yield from _said(f"- {_flow(_short(output))}", _WHY[output[TAG]])
+        yield from _with_reason(f"- {_flow(_short(output))}", _WHY[output[TAG]])
     if data["tool_axis"] != "normal":
         fixed = "to keep it normal to a surface that bends would hinder the way along"
-        yield from _said(f"tool_axis: {data['tool_axis']}", fixed)
+        yield from _with_reason(f"tool_axis: {data['tool_axis']}", fixed)
     (pole,) = data["gains"]["all"]
     fading = f"1/s; after {-6 / pole:.2g} s less than a fiftieth of an error is left"
-    yield from _said(f"gains: !Poles {{all: [{pole}]}}", fading)
+    yield from _with_reason(f"gains: !Poles {{all: [{pole}]}}", fading)
     yield "references:"
-    (along, path), (pressing, force), *held = data["references"].items()
+    (along, path), (pressing, force), *constant = data["references"].items()
     speed = 2 * pi * task.radius / task.period
-    yield from _said(
+    yield from _with_reason(
         f"  {_flow(along)}: {_flow({key: path[key] for key in path if key in _PATH})}",
         f"a {task.path} of {task.radius:g} m in {task.period:g} s: at {speed:.2g} m/s joints stay "
         "below their speed limits",
     )
     least = "N: no more than 20, and than a sixth of what effort limits allow there"
-    yield from _said(f"  {_flow(pressing)}: {_flow(force)}", least)
-    for name, value in held:
-        yield from _said(f"  {_flow(name)}: {_flow(value)}", "held at what it starts with")
+    yield from _with_reason(f"  {_flow(pressing)}: {_flow(force)}", least)
+    for name, value in constant:
+        yield from _with_reason(f"  {_flow(name)}: {_flow(value)}", "held at what it starts with")
     yield "start:"
     positions = f"  positions: {_flow(data['start']['positions'])}"
-    yield from _said(positions, "by inverse kinematics from the references' first values")
-    yield from _said(f"duration: {_flow(data['duration'])}", "s, two rounds")
+    yield from _with_reason(positions, "by inverse kinematics from the references' first values")
+    yield from _with_reason(f"duration: {_flow(data['duration'])}", "s, two rounds")
     accuracy = data["integrator"]["accuracy"]
-    yield from _said(f"integrator: {{accuracy: {accuracy:.1e}}}", "relative, of each step")
+    yield from _with_reason(f"integrator: {{accuracy: {accuracy:.1e}}}", "relative, of each step")
 
 
-def _said(line: str, why: str) -> Iterator[str]:
+def _with_reason(line: str, why: str) -> Iterator[str]:
     """A line with its reason, which is written above if both are long."""
     if len(line) + len(why) + 4 <= _WIDTH:
         yield f"{line}  # {why}"
@@ -115,11 +115,9 @@ def _short(value: Any) -> Any:
     """Data without keys that have their default values."""
     if not isinstance(value, Mapping):
         return value
-    unsaid: tuple[Any, ...] = ("", [], {}, None, [0.0, 0.0, 0.0], [0.0])
-    found = {key: _short(inner) for key, inner in value.items()}
-    return {
-        key: inner for key, inner in found.items() if inner is not False and inner not in unsaid
-    }
+    defaults: tuple[Any, ...] = ("", [], {}, None, [0.0, 0.0, 0.0], [0.0])
+    entries = {key: _short(inner) for key, inner in value.items()}
+    return {key: v for key, v in entries.items() if v is not False and v not in defaults}
 
 
 def _flow(value: Any) -> str:

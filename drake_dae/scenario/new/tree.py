@@ -19,6 +19,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.robots.constraints.plant_constraints import couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.robot_file.loops import joints_of
 
 
 class Tree:
@@ -26,7 +27,7 @@ class Tree:
 
     def __init__(self, plant: MultibodyPlant) -> None:
         self.plant = plant
-        self.joints: list[Joint] = [plant.get_joint(i) for i in plant.GetJointIndices()]
+        self.joints = joints_of(plant)
         self.above = {joint.child_body().index(): joint for joint in self.joints}
         self.names = {joint.index(): name for name, joint in joint_names(plant).items()}
         self.couplings = couplings_of(plant) if plant.num_constraints() else []
@@ -37,15 +38,15 @@ class Tree:
 
     def path(self, body: RigidBody) -> list[Joint]:
         """The joints from the world to a body."""
-        found: list[Joint] = []
+        joints: list[Joint] = []
         while body.index() in self.above:
-            found.append(self.above[body.index()])
-            body = found[-1].parent_body()
-        return found[::-1]
+            joints.append(self.above[body.index()])
+            body = joints[-1].parent_body()
+        return joints[::-1]
 
     @property
     def works(self) -> list[Joint]:
-        """The independent rotational and sliding joints."""
+        """The joints that can be in a working chain; see `can_work`."""
         return [joint for joint in self.joints if self.can_work(joint)]
 
     @property
@@ -69,7 +70,7 @@ class Tree:
         return float(np.linalg.norm(np.ptp(places, axis=0)))
 
     def directions(self, chain: Sequence[Joint], frame: str, point: Vector) -> int:
-        """The number of directions in which a chain of joints moves a point, generically."""
+        """The number of directions in which a chain of joints moves a point, in most postures."""
         context = self.plant.CreateDefaultContext()
         columns = [joint.velocity_start() for joint in chain]
         random = np.random.default_rng(0)
@@ -91,11 +92,11 @@ class Tree:
 
     @property
     def coupled(self) -> set[str]:
-        """Names of joints that follow or lead others."""
-        return {name for one in self.couplings for name in (one.follower, one.leader)}
+        """The names of mimic joints and of the joints that they follow."""
+        return {name for c in self.couplings for name in (c.follower, c.leader)}
 
     def can_work(self, joint: Joint) -> bool:
-        """Whether a joint is an independent rotational or sliding joint."""
+        """Whether a joint is revolute or prismatic, can move, and is not coupled to another one."""
         if not isinstance(joint, RevoluteJoint | PrismaticJoint):
             return False
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]

@@ -42,7 +42,7 @@ Surface = Annotated[
 ]
 Constraint = Annotated[
     contact.PointOnSurface
-    | written.WeldedFrames
+    | written.WeldedFramesForm
     | contact.CoincidentPoints
     | contact.FixedDistance
     | contact.JointCoupler
@@ -57,8 +57,8 @@ Constraint = Annotated[
 Output = Annotated[
     outputs.PointCoordinates
     | outputs.AxisCoordinates
-    | written.SurfaceCoordinates
-    | written.TiltFromNormal
+    | written.SurfaceCoordinatesForm
+    | written.TiltFromNormalForm
     | outputs.JointPositions,
     Choice(_WRITTEN),
 ]
@@ -90,7 +90,7 @@ Reference = Annotated[
 Load = Annotated[known_forces.KnownForce, Form(_WRITTEN)]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascade | parts.Adaptive, Choice()]
+Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     plants.IdealConstraints

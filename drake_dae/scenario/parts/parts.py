@@ -17,14 +17,14 @@ from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 @dataclass(frozen=True)
 class ModelForce:
-    """The law uses the force of its model: (28)."""
+    """The law computes the constraint force from its model: (28)."""
 
     is_measured: ClassVar = False
     seed: ClassVar = 0
     gain: ClassVar = 0.0
 
     def sensor(self, size: int) -> ForceSensor | None:
-        """None: the force is not measured, so there is no sensor."""
+        """None, since the force is not measured."""
         return None
 
     def begin(self, sensor: ForceSensor, context: Context) -> None:
@@ -33,15 +33,16 @@ class ModelForce:
 
 @dataclass(frozen=True)
 class MeasuredForce:
-    """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
+    """The law uses the constraint force that a `ForceSensor` measures: (59), (71), (81).
 
     Attributes:
         time_constant: The time constant of the sensor's lag, in s; 0 for none.
         sample_period: The time between samples, in s; 0 for none.
-        bias: A constant error in N or N m, one number for all forces or one each.
-        noise_deviation: The standard deviation of the noise in N or N m, likewise.
+        bias: A constant error in N or N m, one number for all forces or one per force.
+        noise_deviation: The standard deviation of the noise in N or N m, one number for all forces
+            or one per force.
         seed: The seed of the noise.
-        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
+        gain: Gbar of (59), a number or a matrix row by row; for rigid joints only.
     """
 
     time_constant: float = 0.0
@@ -69,28 +70,29 @@ class MeasuredForce:
 
 @dataclass(frozen=True)
 class Tracking:
-    """The tracking law (28) of the whole robot: four derivatives of the model behind springs."""
+    """The tracking law (28) of the whole robot; with springs it differentiates four times."""
 
     is_cascade: ClassVar = False
 
     def loop(self) -> SpringLoop | None:
-        """None: there is no loop around springs."""
+        """None, since there is no loop around springs."""
         return None
 
 
 @dataclass(frozen=True)
 class Adaptive:
-    """A law that learns parameters which enter linearly, such as masses, while it tracks.
+    """A law that estimates parameters which enter linearly, such as masses, while it tracks.
 
-    It is a `systems.adaptive.AdaptiveLaw`, for rigid joints and contacts that stay closed. `gains`,
-    `integral`, `observer` and `constraint_damping` are left out. With `sampling` its estimates are
-    sampled too.
+    It is an `AdaptiveLaw`, for rigid joints and contacts that stay closed. The keys `gains`,
+    `integral`, `observer` and `constraint_damping` must be left out. With `sampling` the estimates
+    are sampled as well.
 
     Attributes:
-        parameters: Name of a parameter, as in `plant_parameters` -> how fast it is learned: its
-            entry of Gamma, in its unit squared per J. It starts at the law's own value.
+        parameters: Name of a parameter, as in `plant_parameters` -> its adaptation gain, an entry
+            of Gamma, in the unit of the parameter squared per J. The initial estimate is the law's
+            value.
         rate: The rate in 1/s at which errors of positions decay.
-        damping: The rate in 1/s at which the motion comes to such a decay.
+        damping: The rate in 1/s at which the velocity error of this decay decays itself.
         force_rate: The rate in 1/s at which the error of a measured force decays, with
             `force_feedback`; 0 without.
     """
@@ -112,29 +114,29 @@ class Adaptive:
 
     @property
     def gains(self) -> "Poles":
-        """The poles that the errors of positions have when the parameters are learned."""
+        """The poles of the errors of positions when the parameters are known."""
         return Poles(all=[-self.rate])
 
     def loop(self) -> SpringLoop | None:
-        """None: there is no loop around springs."""
+        """None, since there is no loop around springs."""
         return None
 
 
 @dataclass(frozen=True)
-class SpringCascade:
-    """The tracking law of the links alone, and a loop around the springs of the joints.
+class SpringCascadeForm:
+    """The tracking law for the links without springs, and an inner loop around the springs.
 
-    It is a `systems.cascade.SpringCascade`, and needs `sampling`, and FlexibleJoints in
-    `actuation` with DcMotors or nothing behind them. `gains`, `integral` and `observer` are those
-    of the rigid law; where `gains` are left out in compliant contact, all are recommended.
+    It is a `SpringCascade`. It needs `sampling`, and in `actuation` FlexibleJoints, perhaps
+    followed by DcMotors. `gains`, `integral` and `observer` are those of the law for the links; if
+    `gains` are left out in compliant contact, default values of all are computed.
 
     Attributes:
-        rate: The rate of the loop in rad/s, the same for all joints; recommended if left out.
-        damping: Its damping ratio.
+        rate: The rate of the inner loop in rad/s, the same for all joints; computed if left out.
+        damping: The damping ratio of the inner loop.
         motor_rate: The rate in 1/s at which friction and other disturbances of the motors are
             observed and compensated; the rate of the loop if left out, 0 for none.
-        current_rate: The rate in 1/s of currents behind the springs, if there are any; recommended
-            if left out.
+        current_rate: The rate in 1/s of currents behind the springs, if there are any; computed if
+            left out.
     """
 
     rate: float | None = None
@@ -144,19 +146,19 @@ class SpringCascade:
     is_cascade: ClassVar = True
 
     def __post_init__(self) -> None:
-        given = [self.rate, self.motor_rate, self.current_rate]
-        rate, *others = [1.0 if number is None else number for number in given]
+        rates = [self.rate, self.motor_rate, self.current_rate]
+        rate, *others = [1.0 if number is None else number for number in rates]
         SpringLoop(rate, self.damping, *others)
 
-    def filled(self, numbers: SpringLoop) -> "SpringCascade":
-        """The same with recommended numbers where they are left out."""
+    def filled(self, numbers: SpringLoop) -> "SpringCascadeForm":
+        """A copy with these numbers in place of numbers that are left out."""
         rate = numbers.rate if self.rate is None else self.rate
         motor_rate = rate if self.motor_rate is None else self.motor_rate
         current_rate = numbers.current_rate if self.current_rate is None else self.current_rate
-        return SpringCascade(rate, self.damping, motor_rate, current_rate)
+        return SpringCascadeForm(rate, self.damping, motor_rate, current_rate)
 
     def loop(self) -> SpringLoop | None:
-        """The numbers of the loop; None if one is left out."""
+        """The inner loop; None if one of its numbers is left out."""
         if self.rate is None or self.motor_rate is None or self.current_rate is None:
             return None
         return SpringLoop(self.rate, self.damping, self.motor_rate, self.current_rate)
@@ -167,8 +169,8 @@ class Observer(Observing):
     """The settings of a `DisturbanceObserver` of model errors.
 
     Attributes:
-        identify_friction: The names of constraints whose coefficient of friction is identified;
-            identification starts at their own coefficient, 0 if it is unknown.
+        identify_friction: The names of constraints whose coefficient of friction is identified. The
+            initial value is the coefficient of the constraint; write 0 if it is unknown.
     """
 
     identify_friction: list[str] = field(default_factory=list)
@@ -176,10 +178,10 @@ class Observer(Observing):
 
 @dataclass(frozen=True)
 class PerOutput:
-    """Numbers for all outputs, or for each.
+    """Numbers for all outputs, or for each output.
 
     Attributes:
-        all: The numbers of every output.
+        all: The numbers for every output.
         outputs: Output name -> its numbers; "*" is all others. Only without `all`.
     """
 
@@ -193,7 +195,7 @@ class PerOutput:
 
 @dataclass(frozen=True)
 class Poles(PerOutput):
-    """Real poles of the errors, a number or mu_i of them; complex ones are Coefficients.
+    """Real poles of the errors, one number or mu_i numbers per output; see also Coefficients.
 
     Attributes:
         all: The poles of every output, in 1/s.
@@ -211,8 +213,8 @@ class Coefficients(PerOutput):
 
     Attributes:
         all: The gains of every output, in 1/s^mu_i, ..., 1/s.
-        outputs: Output name -> its gains, in 1/s^mu_i, ..., 1/s; "*" is all
-            others. Not beside `all`.
+        outputs: Output name -> its gains, in 1/s^mu_i, ..., 1/s; "*" is all others. Only without
+            `all`.
     """
 
     def design(self) -> GainDesign:
@@ -222,7 +224,7 @@ class Coefficients(PerOutput):
 
 @dataclass(frozen=True)
 class Matrices:
-    """Gains that couple outputs of one degree: `dae.gains.gain_matrices`.
+    """Gains that couple outputs of equal degree; see `gain_matrices`.
 
     Attributes:
         groups: For each degree mu, highest first, its Lambda_1, ..., Lambda_mu, each row by row,
@@ -245,13 +247,13 @@ class Matrices:
 class Start:
     """A start at rest, on the constraints, with given errors of the outputs.
 
-    Where a scenario has `exogenous` signals, the robot starts in motion with its references.
+    If a scenario has `exogenous` signals, the robot starts in motion with its references.
 
     Attributes:
-        positions: Joint name -> position near which the robot starts, in rad or m; the robot's
-            default where not given.
-        errors: Output name -> z - r at the start, in the output's unit; 0 where not given. Forces
-            can start off their references where actuators have dynamics.
+        positions: Joint name -> position near which the robot starts, in rad or m; by default that
+            of the robot's file.
+        errors: Output name -> z - r at the start, in the output's unit; 0 by default. Errors of
+            forces are possible only if actuators have dynamics.
     """
 
     positions: dict[str, float] = field(default_factory=dict)
@@ -260,12 +262,12 @@ class Start:
 
 @dataclass(frozen=True)
 class Write:
-    """What a run leaves in its folder, beside the scenario and the summary.
+    """The files that a run writes, besides the scenario and the summary.
 
     Attributes:
-        record: Whether it leaves record.npz, all signals at all times.
-        plots: Whether it leaves plots.
-        animation: Whether it leaves animation.html, which plays in a browser.
+        record: Whether it writes record.npz, all signals at all times.
+        plots: Whether it writes plots.
+        animation: Whether it writes animation.html, which plays in a browser.
     """
 
     record: bool = True

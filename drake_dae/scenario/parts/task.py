@@ -17,22 +17,22 @@ from drake_dae.systems.task.task import Task
 class ScenarioTask:
     """A sequence of phases, in place of `references`.
 
-    It starts at rest at start.positions: free, or in contact next to them if the first phase starts
-    in contact. While the contact is open its distance is an output, "wall.distance" for example, in
-    place of its force. With ideal constraints in `plant` the contact opens and closes without
-    bouncing.
+    It starts at rest at start.positions, or in contact near them if the first phase requires
+    contact. While the contact is open, its distance, such as "wall.distance", is an output in place
+    of its force. With ideal constraints in `plant` the contact opens and closes without bouncing.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.
         contact: The name of the constraint that opens and closes; not needed if there is only one.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
-        tare_time: The time in s for which a task that begins free measures the bias of the force
-            sensor, before any phase ends; it is subtracted from then on. 0 for no taring.
-        retries: How many times a phase may go back by "approach"; then the run ends with an error.
-        signals: Name -> the signal for which a phase waits, over the time of the run; it has come
-            where it is above 1/2.
-        gains: The gains of the law of the free robot, with the distance among its outputs; those of
+        tare_time: The time in s at the beginning for which a task without contact measures the bias
+            of the force sensor. No phase ends before, and the bias is subtracted afterwards. 0 for
+            no taring.
+        retries: How many times phases may return to the approach; then the run ends with an error.
+        signals: Name -> reference of a signal for which a phase waits. The signal is set where the
+            reference is above 1/2.
+        gains: The gains of the law without contact, with the distance among its outputs; those of
             `gains` if left out.
     """
 
@@ -46,14 +46,14 @@ class ScenarioTask:
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
-        task = self.made()
+        known = self.make().signals
         for name in self.signals:
-            if name not in task.signals:
-                text = unknown_name("phase that waits for the signal", name, task.signals)
+            if name not in known:
+                text = unknown_name("phase that waits for the signal", name, known)
                 raise ModelError(f"signals: {text}")
 
-    def made(self, force_noise: float = 0.0) -> Task:
-        """The task.
+    def make(self, force_noise: float = 0.0) -> Task:
+        """Makes the `Task` of these phases.
 
         Args:
             force_noise: The standard deviation of the force sensor's noise in N.

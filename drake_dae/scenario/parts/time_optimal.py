@@ -15,28 +15,28 @@ ForceRange = Annotated[tuple[float | None, float | None], pydantic.Strict(False)
 
 @dataclass(frozen=True)
 class TimeOptimal:
-    """The references as paths, followed in the shortest time from rest to rest.
+    """The references are paths, which are followed in the shortest time from rest to rest.
 
-    The motion is within limits of drives, joints and contacts; joints are rigid. Limits of paths,
-    `limits`, bound the tool. They hold as well, except the jerk.
+    The motion keeps the limits of drives, joints and contacts, and the `limits` of paths except
+    their jerk. Joints must be rigid.
 
     Attributes:
-        efforts: The share of the drives' effort limits that the motion may use; the feedback has
-            the rest.
-        joint_speeds: The share of the joints' velocity limits that it may use.
-        joint_accelerations: The share of the joints' acceleration limits that it may use, where the
-            robot's file has such limits.
+        efforts: The fraction of the drives' effort limits that the motion may use; the rest is left
+            for feedback.
+        joint_speeds: The fraction of the joints' velocity limits that the motion may use.
+        joint_accelerations: The fraction of the joints' acceleration limits that the motion may
+            use, if the robot's file has such limits.
         forces: Constraint force -> its least and its largest value in N or N m; null
-            for none. Forces that can only push are 0 or more.
+            for none. Unilateral forces are 0 or more.
         cones: Friction cones of contacts that must not slide.
-        largest_rate: How many times as fast as the references a part of the path may be; 1 for a
-            motion that is slowed where limits require it. No limit if left out.
-        until: The time of the references at which the path ends, in s; if left out `duration`, and
-            then the run lasts as long as the motion, with a governor 0.5 s longer.
+        largest_rate: The largest ratio of the motion's speed to that of the references. With 1 the
+            motion is only slowed down. No limit if left out.
+        until: The time of the references at which the path ends, in s. If left out it is
+            `duration`, and the run lasts as long as the motion, with a governor 0.5 s longer.
         points: The number of intervals of the grid along the path.
-        governor: Whether the motion is slowed while it runs where the robot, off its path, would
-            exceed a limit. If left out it is where that is possible: for a law without observer or
-            exogenous signals, on a path that needs no more than 500 polynomials.
+        governor: Whether the motion is slowed down during the run if the robot, off its path, would
+            exceed a limit. If left out, it is if possible: the law must have no observer and no
+            exogenous signals, and the path at most 500 polynomials.
     """
 
     efforts: float = 0.95

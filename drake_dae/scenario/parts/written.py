@@ -1,4 +1,4 @@
-"""What a scenario writes in another way than the library holds it."""
+"""Forms whose data in a scenario differ from the fields of the library's classes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ T = TypeVar("T")
 
 
 class WrittenForm(ABC, Generic[T]):
-    """What a scenario writes in another way than the library holds it."""
+    """A form that makes an object of another class of the library."""
 
     @abstractmethod
-    def made(self, constraints: Sequence[contact.Constraint]) -> T:
-        """The object that the library holds.
+    def make(self, constraints: Sequence[contact.Constraint]) -> T:
+        """Makes the library's object.
 
         Args:
             constraints: The scenario's constraints made so far.
@@ -32,13 +32,13 @@ class WrittenForm(ABC, Generic[T]):
         """
 
 
-def made(form: T | WrittenForm[T], constraints: Sequence[contact.Constraint]) -> T:
-    """The library's object of a form; the library's own classes are their own forms."""
-    return form.made(constraints) if isinstance(form, WrittenForm) else form
+def make(form: T | WrittenForm[T], constraints: Sequence[contact.Constraint]) -> T:
+    """Makes the library's object of a form; an object of the library is returned as it is."""
+    return form.make(constraints) if isinstance(form, WrittenForm) else form
 
 
 @dataclass(frozen=True)
-class WeldedFrames(WrittenForm[contact.Constraint]):
+class WeldedFramesForm(WrittenForm[contact.Constraint]):
     """Frame B has a fixed pose in frame A, given by angles.
 
     Attributes:
@@ -53,14 +53,14 @@ class WeldedFrames(WrittenForm[contact.Constraint]):
     pose: Pose = field(default_factory=Pose)
     name: str = "weld"
 
-    def made(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+    def make(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
         rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
         pose = RigidTransform(rotation, self.pose.translation)
         return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
 
 
 @dataclass(frozen=True)
-class SurfaceCoordinates(WrittenForm[outputs.PositionOutput]):
+class SurfaceCoordinatesForm(WrittenForm[outputs.PositionOutput]):
     """The coordinates along a constraint.
 
     Attributes:
@@ -69,12 +69,12 @@ class SurfaceCoordinates(WrittenForm[outputs.PositionOutput]):
 
     constraint: str
 
-    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+    def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
         return outputs.SurfaceCoordinates(_named(self.constraint, constraints))
 
 
 @dataclass(frozen=True)
-class TiltFromNormal(WrittenForm[outputs.PositionOutput]):
+class TiltFromNormalForm(WrittenForm[outputs.PositionOutput]):
     """The tilt of a tool's axis from the surface normal at its contact.
 
     Attributes:
@@ -87,7 +87,7 @@ class TiltFromNormal(WrittenForm[outputs.PositionOutput]):
     axis: str
     components: str = ""
 
-    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+    def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
         contact = _named(self.constraint, constraints)
         return outputs.TiltFromNormal(contact, self.axis, self.components)
 

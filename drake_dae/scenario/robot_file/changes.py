@@ -1,4 +1,4 @@
-"""Changes of a scenario to the robot of its file: base, locked joints, actuators, payloads."""
+"""The changes that a scenario makes to its robot: base, locked joints, actuators, payloads."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +12,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
     Joint,
-    JointActuator,
     PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
@@ -25,6 +24,7 @@ from drake_dae.robots.constraints.plant_constraints import Coupling, couplings_o
 from drake_dae.robots.links.frames import joint_names, unique_names
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
+from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
 from drake_dae.scenario.robot_file.payloads import add_payloads
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
@@ -36,15 +36,15 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     Args:
         robot: The key `robot` of the scenario.
         plant: The robot of that file, not finalized.
-        efforts: The effort limits of the file, for actuators that it does not declare.
+        efforts: The effort limits of the file, for new actuators.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: A change does not fit the robot; the message names its key.
     """
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
         couplings = _read_couplings(robot)
-    with _told_by_drake():
+    with _drake_errors():
         if robot.base is not None:
             weld_base(robot.base, plant)
         if robot.locked:
@@ -61,12 +61,12 @@ def finalize(plant: MultibodyPlant) -> None:
     Raises:
         ModelError: Drake cannot finalize it.
     """
-    with _told_by_drake():
+    with _drake_errors():
         plant.Finalize()
 
 
 @contextmanager
-def _told_by_drake() -> Iterator[None]:
+def _drake_errors() -> Iterator[None]:
     """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
     try:
         yield
@@ -77,7 +77,7 @@ def _told_by_drake() -> Iterator[None]:
 
 
 def _read_couplings(robot: Robot) -> Sequence[Coupling]:
-    """The couplings of the file, read from a separate plant: only a finalized plant has them."""
+    """Reads the couplings of the file from a second plant, since the plant must be finalized."""
     plant, _ = read_robot(robot)
     finalize(plant)
     return couplings_of(plant)
@@ -98,11 +98,10 @@ def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
     body = frame.body()
     if body.index() == plant.world_body().index():
         raise ModelError("the world needs no base; name a frame of the robot")
-    held = [joint.name() for joint in _joints(plant) if joint.child_body() is body]
-    if held:
+    if joint := _joints_to_parents(plant).get(body.index()):
         raise ModelError(
-            f"body '{body.name()}' is attached already, by joint '{held[0]}'; unattached bodies: "
-            f"{', '.join(_free_bodies(plant)) or 'none'}"
+            f"body '{body.name()}' is attached already, by joint '{joint.name()}'; unattached "
+            f"bodies: {', '.join(_free_bodies(plant)) or 'none'}"
         )
     rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
     plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
@@ -110,7 +109,7 @@ def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
 
 @at("robot.free")
 def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
-    """Gives bodies without a joint a floating joint in roll, pitch and yaw.
+    """Adds floating joints in roll, pitch and yaw to bodies without a joint.
 
     Raises:
         ScenarioError: There is no such body, or it has a joint.
@@ -118,9 +117,8 @@ def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
     for name in bodies:
         try:
             body = GetScopedFrameByName(plant, name).body()
-            held = [j.name() for j in _joints(plant) if j.child_body().index() == body.index()]
-            if held:
-                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
+            if joint := _joints_to_parents(plant).get(body.index()):
+                raise ModelError(f"'{name}' is not free: joint '{joint.name()}' holds it")
             plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
         except RuntimeError as error:
             raise ModelError(f"'{name}' is no body that can be free: {error}") from None
@@ -132,37 +130,33 @@ def lock_joints(
 ) -> None:
     """Replaces joints by welds at given positions.
 
-    Drake locks joints in discrete time only. A weld has the same motion: X_FM(q) of the joint, from
-    its frame on the parent to that on the child, at the constant q. The torque in the joint becomes
-    internal to a body; the actuator, damping and rotor of the joint are removed.
+    Drake supports locked joints only in discrete time. The weld has the constant pose X_FM(q) of
+    the joint, from its frame on the parent to its frame on the child. The actuator, the damping and
+    the rotor of the joint are removed.
 
-    Joints coupled to a locked one, q_f = ratio q_l + offset, are locked with it, followers and
-    leaders.
+    Joints that are coupled to a locked one by q_f = ratio q_l + offset are locked as well.
 
     Args:
         locked: Name -> position, in rad or m.
         plant: The robot, not finalized; changed.
-        couplings: Those of the plant.
+        couplings: The couplings of the plant.
 
     Raises:
         ScenarioError: There is no such joint, its position is outside of its limits or
-            contradicts a coupling, or the file has other constraints.
+            contradicts a coupling, or the file has constraints other than couplings.
     """
     joints = _movable(plant)
     positions = dict(locked)
-    _spread(positions, couplings)
+    _lock_coupled(positions, couplings)
     for name, value in positions.items():
-        if name not in joints:
-            raise ModelError(unknown_name("turning or sliding joint", name, joints))
-        joint = joints[name]
+        joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         # Round-off of a ratio must not put a finger outside.
         if not low - 1e-9 <= value <= high + 1e-9:
             unit = "m" if isinstance(joint, PrismaticJoint) else "rad"
-            given = "" if name in locked else ", as the joint that it is coupled to has it,"
+            why = "" if name in locked else ", as the joint that it is coupled to has it,"
             raise ModelError(
-                f"{name} = {value:g} {unit}{given} is outside its limits, {low:g} to {high:g} "
-                f"{unit}"
+                f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
     with _without_constraints(plant, couplings):
         for name, value in positions.items():
@@ -193,20 +187,21 @@ def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
 
 
-def _spread(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
-    """Adds the joints that are coupled to those with a position."""
+def _lock_coupled(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
+    """Adds the positions of joints that are coupled to locked ones."""
     for _ in couplings:  # As often as the longest chain needs.
-        for one in couplings:
-            if one.leader in positions:
-                wanted = one.ratio * positions[one.leader] + one.offset
-                value = positions.setdefault(one.follower, wanted)
-                if abs(value - wanted) > 1e-9:
+        for coupling in couplings:
+            leader, follower = coupling.leader, coupling.follower
+            if leader in positions:
+                coupled = coupling.ratio * positions[leader] + coupling.offset
+                value = positions.setdefault(follower, coupled)
+                if abs(value - coupled) > 1e-9:
                     raise ModelError(
-                        f"{one.follower} = {value:g}, but it is coupled to {one.leader} = "
-                        f"{positions[one.leader]:g}, which makes it {wanted:g}; lock one of them"
+                        f"{follower} = {value:g}, but it is coupled to {leader} = "
+                        f"{positions[leader]:g}, which makes it {coupled:g}; lock one of them"
                     )
-            elif one.follower in positions and one.ratio != 0.0:
-                positions[one.leader] = (positions[one.follower] - one.offset) / one.ratio
+            elif follower in positions and coupling.ratio != 0.0:
+                positions[leader] = (positions[follower] - coupling.offset) / coupling.ratio
 
 
 def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
@@ -216,7 +211,7 @@ def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
         pose = RigidTransform(position * joint.translation_axis())
     else:
         pose = RigidTransform(AngleAxis(position, joint.revolute_axis()), np.zeros(3))
-    for actuator in _actuators(plant):
+    for actuator in actuators_of(plant):
         if actuator.joint() is joint:
             plant.RemoveJointActuator(actuator)
     try:
@@ -233,16 +228,16 @@ def drive_joints(
     couplings: Sequence[Coupling],
     efforts: Mapping[str, float],
 ) -> None:
-    """Gives actuators to the joints that a scenario names, and removes those of all others.
+    """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
-    An actuator of the file is kept, with its gear ratio and its rotor.
+    Actuators of the file remain, with their gear ratios and rotors.
 
     Args:
         driven: Names of joints, or name -> effort limit in N m or N; or "all", the revolute and
             prismatic joints that mimic no other.
         plant: The robot, not finalized; changed.
-        couplings: Those of the plant.
-        efforts: Name -> effort limit of the file, for actuators that are new and have none.
+        couplings: The couplings of the plant.
+        efforts: Name -> effort limit of the file, for new actuators without a limit.
 
     Raises:
         ScenarioError: There is no such joint, or it has several positions.
@@ -252,33 +247,29 @@ def drive_joints(
         followers = {coupling.follower for coupling in couplings}
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
-    for name in limits:
-        if name not in joints:
-            raise ModelError(unknown_name("turning or sliding joint", name, joints))
-    chosen = {joints[name].index(): limit for name, limit in limits.items()}
-    names = {joints[name].index(): name for name in limits}
-    has: set[int] = set()
-    for actuator in _actuators(plant):
-        index = actuator.joint().index()
-        if index not in chosen:
+    names = {_named(name, joints).index(): name for name in limits}
+    kept = set()
+    for actuator in actuators_of(plant):
+        name = names.get(actuator.joint().index())
+        kept.add(name)
+        if name is None:
             plant.RemoveJointActuator(actuator)
-            continue
-        has.add(index)
-        if chosen[index] is not None:
-            actuator.set_effort_limit(chosen[index])
-    for index, limit in chosen.items():
-        if index not in has:
-            own = efforts.get(names[index], np.inf)
-            joint = joints[names[index]]
-            plant.AddJointActuator(joint.name(), joint, own if limit is None else limit)
+        elif (limit := limits[name]) is not None:
+            actuator.set_effort_limit(limit)
+    for name in (name for name in limits if name not in kept):
+        joint, limit = joints[name], limits[name]
+        effort = efforts.get(name, np.inf) if limit is None else limit
+        plant.AddJointActuator(joint.name(), joint, effort)
 
 
-def _joints(plant: MultibodyPlant) -> list[Joint]:
-    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
+    if name not in joints:
+        raise ModelError(unknown_name("turning or sliding joint", name, joints))
+    return joints[name]
 
 
 def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
-    """Name -> joint, of those with one position."""
+    """Name -> joint, for revolute and prismatic joints."""
     return {
         name: joint
         for name, joint in joint_names(plant).items()
@@ -286,12 +277,13 @@ def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
     }
 
 
-def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
-    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
+    """Index of a body -> the joint by which it is attached."""
+    return {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
 
 
 def _free_bodies(plant: MultibodyPlant) -> list[str]:
     """The names of the bodies without a joint, except the world."""
-    held = {joint.child_body().index() for joint in _joints(plant)}
+    attached = _joints_to_parents(plant)
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    return unique_names(plant, [body for body in bodies if body.index() not in held])
+    return unique_names(plant, [body for body in bodies if body.index() not in attached])

@@ -22,20 +22,21 @@ class Description(NamedTuple):
 
 
 def find_description(name: str) -> Description:
-    """The robot with a name such as "panda_description"; downloaded if necessary.
+    """Finds the robot with a name such as "panda_description"; clones it if necessary.
 
     Raises:
-        ModelError: There is none, it cannot be downloaded, or the package is not installed.
+        ModelError: There is no such robot, it cannot be cloned, or robot_descriptions is not
+            installed.
     """
     try:
-        known = import_module("robot_descriptions").DESCRIPTIONS
+        names = import_module("robot_descriptions").DESCRIPTIONS
     except ImportError:
         raise ModelError(
             "this takes the package robot_descriptions; pip install 'drake_dae[descriptions]', or "
             "name a file of your own as robot.file"
         ) from None
-    if name not in known:
-        near = get_close_matches(name, known, n=1)
+    if name not in names:
+        near = get_close_matches(name, names, n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise ModelError(
             f"robot_descriptions has no '{name}'; {hint}python -m robot_descriptions list names all"
@@ -62,5 +63,5 @@ def _folders(module: Any, file: Path) -> tuple[Path, ...]:
     package, repository = (
         Path(getattr(module, key, file.parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
     )
-    found = (package, repository, package.parent, repository.parent, file.parent)
-    return tuple(dict.fromkeys(found))
+    folders = (package, repository, package.parent, repository.parent, file.parent)
+    return tuple(dict.fromkeys(folders))

@@ -1,55 +1,50 @@
-"""Effort limits of a robot's files that Drake does not read, or reads in another unit."""
+"""Effort limits in a robot's files that Drake does not read, or reads in another unit."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.robots.links.frames import joint_names
+from drake_dae.scenario.robot_file.loops import actuators_of
+from drake_dae.scenario.robot_file.readable.markup import parsed
 
 Efforts = Mapping[tuple[str, str], float]
-"""Model instance ("" where a file is read alone) and joint -> effort limit in N m or N."""
+"""(model instance, joint) -> effort limit in N m or N; the instance is "" for a single file."""
 
 
 def read_efforts(models: Mapping[str, Path]) -> Efforts:
-    """The effort limits of joints in URDF files; others have none.
+    """Reads the effort limits of joints from URDF files.
 
     Args:
-        models: Model instance, or "", -> file that Drake has read.
+        models: Model instance, or "" for a single file -> the file.
     """
-    found: dict[tuple[str, str], float] = {}
+    efforts: dict[tuple[str, str], float] = {}
     for instance, file in models.items():
-        if file.suffix != ".urdf":
-            continue
-        try:
-            root = ElementTree.fromstring(file.read_bytes())
-        except ElementTree.ParseError:
-            continue  # Drake accepts undeclared prefixes.
-        for joint in root.iterfind("joint"):
+        # Drake reads some files that are not XML, with undeclared prefixes; these have no limits.
+        root = parsed(file.read_bytes())
+        for joint in root.iterfind("joint") if file.suffix == ".urdf" else ():
             limit = joint.find("limit")
-            try:
+            with suppress(ValueError):
                 effort = float("" if limit is None else limit.get("effort", ""))
-            except ValueError:
-                continue
-            if 0.0 < effort < np.inf:  # Many authors write 0 for an unknown limit.
-                found[instance, joint.get("name", "")] = effort
-    return found
+                if 0.0 < effort < np.inf:  # Many authors write 0 for an unknown limit.
+                    efforts[instance, joint.get("name", "")] = effort
+    return efforts
 
 
 def limit_joints(plant: MultibodyPlant, models: Mapping[str, Path]) -> None:
     """Converts limits of the motors in MJCF files to effort limits of their joints.
 
-    A motor of MJCF applies gear times its control to the joint. Drake reads the limit of that
-    control, but its own control is the effort at the joint.
+    In MJCF the effort at a joint is the gear times the control of its motor. Drake reads the limit
+    of this control as a limit of the effort.
 
     Args:
         plant: The robot, not finalized; changed.
-        models: Model instance, or "", -> file that Drake has read.
+        models: Model instance, or "" for a single file -> the file.
     """
-    for index in plant.GetJointActuatorIndices():
-        actuator = plant.get_joint_actuator(index)
+    for actuator in actuators_of(plant):
         instance = plant.GetModelInstanceName(actuator.model_instance())
         file = models.get(instance, models.get("", Path()))
         limit, gear = actuator.effort_limit(), actuator.default_gear_ratio()
@@ -58,7 +53,7 @@ def limit_joints(plant: MultibodyPlant, models: Mapping[str, Path]) -> None:
 
 
 def limits_of(plant: MultibodyPlant, efforts: Efforts) -> dict[str, float]:
-    """The effort limits by the names that joints have in a scenario."""
+    """The effort limits by the names of the joints in a scenario."""
     limits: dict[str, float] = {}
     for name, joint in joint_names(plant).items():
         instance = plant.GetModelInstanceName(joint.model_instance())

@@ -1,4 +1,4 @@
-"""Files of a robot that include themselves, on which Drake's parser would not end."""
+"""A check for files that include themselves, with which Drake's parser would not terminate."""
 
 import re
 from collections.abc import Iterator
@@ -8,29 +8,29 @@ from pydrake.multibody.parsing import PackageMap
 
 from drake_dae.errors import ModelError
 from drake_dae.files import read_bytes
+from drake_dae.scenario.robot_file.readable.markup import without_comments
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _INCLUDED = {
     ".xml": re.compile(r"<include\b[^>]*?\bfile\s*=\s*[\"']\s*([^\"']+)"),
     ".sdf": re.compile(r"<include\b.*?<uri>\s*([^<]*?)\s*</uri>", re.DOTALL),
     ".yaml": re.compile(r"\bfile:\s*[\"']?([^\"'\s,}\]]+)"),
 }
 _INCLUDED[".yml"] = _INCLUDED[".yaml"]
-"""Per kind of file: what it includes."""
+"""Suffix of a file -> the pattern of the files that it includes."""
 
 MOST = 1000
 """The largest number of files of a robot, each counted as often as it is included."""
 
 
 def check_includes(file: Path, packages: PackageMap) -> None:
-    """Refuses a file that includes itself, or more than `MOST` files.
+    """Checks that a file does not include itself, and not more than `MOST` files.
 
     Args:
-        file: MJCF, SDFormat or model directives; others include nothing.
-        packages: The packages that URLs name.
+        file: MJCF, SDFormat or model directives; other files include nothing.
+        packages: The packages for URLs.
 
     Raises:
-        ModelError: It does; the message has the chain of includes.
+        ModelError: The file includes itself, or too many files.
     """
     waiting: list[tuple[Path, ...]] = [(file.resolve(),)]
     count = 0
@@ -41,28 +41,28 @@ def check_includes(file: Path, packages: PackageMap) -> None:
             raise ModelError(f"'{file.name}' includes more than {MOST} files")
         for inner in _included(chain[-1], file, packages):
             if inner in chain:
-                names = " -> ".join(one.name for one in (*chain, inner))
+                names = " -> ".join(included.name for included in (*chain, inner))
                 raise ModelError(f"'{inner.name}' includes itself: {names}")
             waiting.append((*chain, inner))
 
 
 def _included(file: Path, first: Path, packages: PackageMap) -> Iterator[Path]:
-    """The files that a file includes; missing ones are left to Drake's message."""
-    form = _INCLUDED.get(file.suffix)
-    if form is None or not file.is_file():
+    """The files that a file includes, without missing ones, which Drake reports."""
+    pattern = _INCLUDED.get(file.suffix)
+    if pattern is None or not file.is_file():
         return
-    text = _COMMENT.sub("", read_bytes(file).decode("utf-8", errors="replace"))
-    for name in form.findall(text):
+    text = without_comments(read_bytes(file).decode("utf-8", errors="replace"))
+    for name in pattern.findall(text):
         try:
             if "://" in name:
-                places = [Path(packages.ResolveUrl(name))]
+                candidates = [Path(packages.ResolveUrl(name))]
             else:
-                places = [folder / name for folder in (file.parent, first.parent)]
+                candidates = [folder / name for folder in (file.parent, first.parent)]
         except RuntimeError:
             continue
         # A folder stands for a model of SDFormat in it.
-        found = next((place for place in places if place.exists()), None)
-        if found is not None and found.is_dir():
-            found = next(found.glob("*.sdf"), None)
-        if found is not None:
-            yield found.resolve()
+        included = next((path for path in candidates if path.exists()), None)
+        if included is not None and included.is_dir():
+            included = next(included.glob("*.sdf"), None)
+        if included is not None:
+            yield included.resolve()

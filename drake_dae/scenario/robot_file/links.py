@@ -1,4 +1,4 @@
-"""The links of a scenario's robot, and the same robot for a plant of Drake's."""
+"""The robot of a scenario as links for the library, and in a MultibodyPlant of Drake's."""
 
 from collections.abc import Sequence
 
@@ -14,13 +14,13 @@ from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import change_robot, finalize
-from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
+from drake_dae.scenario.robot_file.loops import cut_loops, joints_of, loop_constraints
 from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
 _MASSLESS = 1e-12
-"""An eigenvalue of M(q) below it, relative to the largest, is zero up to round-off."""
+"""An eigenvalue of M(q) below this fraction of the largest one is zero up to round-off."""
 
 
 @at("robot.file")
@@ -55,26 +55,24 @@ def robot_links(
 
     Args:
         robot: The key `robot` of the scenario.
-        scene_graph: Where its geometry is registered.
+        scene_graph: The scene graph for its geometry.
         payloads: The key `plant_payloads` of the scenario, for the links of the plant.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: The file cannot be read or a change does not fit; the message names the key.
     """
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
     add_payloads("plant_payloads", payloads, plant)
     cuts = cut_loops(plant)
     finalize(plant)
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
+    for joint in joints_of(plant):
         if isinstance(joint, QuaternionFloatingJoint):
             name = joint.child_body().name()
             raise ModelError(
-                f"body '{name}' is free; weld it to the world by "
-                f"robot.base, as base: {{weld: {name}}}, or name it in robot.free, which gives it "
-                "a joint in roll, pitch and yaw. A quaternion is not supported: no force keeps its "
-                "length"
+                f"body '{name}' is free, with a quaternion, which is not supported. Weld it to the "
+                f"world by robot.base, as base: {{weld: {name}}}, or name it in robot.free, which "
+                "gives it a joint in roll, pitch and yaw"
             )
     links = MultibodyExpressions(plant)
     _check_mass(plant)
@@ -88,10 +86,10 @@ def robot_links(
 
 
 def _check_mass(plant: MultibodyPlant) -> None:
-    """Refuses joints that move no mass: their acceleration is not determined.
+    """Checks that each joint moves a mass; otherwise its acceleration is not determined.
 
     Raises:
-        ModelError: M(q) is singular in the default configuration, and in others.
+        ModelError: M(q) is singular in the default and in three random configurations.
     """
     context = plant.CreateDefaultContext()
     default = plant.GetPositions(context)
@@ -103,13 +101,13 @@ def _check_mass(plant: MultibodyPlant) -> None:
         null = modes[:, values <= _MASSLESS * values[-1]]
         if not null.size:
             return
-    found = {}
+    massless = {}
     for name, joint in joint_names(plant).items():
-        own = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
-        if np.any(np.abs(null[own]) > 0.1):
-            found[name] = joint.child_body().name()
+        velocities = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        if np.any(np.abs(null[velocities]) > 0.1):
+            massless[name] = joint.child_body().name()
     raise ModelError(
-        f"joints that move no mass: {', '.join(found)}. Links without it, which no force can move: "
-        f"{', '.join(found.values())}; give them <inertial> with mass and inertia, or lock the "
-        "joints by robot.locked"
+        f"joints that move no mass: {', '.join(massless)}. Links without it, which no force can "
+        f"move: {', '.join(massless.values())}; give them <inertial> with mass and inertia, or "
+        "lock the joints by robot.locked"
     )

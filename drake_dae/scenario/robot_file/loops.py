@@ -1,4 +1,4 @@
-"""Joints of a robot's file that close loops: removed from the tree and converted to constraints."""
+"""Joints of a robot's file that close loops: they are replaced by constraints."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from drake_dae.robots.surfaces.surface import axes_along, triple
 
 @dataclass(frozen=True)
 class CutJoint:
-    """A joint that closes a loop, as read from the plant.
+    """A joint that closes a loop and was removed from the plant.
 
     Attributes:
         name: Its name.
@@ -27,7 +27,7 @@ class CutJoint:
         bodies: The indices of parent and child.
         poses: The poses of its frames on parent and child.
         axis: Its axis in these frames, shape (3,).
-        options: Its damping, limits and motor, as arguments of the constraint.
+        options: Its name, damping, limits and motor, as arguments of the constraint.
     """
 
     name: str
@@ -39,7 +39,7 @@ class CutJoint:
 
 
 def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
-    """Removes joints of a plant until the others form a tree; driven ones only if necessary.
+    """Removes joints until the others form a tree; driven joints only if necessary.
 
     Args:
         plant: Not finalized; changed.
@@ -47,7 +47,7 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
     Raises:
         ModelError: A loop has no joint that can be cut, or Drake cannot remove it.
     """
-    driven = {a.joint().index(): a for a in _actuators(plant)}
+    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
     return [
         _cut(joint, names.get(joint.index(), joint.name()), driven.get(joint.index()), plant)
@@ -56,10 +56,13 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
 
 
 def closing_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The loop-closing joints of a plant that is not finalized: the others form a tree."""
-    driven = {a.joint().index() for a in _actuators(plant)}
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    joints.sort(key=lambda joint: _reluctance(joint, joint.index() in driven), reverse=True)
+    """The joints that close loops, so that the others form a tree; if possible without motors."""
+    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    joints = sorted(
+        joints_of(plant),
+        key=lambda joint: (not _has_one_position(joint), joint.index() in driven),
+        reverse=True,
+    )
     groups = {index: index for index in range(plant.num_bodies())}
 
     def group(body: int) -> int:
@@ -67,28 +70,34 @@ def closing_joints(plant: MultibodyPlant) -> list[Joint]:
             body = groups[body]
         return body
 
-    found = []
+    closing = []
     for joint in joints:
-        first, second = (
-            group(int(body.index())) for body in (joint.parent_body(), joint.child_body())
-        )
+        first = group(int(joint.parent_body().index()))
+        second = group(int(joint.child_body().index()))
         groups[first] = second
         if first == second:
-            found.append(joint)
-    return found
+            closing.append(joint)
+    return closing
 
 
-def _reluctance(joint: Joint, is_driven: bool) -> int:
-    """Joints with a higher value are cut later."""
-    if not isinstance(joint, RevoluteJoint | PrismaticJoint):
-        return 2
-    return 1 if is_driven else 0
+def joints_of(plant: MultibodyPlant) -> list[Joint]:
+    """The joints of a plant."""
+    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+
+
+def actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
+    """The actuators of a plant."""
+    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+
+
+def _has_one_position(joint: Joint) -> bool:
+    return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
 def _cut(
     joint: Joint, name: str, actuator: JointActuator | None, plant: MultibodyPlant
 ) -> CutJoint:
-    if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+    if not _has_one_position(joint):
         raise ModelError(
             f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
             "and write it under constraints, as a !WeldedFrames or !CoincidentPoints"
@@ -110,12 +119,12 @@ def _cut(
         limits["effort_limit"] = actuator.effort_limit()
         plant.RemoveJointActuator(actuator)
     options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
-    frames = joint.frame_on_parent(), joint.frame_on_child()
+    parent, child = joint.frame_on_parent(), joint.frame_on_child()
     cut = CutJoint(
         name,
         slides,
-        (joint.parent_body().index(), joint.child_body().index()),
-        (frames[0].GetFixedPoseInBodyFrame(), frames[1].GetFixedPoseInBodyFrame()),
+        (parent.body().index(), child.body().index()),
+        (parent.GetFixedPoseInBodyFrame(), child.GetFixedPoseInBodyFrame()),
         np.array(joint.translation_axis() if slides else joint.revolute_axis()),
         options,
     )
@@ -129,8 +138,8 @@ def _cut(
 def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Constraint]:
     """The constraints that replace cut joints.
 
-    If all joints of a loop move in one plane, the constraint is planar: a spatial one would be
-    redundant.
+    If all joints of a loop move in one plane, the constraint is planar, since a spatial constraint
+    would be redundant.
 
     Args:
         cuts: The result of `cut_loops`.
@@ -148,15 +157,15 @@ def _constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
     if cut.slides and normal is not None:
         across = pose.rotation().inverse() @ normal
         axes = np.column_stack([across, np.cross(cut.axis, across), cut.axis])
-    places = [pose @ RigidTransform(RotationMatrix(axes), np.zeros(3)) for pose in cut.poses]
-    own = dict(cut.options)
-    for letter, body, place in zip("ab", bodies, places, strict=True):
-        own[f"frame_{letter}"] = frame_name(plant, body.body_frame())
-        own[f"point_{letter}"] = triple("a point", place.translation())
-        own[f"rpy_{letter}"] = triple("an angle", RollPitchYaw(place.rotation()).vector())
+    options = dict(cut.options)
+    for letter, body, pose in zip("ab", bodies, cut.poses, strict=True):
+        frame = pose @ RigidTransform(RotationMatrix(axes), np.zeros(3))
+        options[f"frame_{letter}"] = frame_name(plant, body.body_frame())
+        options[f"point_{letter}"] = triple("a point", frame.translation())
+        options[f"rpy_{letter}"] = triple("an angle", RollPitchYaw(frame.rotation()).vector())
     if cut.slides:
-        return PrismaticLoopJoint(axis="z", normal=None if normal is None else "x", **own)
-    return RevoluteLoopJoint(axis="z", planar=normal is not None, **own)
+        return PrismaticLoopJoint(axis="z", normal=None if normal is None else "x", **options)
+    return RevoluteLoopJoint(axis="z", planar=normal is not None, **options)
 
 
 def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArray | None:
@@ -167,23 +176,20 @@ def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArra
         axis: Its axis in the world.
         plant: The robot, finalized.
     """
-    others = list(_path(cut, plant))
-    turning = [own for slides, own in others if not slides] + ([] if cut.slides else [axis])
-    sliding = [own for slides, own in others if slides] + ([axis] if cut.slides else [])
+    joints = [*_path(cut, plant), (cut.slides, axis)]
+    turning = [axis for slides, axis in joints if not slides]
+    sliding = [axis for slides, axis in joints if slides]
     if not turning:
         return None
     normal = turning[-1]
-    flat = all(np.linalg.norm(np.cross(normal, one)) < 1e-9 for one in turning)
-    return normal if flat and all(abs(normal @ one) < 1e-9 for one in sliding) else None
+    are_parallel = all(np.linalg.norm(np.cross(normal, axis)) < 1e-9 for axis in turning)
+    return normal if are_parallel and all(abs(normal @ axis) < 1e-9 for axis in sliding) else None
 
 
 def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArray]]:
-    """The joints between two bodies: whether each is prismatic, and its axis in the world."""
+    """The other joints of a loop: whether each is prismatic, and its axis in the world."""
     context = plant.CreateDefaultContext()
-    above: dict[int, Joint] = {
-        int(joint.child_body().index()): joint
-        for joint in (plant.get_joint(index) for index in plant.GetJointIndices())
-    }
+    above = {int(joint.child_body().index()): joint for joint in joints_of(plant)}
     lines: list[dict[int, Joint]] = []
     for body in map(int, cut.bodies):
         line: dict[int, Joint] = {}
@@ -195,7 +201,7 @@ def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArr
         joint = (lines[0] | lines[1])[body]
         if isinstance(joint, WeldJoint):
             continue
-        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+        if not _has_one_position(joint):
             yield False, np.array([1.0, 0.0, 0.0])  # Its motion is not planar.
             yield False, np.array([0.0, 1.0, 0.0])
             continue
@@ -203,7 +209,3 @@ def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArr
         axis = joint.translation_axis() if slides else joint.revolute_axis()
         frame = joint.frame_on_parent().CalcPoseInWorld(context)
         yield slides, frame.rotation() @ axis
-
-
-def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
-    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]

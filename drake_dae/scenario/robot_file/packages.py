@@ -1,8 +1,8 @@
-"""The packages that a robot's files name, "package://<name>/...", found as ROS finds them."""
+"""Finds the packages that a robot's files name, "package://<name>/...", as ROS finds them."""
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydrake.multibody.parsing import PackageMap
@@ -10,11 +10,12 @@ from pydrake.multibody.parsing import PackageMap
 from drake_dae.errors import ModelError
 from drake_dae.files import read_bytes
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.robot_file.readable.markup import without_comments
 from drake_dae.scenario.shipped import FOLDER
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
 _MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
-"""The suffixes of files that may name packages themselves."""
+"""The suffixes of files that may contain names of packages."""
 
 
 def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
@@ -35,20 +36,20 @@ def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
 def find_packages(
     file: str, known: PackageMap, places: Sequence[Path] = ()
 ) -> tuple[list[Path], dict[str, str]]:
-    """Adds the packages that a file names, and those named by the files that it includes.
+    """Adds the packages that a file names, and those that its included files name.
 
-    A package is searched near the file that names it: each folder above that file, and each
-    subfolder of the package's name in one of these, if it has a package.xml with the name. Then it
-    is searched in ROS_PACKAGE_PATH, and then in places.
+    A package is searched near the file that names it: a folder above the file, or a subfolder of
+    the package's name in such a folder, that has a package.xml with the name. Then it is searched
+    in ROS_PACKAGE_PATH, and last as a subfolder of `places`.
 
     Args:
         file: A path, or a URL of a package.
-        known: The packages found already; new ones are added.
+        known: The known packages; the packages that are found are added.
         places: Folders with packages as subfolders of their names.
 
     Returns:
-        The folders of the added packages, and the packages not found: name -> a file that names it,
-        or "" for `file` itself.
+        The folders of the added packages; and the packages that are not found: name -> a file that
+        names it, or "" for `file` itself.
     """
     folders: list[Path] = []
     missing: dict[str, str] = {}
@@ -59,28 +60,28 @@ def find_packages(
         for name in _URL.findall(url):
             if not known.Contains(name) and name not in missing:
                 ros = ros or _ros_packages()
-                found = _beside(name, origin) if origin.name else None
-                if found is None and ros.Contains(name):
-                    found = Path(ros.GetPath(name))
-                if found is None:
-                    found = next((one / name for one in places if (one / name).is_dir()), None)
-                if found is None:
+                folder = _beside(name, origin) if origin.name else None
+                if folder is None and ros.Contains(name):
+                    folder = Path(ros.GetPath(name))
+                if folder is None:
+                    inside = (place / name for place in places)
+                    folder = next((path for path in inside if path.is_dir()), None)
+                if folder is None:
                     missing[name] = str(origin) if origin.name else ""
                     continue
-                known.Add(name, str(found))
-                folders.append(found)
+                known.Add(name, str(folder))
+                folders.append(folder)
         path = _path(url, known)
         if path is None or path in seen or path.suffix not in _MODEL or not path.is_file():
             continue
         seen.add(path)
-        text = path.read_text("utf-8", errors="replace")
-        text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-        waiting.extend((found[0], path) for found in _URL.finditer(text))
+        text = without_comments(path.read_text("utf-8", errors="replace"))
+        waiting.extend((match[0], path) for match in _URL.finditer(text))
     return folders, missing
 
 
 def explained(missing: Mapping[str, str]) -> str:
-    """The remedy for packages that are not found, as text."""
+    """The error message for packages that are not found."""
     name, origin = next(iter(missing.items()))
     where = (
         f", which '{Path(origin).name}' names, is neither beside it" if origin else " is neither"
@@ -95,7 +96,7 @@ def explained(missing: Mapping[str, str]) -> str:
 
 
 def _path(url: str, known: PackageMap) -> Path | None:
-    """The file of a path or a URL; None if there is none."""
+    """The file of a path or a URL; None if the package is unknown."""
     if "://" not in url:
         return Path(url)
     try:
@@ -105,22 +106,22 @@ def _path(url: str, known: PackageMap) -> Path | None:
 
 
 def _beside(name: str, file: Path) -> Path | None:
-    """The folder of a package in the folders above a file."""
+    """The folder of a package above a file, or beside a folder above it; None if there is none."""
     for above in file.resolve().parents:
         for folder in (above, above / name):
-            if name in _names(folder / "package.xml"):
+            if _package_name(folder / "package.xml") == name:
                 return folder
     return None
 
 
-def _names(package: Path) -> Iterator[str]:
-    """The name in a package.xml, if there is one."""
+def _package_name(file: Path) -> str:
+    """The name in a package.xml; empty if there is none."""
     try:
-        text = read_bytes(package).decode("utf-8", errors="replace")
+        text = without_comments(read_bytes(file).decode("utf-8", errors="replace"))
     except (OSError, ValueError):
-        return
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    yield from re.findall(r"<name>\s*([^<]*?)\s*</name>", text)[:1]
+        return ""
+    match = re.search(r"<name>\s*([^<]*?)\s*</name>", text)
+    return match[1] if match else ""
 
 
 def _ros_packages() -> PackageMap:

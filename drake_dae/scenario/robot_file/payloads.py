@@ -38,7 +38,7 @@ def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -
     """Adds payloads to a plant that is not finalized.
 
     Args:
-        key: The key of the scenario that has them.
+        key: The key of the scenario with these payloads.
         payloads: The payloads.
         plant: The plant.
 

@@ -1,4 +1,4 @@
-"""The robot's files as a MultibodyPlant, with the changes of a scenario."""
+"""Reads a robot's files into a MultibodyPlant."""
 
 import logging
 import re
@@ -19,7 +19,9 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.descriptions import find_description
 from drake_dae.scenario.robot_file.efforts import Efforts, limit_joints, read_efforts
 from drake_dae.scenario.robot_file.includes import check_includes
+from drake_dae.scenario.robot_file.loops import joints_of
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
+from drake_dae.scenario.robot_file.readable.markup import without_comments
 from drake_dae.scenario.robot_file.readable.meshes import DRAWN, ReadableCopies, add_models
 from drake_dae.scenario.robot_file.readable.placing import add_floating_joints
 from drake_dae.scenario.robot_file.resources import check_resources, package_folder
@@ -32,24 +34,24 @@ _IDLE = {
     *("timestep", "integrator", "solver", "iterations", "ls_iterations", "tolerance", "jacobian"),
     *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
 }
-"""Parts of MJCF that Drake ignores and that do not affect the equations."""
+"""Tags and attributes of MJCF that Drake ignores and that do not affect the equations."""
 
 
 def read_robot(
     robot: Robot, scene_graph: SceneGraph | None = None
 ) -> tuple[MultibodyPlant, Efforts]:
-    """A plant in continuous time with the models of the robot's file, not finalized.
+    """Makes a plant in continuous time with the models of the robot's file, not finalized.
 
     Args:
         robot: The key `robot` of the scenario.
-        scene_graph: Registers the robot's geometry; None leaves geometry out.
+        scene_graph: The scene graph for the robot's geometry; None leaves geometry out.
 
     Returns:
-        The plant, and the effort limits of joints without an actuator.
+        The plant, and the effort limits of the file.
 
     Raises:
         ModelError: The files cannot be read, or are not supported.
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: A key of the scenario does not fit; the message names the key.
     """
     # In continuous time, in which the plant's own dynamics are those of (37).
     plant = MultibodyPlant(0.0)
@@ -66,28 +68,28 @@ def read_into(
     Args:
         plant: The plant.
         robot: The key `robot` of the scenario.
-        scene_graph: Registers the plant's geometry; None leaves geometry out.
+        scene_graph: The scene graph for the plant's geometry; None leaves geometry out.
 
     Returns:
-        The effort limits of joints without an actuator.
+        The effort limits of the file.
     """
-    name, places = robot.file, tuple[Path, ...]()
+    name, described = robot.file, tuple[Path, ...]()
     if robot.description:
         with at("robot.description"):
-            described = find_description(robot.description)
-        name, places = str(described.file), described.folders
+            description = find_description(robot.description)
+        name, described = str(description.file), description.folders
     is_url = name.startswith("package://")
     if not is_url and not _is_file(name):
         raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
     parser = Parser(plant)
     missing: dict[str, str] = {}
-    placed = [robot.base.weld] if robot.base is not None else []
-    copies = ReadableCopies(robot.leave_out, [*placed, *robot.free])
+    base = [robot.base.weld] if robot.base is not None else []
+    copies = ReadableCopies(robot.leave_out, [*base, *robot.free])
     with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
             add_packages(robot.packages, packages)
-            folders, missing = find_packages(name, packages, places)
+            folders, missing = find_packages(name, packages, described)
             file = Path(packages.ResolveUrl(name) if is_url else name)
             check_includes(file, packages)
             _check_text(file)
@@ -113,9 +115,9 @@ def read_into(
     if warned:
         raise ModelError("; ".join(_explained(copies.named(text)) for text in warned))
     if scene_graph is not None:
-        own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
-        own += places[:2]  # The package and the repository of a description.
-        check_resources(scene_graph, [*own, *folders])
+        folders += [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
+        folders += described[:2]  # The package and the repository of a description.
+        check_resources(scene_graph, folders)
         _warn_of_omitted(copies.left_out, scene_graph)
     return read_efforts(models)
 
@@ -130,17 +132,17 @@ _REMEDIES = {
     r"pos_lower_limits": "the lower limit of a joint is above its upper limit; mend them in the "
     "file",
 }
-"""A part of Drake's message -> the remedy."""
+"""A pattern in Drake's messages -> the remedy."""
 
 
 def _with_remedy(text: str) -> str:
     """A message of Drake's, with the remedy."""
-    remedies = (remedy for known, remedy in _REMEDIES.items() if re.search(known, text))
+    remedies = (remedy for pattern, remedy in _REMEDIES.items() if re.search(pattern, text))
     return "; ".join([text.rstrip("."), *remedies]) if text else text
 
 
 def _is_answered(warning: str, robot: Robot) -> bool:
-    """Whether a warning of Drake's parser is settled by the scenario."""
+    """Whether the scenario has the key that a warning of Drake's parser requires."""
     if "effort limit" in warning:
         return robot.actuators is not None
     if "inertia" in warning:
@@ -151,7 +153,7 @@ def _is_answered(warning: str, robot: Robot) -> bool:
 
 
 def _warn_of_repairs(copies: ReadableCopies, robot: Robot) -> None:
-    """Warns of impossible inertias, with their replacements."""
+    """Warns of impossible inertias that are replaced; raises an error if they must not be."""
     if not copies.repaired:
         return
     if "inertia" not in robot.leave_out:
@@ -164,17 +166,14 @@ def _warn_of_repairs(copies: ReadableCopies, robot: Robot) -> None:
 
 
 def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
-    """Removes position limits that are empty intervals, and speed limits of 0.
-
-    Many authors write 0 for an unknown limit.
+    """Removes limits that are empty intervals: many authors write 0 for an unknown limit.
 
     Args:
         plant: The robot, not finalized; changed.
-        of_positions: Whether position limits are removed.
+        of_positions: Whether position limits are removed as well.
     """
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
-        unlimited = np.full(1, np.inf)
+    unlimited = np.full(1, np.inf)
+    for joint in joints_of(plant):
         if joint.num_positions() != 1:
             continue
         if of_positions and joint.position_lower_limits() == joint.position_upper_limits():
@@ -184,7 +183,7 @@ def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
 
 
 def _warn_of_omitted(unread: list[Path], scene_graph: SceneGraph) -> None:
-    """Warns of geometry that is not read, or not drawn, in one line each."""
+    """Warns of geometry that Drake cannot read, and of geometry that Meshcat cannot draw."""
     if unread:
         warnings.warn(
             f"geometry that Drake cannot read is left out: {_listed(unread)}; no equation needs it",
@@ -249,9 +248,9 @@ class _Dropped(logging.Filter):
 
 
 def _explained(warning: str) -> str:
-    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint.
+    """Adds the name of link or joint to a warning "<file>:<line>: warning: <text>" of Drake's.
 
-    For SDFormat the file and line may be missing.
+    For SDFormat file and line may be missing.
     """
     before, _, text = warning.rpartition("warning: ")
     place = before.removesuffix(": ") or "the robot's file"
@@ -284,14 +283,14 @@ def _explained(warning: str) -> str:
 
 
 _WITH_COMMA = re.compile(r"(?:=\s*[\"']|>)\s*([-+.\deE\s]*\d,\d[-+.\deE,\s]*)[\"'<]")
-"""A value of XML with numbers only, and a comma between two digits."""
+"""A value in XML that consists of numbers, with a comma between two digits."""
 
 
 def _check_text(file: Path) -> None:
-    """Refuses text that Drake ignores: a second robot in a URDF, and digits after a comma."""
+    """Checks for errors that Drake ignores: several robots in a URDF, and commas in numbers."""
     if file.suffix not in (".urdf", ".sdf", ".xml"):
         return
-    text = re.sub(r"<!--.*?-->", _lines, file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    text = without_comments(file.read_text("utf-8", errors="replace"))
     if comma := _WITH_COMMA.search(text):
         line = text.count("\n", 0, comma.start(1)) + 1
         raise ModelError(
@@ -303,11 +302,6 @@ def _check_text(file: Path) -> None:
     names = re.findall(r"<robot\b[^>]*", text)
     if len(names) > 1:
         raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
-
-
-def _lines(found: re.Match[str]) -> str:
-    """The line breaks of the text."""
-    return "\n" * found[0].count("\n")
 
 
 def _is_file(name: str) -> bool:

@@ -1,7 +1,7 @@
-"""The files that a robot's geometry may be read from.
+"""Checks from which files a robot's geometry is read.
 
 Meshcat copies meshes, and the files that they name, into its HTML page. A model from an untrusted
-source could name any file of this machine, which would be disclosed with the page.
+source could name any file of this machine, and the page would disclose it.
 """
 
 import json
@@ -31,23 +31,23 @@ _OUTSIDE = (
 
 
 def package_folder(model: Path) -> Path:
-    """The folder that a model file may read from: its package's, or else its own."""
+    """The folder from which a model's file may read: that of its package, or its own if in none."""
     folder = model.resolve().parent
-    homes = (above for above in (folder, *folder.parents) if (above / "package.xml").is_file())
-    return next(homes, folder)
+    packages = (path for path in (folder, *folder.parents) if (path / "package.xml").is_file())
+    return next(packages, folder)
 
 
 def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
-    """Refuses meshes, textures and files named by meshes that are outside of all folders.
+    """Checks that meshes, textures and the files that they name are inside of some folders.
 
-    Symbolic links are followed: the actual path counts. Drake's own packages are always allowed.
+    Symbolic links are resolved. Drake's own packages are always allowed.
 
     Args:
-        scene_graph: With the geometry of the robot, not drawn yet.
-        folders: Of the model and its packages.
+        scene_graph: The scene graph with the geometry of the robot, not drawn yet.
+        folders: The folders of the model and its packages.
 
     Raises:
-        ModelError: The link, the file and what it names.
+        ModelError: A file is outside; the message has the link, the file, and the file it names.
     """
     allowed = [folder.resolve() for folder in (*folders, *_drake_folders())]
     inspector = scene_graph.model_inspector()
@@ -69,7 +69,7 @@ def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
 
 
 def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
-    """Refuses files outside of the folders that a file names, directly or through others."""
+    """Checks the files that a file names, directly or through other files."""
     waiting, seen = [file], set()
     while waiting:
         current = waiting.pop()
@@ -91,7 +91,7 @@ def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
 
 
 def _references(file: Path) -> Iterator[str]:
-    """The files that a mesh or a material names, as written."""
+    """The names of files in a mesh or a material."""
     kind = file.suffix.lower()
     if kind not in (".gltf", ".obj", ".mtl", ".dae"):
         return

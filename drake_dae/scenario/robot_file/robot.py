@@ -1,4 +1,4 @@
-"""The robot of a scenario: a file, and additions to it."""
+"""The robot of a scenario: a file, and changes of it."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +17,10 @@ from drake_dae.scenario.robot_file.payloads import Payload
 
 @dataclass(frozen=True)
 class Pose:
-    """The pose of a frame in another one, as in Drake's model directives.
+    """The pose of a frame relative to another one, as in Drake's model directives.
 
     Attributes:
-        translation: Its origin, m.
+        translation: The position of its origin, m.
         rpy_deg: Roll, pitch and yaw, in degrees.
     """
 
@@ -43,7 +43,7 @@ class RobotPlacement:
 
 
 def _actuators(value: Any) -> Any:
-    """Checks the forms in which driven joints may be named."""
+    """Checks the value of `actuators`."""
     if value is None or value == "all":
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
@@ -79,49 +79,51 @@ Actuators = Annotated[
         }
     ),
 ]
-"""The driven joints: "all", names, or name -> effort limit."""
+"""The driven joints: "all", a list of names, or name -> effort limit."""
 
 
 LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
-"""The parts of a robot's file that a scenario may leave out."""
+"""The parts of a robot's file that a scenario can leave out."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot that Drake's Parser reads, with additions to its file.
+    """A robot's file that Drake's Parser reads, with changes.
 
     Meshes that Drake cannot read, such as collision meshes in .stl or .dae, are left out: no
-    equation needs them. Joints that mimic another one become constraints "<joint>_coupler". A joint
-    that closes a loop, as in SDFormat, becomes a constraint of its name; of each loop a joint
-    without motor is chosen, if there is one.
+    equation needs them. A joint that mimics another one becomes a constraint "<joint>_coupler". In
+    each closed loop of joints one joint, if possible one without motor, becomes a constraint of the
+    joint's name.
 
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
-        description: Instead of a file: a robot of the package robot_descriptions by its name there,
-            "panda_description", cloned when it is first used (the extra `descriptions`).
-        packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Not
-            needed for packages with a package.xml in a folder above the file that names them, or in
-            a folder of their name beside one of these, nor for those in ROS_PACKAGE_PATH.
-        free: Names of bodies without a joint, "object" or "puck::object", or that the file fixes to
-            the world: they get a joint in roll, pitch and yaw, with the positions "object_qx",
-            "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file also gets such positions,
-            instead of a quaternion.
-        base: The link that is welded to the world, if the file does not do it, or does it at
+        description: Instead of a file: the name of a robot in the package robot_descriptions, such
+            as "panda_description". It is cloned when it is first used. It needs the extra
+            `descriptions`.
+        packages: Name -> folder, relative to the scenario, of a package in "package://<name>/...".
+            Packages are found without this key if their package.xml is in a folder above the file
+            that names them, or in a folder of the package's name in one of these, or in
+            ROS_PACKAGE_PATH.
+        free: Names of bodies, "object" or "puck::object", that have no joint or that the file fixes
+            to the world. They get a joint in roll, pitch and yaw, with the positions "object_qx",
+            "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file gets such positions as
+            well, instead of a quaternion.
+        base: The link that is welded to the world, if the file does not weld it, or welds it at
             another pose.
         locked: Joint name -> constant position in rad or m, for revolute and prismatic joints;
             joints coupled to it are locked as well. The rest of the scenario must not name locked
             joints.
         actuators: The driven joints, if they differ from those of the file: a list of names, or
             name -> effort limit in N m or N, or "all" revolute and prismatic joints that mimic no
-            other. A limit that is not given is that of the file. Controls have this order, after
+            other. Without a number the limit is that of the file. Controls have this order, after
             those of the file's own actuators.
-        leave_out: Parts of the file to leave out, which are refused otherwise: joint_friction,
-            which is Coulomb friction; inertia, impossible inertias, which are replaced by the
-            nearest possible ones; empty_limits, position limits that are empty intervals, 0 to 0
-            for example; constraints, all those of the file except joints, such as <equality> of
-            MJCF, to be written under `constraints` instead.
-        payloads: Masses attached to it, in plant and law.
+        leave_out: Parts of the file that are left out, and are errors otherwise. joint_friction:
+            Coulomb friction of joints. inertia: impossible inertias, which are replaced by the
+            nearest possible ones. empty_limits: position limits that are empty intervals, such as 0
+            to 0. constraints: all constraints of the file except joints, such as <equality> of
+            MJCF; write them under `constraints` instead.
+        payloads: Masses attached to the robot, known to plant and law.
     """
 
     file: str = ""
@@ -136,10 +138,10 @@ class Robot:
 
     def __post_init__(self) -> None:
         if bool(self.file) == bool(self.description):
-            wanted = "the key 'file', or 'description' for a robot of robot_descriptions"
-            raise ModelError(f"needs {wanted}{', not both' if self.file else ''}")
+            keys = "the key 'file', or 'description' for a robot of robot_descriptions"
+            raise ModelError(f"needs {keys}{', not both' if self.file else ''}")
 
     @property
     def title(self) -> str:
-        """Its name in messages and systems: "two_arms" of "two_arms.dmd.yaml"."""
+        """The robot's name in messages and systems: "two_arms" for "two_arms.dmd.yaml"."""
         return self.description or Path(self.file).name.split(".")[0]

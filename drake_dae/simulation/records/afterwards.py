@@ -1,4 +1,4 @@
-"""Signals of a record that are computed from the logged ones."""
+"""The signals of a record that are computed from the logged signals."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -17,7 +17,7 @@ from drake_dae.systems.plants.contract import Plant
 
 
 class RecordedLoop(Protocol):
-    """The parts of a closed loop from which a record is computed; see `ClosedLoop`."""
+    """The parts of a closed loop that `completed` needs; see `ClosedLoop`."""
 
     @property
     def plant(self) -> Plant:
@@ -49,7 +49,7 @@ class RecordedLoop(Protocol):
 
 
 def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
-    """A record with the signals computed from the log of a loop.
+    """Adds the signals that are computed from the log of a loop.
 
     Args:
         logged: The logged signals.
@@ -71,40 +71,40 @@ def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     if loop.generator is not None and "reference" not in values:
         values["reference"] = _along(loop.generator, times, context)
     if "control" not in known:
-        given = {**known, "reference": values["reference"]}
-        values["control"] = known["control"] = _control_along(loop, context, times, given)
+        inputs = {**known, "reference": values["reference"]}
+        values["control"] = known["control"] = _control_along(loop, context, times, inputs)
     values |= {port: plant.along(port, known) for port in plant.functions}
     return Record(times, {n: Recorded(values[n], tuple(loop.signals[n])) for n in loop.signals})
 
 
 def _control_along(
-    loop: RecordedLoop, context: Context, times: FloatArray, given: dict[str, FloatArray]
+    loop: RecordedLoop, context: Context, times: FloatArray, inputs: dict[str, FloatArray]
 ) -> FloatArray:
     """The control of a continuous law, as a function of the other signals."""
     plant, controller, law = loop.plant, loop.controller, loop.controller.law
-    of_plant = given["parameters"]
+    of_plant = inputs["parameters"]
     gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
     motion = plant.motion_under(law.function) if gains is not None else None
     if gains is None:
         gains = _parameters_along(loop, controller, context, times)
-    if law.measured_force and "measured_force" not in given:
+    if law.measured_force and "measured_force" not in inputs:
         # Without a sensor; a law that only integrates the force does not need it here.
-        given["measured_force"] = (
-            plant.along("constraint_force", given)
+        inputs["measured_force"] = (
+            plant.along("constraint_force", inputs)
             if law.control_takes_force
             else np.zeros((times.size, plant.dae.num_constraints))
         )
-    given["parameters"] = gains
+    inputs["parameters"] = gains
     if motion is None or not motion.is_machine_code:
-        return function_along(law.function, given)
+        return function_along(law.function, inputs)
 
-    def alone(moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
-        """The control at times where the plant has no value."""
+    def without_plant(moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
+        """The control at times at which the plant cannot be evaluated."""
         values = law.function.evaluate(*moment[:3])
         return values if law.function.is_valid else None
 
-    # Uses existing machine code instead of code for the law alone.
-    return function_along(motion, {**given, "law": gains, "plant": of_plant}, alone)
+    # Uses the machine code of plant and law, instead of compiling the law by itself.
+    return function_along(motion, {**inputs, "law": gains, "plant": of_plant}, without_plant)
 
 
 def _parameters_along(
@@ -123,21 +123,21 @@ def _along(generator: ReferenceGenerator, times: FloatArray, context: Context) -
 
 
 def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:
-    plant, taker = loop.plant, loop.controller
-    own = taker.GetMyContextFromRoot(context)
-    wires = {"estimated_state": loop.state_source}
+    plant, controller = loop.plant, loop.controller
+    at_controller = controller.GetMyContextFromRoot(context)
+    sources = {"estimated_state": loop.state_source}
     if loop.generator is not None:
-        wires["reference"] = loop.generator.GetOutputPort("reference")
-    for name, giver in wires.items():
-        port = taker.GetInputPort(name)
-        if not port.HasValue(own):
+        sources["reference"] = loop.generator.GetOutputPort("reference")
+    for name, source in sources.items():
+        port = controller.GetInputPort(name)
+        if not port.HasValue(at_controller):
             continue  # The law has its references, and is used at `feedback`.
         try:
-            given = giver.Eval(giver.get_system().GetMyContextFromRoot(context))
+            value = source.Eval(source.get_system().GetMyContextFromRoot(context))
         except DrakeDaeError:
             continue  # At the failure of a run.
-        if not np.array_equal(given, port.Eval(own), equal_nan=True):
-            raise _fixed(name, taker)
+        if not np.array_equal(value, port.Eval(at_controller), equal_nan=True):
+            raise _fixed(name, controller)
     if plant.HasInputPort("feedback"):
         at_plant, port = plant.GetMyContextFromRoot(context), plant.GetInputPort("control")
         if plant.GetInputPort("feedback").HasValue(at_plant) and port.HasValue(at_plant):

@@ -3,10 +3,12 @@
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, number_in
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -16,8 +18,23 @@ TIME = "time"
 _LABEL = re.compile(r"\s*(.+?)(?:\s+\[([^\]]*)\])?\s*")
 """A name, and perhaps its unit in brackets."""
 
-Table = tuple[FloatArray, dict[str, tuple[FloatArray, tuple[Signal, ...]]]]
-"""The times, and name of a signal -> its values, with names and units."""
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A vector signal over time.
+
+    Attributes:
+        values: The values, one row per time, shape (k, size).
+        signals: The name and unit of each column.
+    """
+
+    values: FloatArray
+    signals: tuple[Signal, ...]
+
+
+Table = tuple[FloatArray, dict[str, Recorded]]
+"""The times, and the signals by name."""
 
 
 def label(signal: Signal) -> str:
@@ -25,18 +42,16 @@ def label(signal: Signal) -> str:
     return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
 
 
-def write_csv(
-    path: str | Path, time: FloatArray, signals: Mapping[str, tuple[FloatArray, Sequence[Signal]]]
-) -> None:
+def write_csv(path: str | Path, time: FloatArray, signals: Mapping[str, Recorded]) -> None:
     """Writes the columns "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
 
     Args:
         path: The file.
         time: The times in s, shape (k,).
-        signals: Name of a signal -> its values, shape (k, n), and their names and units.
+        signals: The signals by name.
     """
-    columns = [f"{name}.{label(one)}" for name, (_, own) in signals.items() for one in own]
-    rows = np.column_stack([time, *(values for values, _ in signals.values())])
+    columns = [f"{name}.{label(s)}" for name, course in signals.items() for s in course.signals]
+    rows = np.column_stack([time, *(course.values for course in signals.values())])
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([f"{TIME} [s]", *columns])
@@ -59,27 +74,34 @@ def read_csv(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)
-            found = _columns(path, next(lines, []), columns)
-            rows = list(_numbers(path, lines, [place for place, *_ in found]))
+            chosen = _columns(path, next(lines, []), columns)
+            rows = list(_numbers(path, lines, [place for place, *_ in chosen]))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ModelError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
-    values = np.array(rows).reshape(-1, len(found))
-    labels = dict[str, list[tuple[int, Signal]]]()
+    values = np.array(rows).reshape(-1, len(chosen))
+    groups = dict[str, list[tuple[FloatArray, Signal]]]()
     time = values[:, 0]
-    for number, (_, name, unit) in enumerate(found):
-        signal, dot, entry = name.partition(".")
+    for column, (_, name, unit) in zip(values.T, chosen, strict=True):
+        group, dot, entry = name.partition(".")
         if name == TIME:
-            time = values[:, number]
+            time = column
         elif dot:
-            labels.setdefault(signal, []).append((number, Signal(entry, unit)))
+            groups.setdefault(group, []).append((column, Signal(entry, unit)))
         else:
             raise ModelError(
                 f"{path}: a column of a record is 'time' or '<signal>.<name>', such as "
                 f"'control.joint1_motor', got {brief(name)}"
             )
-    return time, {
-        signal: (values[:, [number for number, _ in own]], tuple(one for _, one in own))
-        for signal, own in labels.items()
+    return time, recorded_groups(groups)
+
+
+def recorded_groups(
+    groups: Mapping[str, Sequence[tuple[FloatArray, Signal]]],
+) -> dict[str, Recorded]:
+    """The signals of a record, each from its columns with their names and units."""
+    return {
+        name: Recorded(np.column_stack([c for c, _ in columns]), tuple(s for _, s in columns))
+        for name, columns in groups.items()
     }
 
 
@@ -95,12 +117,11 @@ def _columns(
         missing = [name for name in columns if name_and_unit(name)[0] not in known]
         if missing:
             raise ModelError(f"{path} has no column {listed(missing)}; it has {listed(known, 30)}")
-        chosen = []
-        for given, meant in columns.items():
-            place, unit = known[name_and_unit(given)[0]]
-            name, said = name_and_unit(meant)
-            chosen.append((place, name, said or unit))
-        parsed = chosen
+        parsed = []
+        for column, target in columns.items():
+            place, unit = known[name_and_unit(column)[0]]
+            name, target_unit = name_and_unit(target)
+            parsed.append((place, name, target_unit or unit))
     names = [name for _, name, _ in parsed]
     if names.count(TIME) != 1:
         raise ModelError(
@@ -127,9 +148,9 @@ def _numbers(
     for count, line in enumerate(lines, 2):
         if not line:
             continue
-        found = [number_in(line[place]) if place < len(line) else None for place in places]
-        if None in found:
-            place = places[found.index(None)]
+        numbers = [number_in(line[place]) if place < len(line) else None for place in places]
+        if None in numbers:
+            place = places[numbers.index(None)]
             entry = brief(line[place]) if place < len(line) else "nothing"
             raise ModelError(f"{path}: line {count} has {entry} where a number is needed")
-        yield [each for each in found if each is not None]
+        yield [number for number in numbers if number is not None]

@@ -1,4 +1,4 @@
-"""Events of opening contacts: on disk, as a table, and in animations."""
+"""The events of opening contacts: on disk, as a table, and in animations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ FLASH = 0.3
 
 
 def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
-    """Events as arrays of plain numbers and text, one row for each event; {} if there are none.
+    """Converts events to arrays of numbers and text, one row per event; {} for no events.
 
     The columns of "events.happened", "events.closed" and "events.impulses" (N s) are the contacts
     "events.contacts"; "events.rest_time" is nan without a value.
@@ -36,7 +36,7 @@ def event_arrays(events: Sequence[ContactEvent]) -> dict[str, np.ndarray]:
 
 
 def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ...]:
-    """The events of arrays made by `event_arrays`.
+    """Converts arrays of `event_arrays` back to events.
 
     Raises:
         KeyError, ValueError: The arrays are those of something else.
@@ -45,13 +45,13 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
         return ()
     names = [str(name) for name in arrays["events.contacts"]]
     columns = ("time", "kind", "happened", "closed", "impulses", "energy_lost", "rest_time")
-    found = []
+    events = []
     for time, kind, happened, closed, impulses, lost, rest in zip(
         *(arrays[f"events.{column}"] for column in columns), strict=True
     ):
         change = ContactChange(str(kind))
         is_impact = change in (ContactChange.IMPACT, ContactChange.REST)
-        found.append(
+        events.append(
             ContactEvent(
                 time=float(time),
                 kind=change,
@@ -62,7 +62,7 @@ def events_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[ContactEvent, ..
                 rest_time=None if np.isnan(rest) else float(rest),
             )
         )
-    return tuple(found)
+    return tuple(events)
 
 
 def _chosen(names: Sequence[str], which: np.ndarray) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def impacts(events: Sequence[ContactEvent]) -> list[ContactEvent]:
 
 
 def flashes(events: Sequence[ContactEvent], names: Sequence[str], times: FloatArray) -> FloatArray:
-    """The brightness of each contact's flash: its impulse relative to the largest, fading.
+    """The brightness of each contact's flash, which fades after an impact.
 
     Args:
         events: The events of a run.
@@ -100,14 +100,14 @@ def flashes(events: Sequence[ContactEvent], names: Sequence[str], times: FloatAr
     Returns:
         0 to 1, one row for each moment.
     """
-    found = np.zeros((times.size, len(names)))
+    brightness = np.zeros((times.size, len(names)))
     largest = max((max(event.impulses) for event in impacts(events)), default=1.0)
     for event in impacts(events):
         since = times - event.time
         fading = np.where((since >= 0.0) & (since < FLASH), 1.0 - since / FLASH, 0.0)
         for name, impulse in zip(event.contacts, event.impulses, strict=True):
             if name in names:
-                column = found[:, list(names).index(name)]
+                column = brightness[:, list(names).index(name)]
                 # The size of a ball of that volume.
                 np.maximum(column, np.cbrt(impulse / largest) * fading, out=column)
-    return found
+    return brightness

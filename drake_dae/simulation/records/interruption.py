@@ -24,9 +24,9 @@ def ending_signals(
     ignored, as under nohup, stays so.
 
     Args:
-        handle: Gets the signal, between two instructions of Python outside of callbacks from
-            CasADi, which loses exceptions raised in them.
-        in_callbacks: Whether it gets the signal in these, too, since it raises nothing.
+        handle: The function, called between two instructions of Python. It is not called in
+            callbacks from CasADi, which loses exceptions.
+        in_callbacks: Whether it is called in callbacks as well, since it raises no exception.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -68,7 +68,7 @@ def end_at_once(number: signal.Signals) -> None:
 
 
 class Interruption:
-    """Remembers the first signal, instead of an exception in the middle of a step.
+    """Stores the first signal, instead of an exception in the middle of a step.
 
     Attributes:
         signal: The first signal, or None. A second one raises a KeyboardInterrupt.

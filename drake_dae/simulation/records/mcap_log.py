@@ -1,4 +1,4 @@
-"""A record as an MCAP log, as Foxglove shows it, and logs of robots in MCAP."""
+"""Records as MCAP logs, which Foxglove shows, and logs of robots in MCAP."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,13 @@ import numpy as np
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records.columns import TIME, Table, name_and_unit
+from drake_dae.simulation.records.columns import (
+    TIME,
+    Recorded,
+    Table,
+    name_and_unit,
+    recorded_groups,
+)
 from drake_dae.simulation.records.optional import optional_module
 
 NANO = 1e-9
@@ -22,7 +28,7 @@ NANO = 1e-9
 def write_mcap(
     path: str | Path,
     time: FloatArray,
-    signals: Mapping[str, tuple[FloatArray, Sequence[Signal]]],
+    signals: Mapping[str, Recorded],
     about: Mapping[str, Any],
 ) -> None:
     """Writes a channel "/<signal>" of JSON messages {"<name>": number} for each signal.
@@ -30,8 +36,8 @@ def write_mcap(
     Args:
         path: The file.
         time: The times in s, shape (k,), not negative.
-        signals: Name of a signal -> its values, shape (k, n), and their names and units.
-        about: What is written as metadata "drake_dae".
+        signals: The signals by name.
+        about: The metadata "drake_dae".
 
     Raises:
         ModelError: mcap is not installed, or a time is negative.
@@ -41,26 +47,27 @@ def write_mcap(
     writer = optional_module("mcap.writer", "a log in MCAP", "mcap").Writer(str(path))
     writer.start(library="drake_dae")
     writer.add_metadata("drake_dae", {"about": json.dumps(about)})
-    for name, (values, own) in signals.items():
+    for name, recorded in signals.items():
         properties = {
-            s.name: {"type": ["number", "null"], "description": s.unit, "unit": s.unit} for s in own
+            s.name: {"type": ["number", "null"], "description": s.unit, "unit": s.unit}
+            for s in recorded.signals
         }
         schema = json.dumps({"title": name, "type": "object", "properties": properties})
         number = writer.register_schema(f"drake_dae.{name}", "jsonschema", schema.encode())
         channel = writer.register_channel(f"/{name}", "json", number)
-        names = [signal.name for signal in own]
-        for count, (moment, row) in enumerate(zip(_ticks(time), values.tolist(), strict=True)):
+        stamps = [round(moment / NANO) for moment in time.tolist()]
+        for count, (stamp, row) in enumerate(zip(stamps, recorded.values.tolist(), strict=True)):
             numbers = [value if np.isfinite(value) else None for value in row]
-            text = json.dumps(dict(zip(names, numbers, strict=True)))
-            writer.add_message(channel, moment, text.encode(), moment, count)
+            text = json.dumps(dict(zip(properties, numbers, strict=True)))
+            writer.add_message(channel, stamp, text.encode(), stamp, count)
     writer.finish()
 
 
 def read_mcap(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     """Reads what `write_mcap` writes, or the log of a robot in JSON or ROS 2's CDR.
 
-    The rows have the times at which messages of the first topic were logged, from the first one of
-    them after which all topics are known; of others a row has the last message until then.
+    There is a row for each message of the first topic, at the time of its logging, as soon as all
+    topics have a message. From another topic a row has the last message before.
 
     Args:
         path: The file.
@@ -80,20 +87,20 @@ def read_mcap(path: str | Path, columns: Mapping[str, str] | None) -> Table:
     units = dict[str, str]()
     try:
         with open(path, "rb") as file:
-            known = reader.make_reader(file, decoder_factories=factories)
-            for schema, channel, message, given in known.iter_decoded_messages(topics):
-                fields = dict(_numbers(channel.topic, given))
+            log = reader.make_reader(file, decoder_factories=factories)
+            for schema, channel, message, content in log.iter_decoded_messages(topics):
+                fields = dict(_numbers(channel.topic, content))
                 if channel.topic not in messages and schema is not None:
                     units |= _units(channel.topic, schema)
                 messages.setdefault(channel.topic, []).append((message.log_time, fields))
     except Exception as error:  # mcap raises many kinds; no decoder for an encoding is one.
         text = getattr(error, "strerror", None) or error
         raise ModelError(f"{path} cannot be read as MCAP: {text}") from None
+    available = [name for topic in messages.values() for name in topic[0][1]]
     if columns is None:
-        columns = {name: name[1:] for own in messages.values() for name in own[0][1]}
+        columns = {name: name[1:] for name in available}
     if not columns:
         raise ModelError(f"{path} has no message with a number")
-    available = [name for own in messages.values() for name in own[0][1]]
     missing = [name for name in columns if name not in available]
     if missing:
         raise ModelError(f"{path} has no {listed(missing)}; it has {listed(available, 30)}")
@@ -106,62 +113,56 @@ def _table(
     units: Mapping[str, str],
     columns: Mapping[str, str],
 ) -> Table:
-    stamps = {topic: np.array([stamp for stamp, _ in own]) for topic, own in messages.items()}
+    stamps = {topic: np.array([stamp for stamp, _ in log]) for topic, log in messages.items()}
     used = list(dict.fromkeys(_topic(name) for name in columns))
     ticks = np.unique(stamps[used[0]])
     ticks = ticks[ticks >= max(stamps[topic][0] for topic in used)]
     rows = {topic: np.searchsorted(stamps[topic], ticks, side="right") - 1 for topic in used}
-    found = dict[str, list[tuple[Signal, FloatArray]]]()
-    for name, meant in columns.items():
-        signal, dot, entry = name_and_unit(meant)[0].partition(".")
-        if not dot or signal == TIME:
+    groups = dict[str, list[tuple[FloatArray, Signal]]]()
+    for name, target in columns.items():
+        target_name, unit = name_and_unit(target)
+        group, dot, entry = target_name.partition(".")
+        if not dot or group == TIME:
             raise ModelError(
                 f"{path}: '{name}' must become '<signal>.<name>', such as 'control.joint1_motor', "
-                f"got '{meant}'; times are those of the messages"
+                f"got '{target}'; times are those of the messages"
             )
-        own = messages[_topic(name)]
-        values = np.array([own[row][1].get(name, np.nan) for row in rows[_topic(name)].tolist()])
-        one = Signal(entry, name_and_unit(meant)[1] or units.get(name, ""))
-        found.setdefault(signal, []).append((one, values))
-    return ticks * NANO, {
-        signal: (np.column_stack([v for _, v in own]), tuple(one for one, _ in own))
-        for signal, own in found.items()
-    }
+        topic = _topic(name)
+        fields = [messages[topic][row][1] for row in rows[topic].tolist()]
+        values = np.array([numbers.get(name, np.nan) for numbers in fields])
+        groups.setdefault(group, []).append((values, Signal(entry, unit or units.get(name, ""))))
+    return ticks * NANO, recorded_groups(groups)
 
 
 class _Json:
-    """What mcap calls a decoder factory, for JSON."""
+    """A decoder factory of mcap, for JSON."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         return json.loads if message_encoding == "json" else None
 
 
-def _numbers(name: str, given: Any) -> Iterator[tuple[str, float]]:
-    """The numbers of a message, with the places where they stand."""
-    if isinstance(given, (bool, int, float)):
-        yield name, float(given)
-    elif isinstance(given, Mapping):
-        for key, value in given.items():
+def _numbers(name: str, content: Any) -> Iterator[tuple[str, float]]:
+    """The numbers in a message, each with the name of its field."""
+    if isinstance(content, (bool, int, float)):
+        yield name, float(content)
+    elif isinstance(content, Mapping):
+        for key, value in content.items():
             yield from _numbers(f"{name}.{key}", np.nan if value is None else value)
-    elif hasattr(given, "__slots__"):  # Messages of ROS 2.
-        for key in given.__slots__:
-            yield from _numbers(f"{name}.{key}", getattr(given, key))
-    elif isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, (str, bytes)):
-        for place, value in enumerate(given):
-            yield from _numbers(f"{name}[{place}]", value)
+    elif hasattr(content, "__slots__"):  # Messages of ROS 2.
+        for key in content.__slots__:
+            yield from _numbers(f"{name}.{key}", getattr(content, key))
+    elif isinstance(content, (Sequence, np.ndarray)) and not isinstance(content, (str, bytes)):
+        for index, value in enumerate(content):
+            yield from _numbers(f"{name}[{index}]", value)
 
 
 def _units(topic: str, schema: Any) -> dict[str, str]:
-    """The units that `write_mcap` has put into a schema."""
+    """Reads the units that `write_mcap` writes into a schema."""
     if schema.encoding != "jsonschema":
         return {}
     properties = json.loads(schema.data).get("properties", {})
-    return {f"{topic}.{key}": str(own.get("unit", "")) for key, own in properties.items()}
+    return {f"{topic}.{key}": str(field.get("unit", "")) for key, field in properties.items()}
 
 
 def _topic(name: str) -> str:
     return name.partition(".")[0]
-
-
-def _ticks(time: FloatArray) -> list[int]:
-    return [round(moment / NANO) for moment in time.tolist()]

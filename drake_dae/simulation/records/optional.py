@@ -6,13 +6,13 @@ from typing import Any
 from drake_dae.errors import ModelError
 
 
-def optional_module(module: str, asked: str, extra: str) -> Any:
-    """A module of a package that an extra of this one installs.
+def optional_module(module: str, user: str, extra: str) -> Any:
+    """Imports a module of an optional package.
 
     Args:
         module: The module's name.
-        asked: What needs it, the beginning of a sentence.
-        extra: The extra.
+        user: The feature that needs it, as the beginning of a sentence.
+        extra: The extra of drake_dae that installs it.
 
     Raises:
         ModelError: It is not installed.
@@ -21,4 +21,4 @@ def optional_module(module: str, asked: str, extra: str) -> Any:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise ModelError(f"{asked} needs {package}: pip install 'drake_dae[{extra}]'") from None
+        raise ModelError(f"{user} needs {package}: pip install 'drake_dae[{extra}]'") from None

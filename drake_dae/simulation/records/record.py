@@ -16,6 +16,7 @@ from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import open_file
+from drake_dae.simulation.records.columns import Recorded as Recorded
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
 from drake_dae.simulation.records.mcap_log import read_mcap, write_mcap
@@ -24,25 +25,11 @@ from drake_dae.simulation.records.versions import versions
 from drake_dae.systems.plants.contact_events import ContactEvent
 
 
-@checked(ModelError)
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A vector signal over time.
-
-    Attributes:
-        values: The values, one row per time, shape (k, size).
-        signals: The name and unit of each column.
-    """
-
-    values: FloatArray
-    signals: tuple[Signal, ...]
-
-
 def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
-    """What the library itself has recorded, without the checks of what a user gives."""
-    found = object.__new__(Recorded)
-    vars(found).update(values=values, signals=signals)
-    return found
+    """A signal that the library itself has recorded, made without checks of the arguments."""
+    recorded = object.__new__(Recorded)
+    vars(recorded).update(values=values, signals=signals)
+    return recorded
 
 
 @checked(ModelError)
@@ -75,17 +62,16 @@ class Record:
             name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
         }
         if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
-            found = ", ".join(f"{name} {size}" for name, size in lengths.items())
-            raise ModelError(f"a record has one sample of each signal at each time, got {found}")
+            text = ", ".join(f"{name} {size}" for name, size in lengths.items())
+            raise ModelError(
+                f"all signals of a record must have as many samples as time, got the sizes {text}"
+            )
         if np.any(np.diff(self.time) <= 0.0):
             raise ModelError("the times of a record must be strictly increasing")
-        for name, (values, signals) in (
-            (name, (recorded.values, recorded.signals)) for name, recorded in self.signals.items()
-        ):
-            if np.ndim(values) != 2 or np.shape(values)[1] != len(signals):
-                raise ModelError(
-                    f"'{name}' of a record has shape {np.shape(values)}, but {len(signals)} names"
-                )
+        for name, recorded in self.signals.items():
+            shape, count = np.shape(recorded.values), len(recorded.signals)
+            if len(shape) != 2 or shape[1] != count:
+                raise ModelError(f"'{name}' of a record has shape {shape}, but {count} names")
 
     def __getitem__(self, name: str) -> FloatArray:
         """The values of a signal, shape (k, size).
@@ -102,8 +88,8 @@ class Record:
         return name in self.signals
 
     def __repr__(self) -> str:
-        found = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
-        return f"Record({self._extent()}, signals={found})"
+        text = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
+        return f"Record({self._extent()}, signals={text})"
 
     def _repr_html_(self) -> str:
         """A table of the signals, as a notebook shows it."""
@@ -124,26 +110,24 @@ class Record:
         return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
 
     def after(self, time: float | None) -> Self:
-        """What was recorded later than a time in s; all for None."""
+        """The part of the record later than a time in s; the whole record for None."""
         if time is None:
             return self
         first = int(np.searchsorted(self.time, time, side="right"))
-        return self._rows(slice(first, None), [one for one in self.events if one.time > time])
+        return self._rows(slice(first, None), [event for event in self.events if event.time > time])
 
     def while_finite(self) -> Self:
         """The record up to the first time at which some signal is not finite."""
-        finite = [np.isfinite(recorded.values).all(axis=1) for recorded in self.signals.values()]
-        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
-        if not broken.any():
+        count = _finite_rows(self.time.size, [r.values for r in self.signals.values()])
+        if count == self.time.size:
             return self
-        count = int(np.argmax(broken))
         last = self.time[count - 1] if count else -np.inf
-        return self._rows(slice(count), [one for one in self.events if one.time <= last])
+        return self._rows(slice(count), [event for event in self.events if event.time <= last])
 
     def _rows(self, rows: slice, events: Sequence[ContactEvent]) -> Self:
         signals = {
-            name: recorded_values(each.values[rows], each.signals)
-            for name, each in self.signals.items()
+            name: recorded_values(recorded.values[rows], recorded.signals)
+            for name, recorded in self.signals.items()
         }
         return type(self)(self.time[rows], signals, tuple(events), self.about)
 
@@ -176,17 +160,16 @@ class Record:
         time = times[0][:count] if times else np.zeros(0)
         first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
         # The last step of a failed run may have values that are not numbers.
-        finite = [np.isfinite(log.data()[:, first:count]).all(axis=0) for log in logs.values()]
-        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
-        count = first + int(np.argmax(broken)) if broken.any() else count
-        time = time[first:count]
+        values = {name: log.data()[:, first:count].T for name, log in logs.items()}
+        finite = _finite_rows(max(count - first, 0), list(values.values()))
+        time = time[first : first + finite]
         # The last sample of a time is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
         return cls(
             time[last].copy(),
             {
-                name: Recorded(log.data()[:, first:count].T[last].copy(), tuple(loggers[name][1]))
-                for name, log in logs.items()
+                name: Recorded(values[name][:finite][last].copy(), tuple(signals))
+                for name, (_, signals) in loggers.items()
             },
         )
 
@@ -207,7 +190,7 @@ class Record:
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
         Events are not among them; see `event_rows`.
         """
-        write_csv(path, self.time, {n: (r.values, r.signals) for n, r in self.signals.items()})
+        write_csv(path, self.time, self.signals)
 
     @classmethod
     def from_csv(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
@@ -226,8 +209,7 @@ class Record:
             ModelError: The file cannot be read, it lacks a column, some entry is not a number, or
                 times do not increase.
         """
-        time, signals = read_csv(path, columns)
-        return cls(time, {name: Recorded(*given) for name, given in signals.items()})
+        return cls(*read_csv(path, columns))
 
     def to_mcap(self, path: str | Path) -> None:
         """Writes the record as MCAP, which Foxglove shows: a channel of JSON for each signal.
@@ -235,8 +217,7 @@ class Record:
         Raises:
             ModelError: mcap is not installed, or a time is negative.
         """
-        signals = {n: (r.values, r.signals) for n, r in self.signals.items()}
-        write_mcap(path, self.time, signals, {"versions": versions(), **self.about})
+        write_mcap(path, self.time, self.signals, {"versions": versions(), **self.about})
 
     @classmethod
     def from_mcap(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
@@ -245,8 +226,7 @@ class Record:
         Raises:
             ModelError: mcap is not installed, or the file cannot be read or lacks a column.
         """
-        time, signals = read_mcap(path, columns)
-        return cls(time, {name: Recorded(*given) for name, given in signals.items()})
+        return cls(*read_mcap(path, columns))
 
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
@@ -318,14 +298,21 @@ RecordAfter = Callable[[float | None], Record]
 R = TypeVar("R", bound=Record)
 
 
+def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
+    """The number of rows before the first one in which some value is not finite."""
+    finite = np.ones(count, bool)
+    for values in columns:
+        finite &= np.isfinite(values).all(axis=1)
+    return count if finite.all() else int(np.argmin(finite))
+
+
 def _read_rows(file: BinaryIO, kind: type[R]) -> R:
     """The rows of a `RecordWriter`; bytes after the last whole row are ignored."""
     head = json.loads(file.readline())
     labels = head["signals"]
     named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
     stops = np.cumsum([1, *map(len, named.values())])
-    data = file.read()
-    width = int(stops[-1])
+    data, width = file.read(), int(stops[-1])
     count = len(data) // (8 * width)
     rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
     # After a power failure, unsynced bytes may be zeros.

@@ -20,10 +20,10 @@ from drake_dae.simulation.records.versions import versions
 from drake_dae.trace.given import result_of
 
 PERIOD = 1.0
-"""Between two appends, in s."""
+"""The time between two appends, in s."""
 
 _SHARE = 0.02
-"""The largest fraction of the run for appending: on a slow disk it is done less often."""
+"""The largest fraction of the run for appending: on a slow disk rows are appended less often."""
 
 
 @checked(ModelError)
@@ -33,18 +33,19 @@ class RecordWriter:
         with RecordWriter("run.part", loop.record) as writer:
             simulate(loop.diagram, context, 10.0, config, after_step=writer.update)
 
-    However the process ends, `Record.load` reads the file up to the last append. It is one line of
-    JSON with names and units, and then rows of numbers (little-endian float64): the time in s and
-    the signals in the order of that line. A truncated file lacks its last row. Events of contacts
-    are not included, but the closed contacts are a signal.
+    `Record.load` reads the file up to the last append, however the process ends. The file consists
+    of a line of JSON with names and units, and rows of numbers (little-endian float64): the time in
+    s and the signals in the order of that line. A truncated last row is ignored. Events of contacts
+    are not included; the closed contacts are a signal.
 
-    The file is created with the first append and never replaces another one. If appending fails, as
-    on a full disk, this warns and tries again a second later; the run continues.
+    The file is created with the first append and never replaces another file. If an append fails,
+    for example on a full disk, a warning is printed once, and the next append is tried later; the
+    run continues.
 
     Args:
         path: The file.
-        record: A function of a context and a time in s (or None) that returns the later record, as
-            `ClosedLoop.record`.
+        record: A function of a context and a time in s (or None) that returns the record after this
+            time, such as `ClosedLoop.record`.
         about: The data to repeat the run, as in `Record`.
 
     Attributes:
@@ -82,7 +83,7 @@ class RecordWriter:
     def update(self, context: Context) -> None:
         """Appends the new part of the record, if an update is due.
 
-        The last row is not written yet: at the end of a run it is replaced by the one after the
+        The last row is not written yet: at the end of a run it is replaced by the row after the
         projection.
 
         Warns:
@@ -91,7 +92,7 @@ class RecordWriter:
         if time.perf_counter() < self._next:
             return
         record = self._made(context)
-        # The time to make it grows with the steps, and does not depend on the disk.
+        # The time to make a record depends on its length, and not on the disk.
         began = time.perf_counter()
         try:
             self._append(record, keep_last=True)

@@ -100,7 +100,7 @@ class LoopRuns:
         changed, size = context.Clone(), program.size
         _, held = program.compiled.start(changed)
         held[program.kept_places] = start[size:]
-        program.compiled.put(changed, context.get_time(), start[:size], held, parameters)
+        program.compiled.set_context(changed, context.get_time(), start[:size], held, parameters)
         return changed
 
     def _initial(self, values: FloatArray) -> tuple[FloatArray, FloatArray, list[ComputedFunction]]:

@@ -12,7 +12,7 @@ from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
 
 _CLOSE = 1e-9
-"""Two numbers are the same up to so much of the largest of their kind."""
+"""The relative difference below which two numbers count as equal."""
 
 
 class ForceBalance:
@@ -31,12 +31,12 @@ class ForceBalance:
         shares: S of z_2 = S lambda, shape (m, m).
         inverse: B^-1, shape (nv, nv).
         theta: The adapted parameters, symbols.
-        entries: Where they stand among all parameters.
+        entries: Their indices among all parameters.
         signals: Names and units of theta.
         parameters: Name -> adapted parameter.
 
     Raises:
-        ModelError: The robot, or a parameter, is none of these.
+        ModelError: The robot or a parameter does not fit; the message has the reason.
     """
 
     def __init__(self, model: RobotModel, adapted: Sequence[str]) -> None:
@@ -62,16 +62,16 @@ class ForceBalance:
             if name not in known:
                 raise ModelError(f"{model.name} has no parameter '{name}'; it has {listed(known)}")
         self.parameters: dict[str, Parameter] = {name: known[name] for name in adapted}
-        self.theta = ca.vertcat(*[each.symbol for each in self.parameters.values()])
+        self.theta = ca.vertcat(*[parameter.symbol for parameter in self.parameters.values()])
         places = [dae.parameter_slice(name) for name in adapted]
         self.entries = [i for place in places for i in range(place.start, place.stop)]
         self.signals = tuple(
-            Signal(name if each.value.size == 1 else f"{name}[{i}]", each.unit)
-            for name, each in self.parameters.items()
-            for i in range(each.value.size)
+            Signal(name if parameter.value.size == 1 else f"{name}[{i}]", parameter.unit)
+            for name, parameter in self.parameters.items()
+            for i in range(parameter.value.size)
         )
         a, s = ca.SX.sym("a", nv), ca.SX.sym("s", nv)
-        self._given = ca.vertcat(a, s, self.theta)
+        self._arguments = ca.vertcat(a, s, self.theta)
         self._needed = ca.mtimes(self.mass, a) - self.coriolis(s) - self._force
         self._regressor = ca.jacobian(self._needed, self.theta)
         self._check_parameters(ca.vertcat(a, s))
@@ -91,44 +91,48 @@ class ForceBalance:
 
     def needed(self, acceleration: ca.SX, sliding: ca.SX, theta: ca.SX) -> ca.SX:
         """W(theta) = M a - C s - F, shape (nv, 1)."""
-        given = ca.vertcat(acceleration, sliding, theta)
-        return ca.substitute(self._needed, self._given, given)
+        arguments = ca.vertcat(acceleration, sliding, theta)
+        return ca.substitute(self._needed, self._arguments, arguments)
 
     def regressor(self, acceleration: ca.SX, sliding: ca.SX, theta: ca.SX) -> ca.SX:
         """Y = dW/dtheta, shape (nv, k)."""
-        given = ca.vertcat(acceleration, sliding, theta)
-        return ca.substitute(self._regressor, self._given, given)
+        arguments = ca.vertcat(acceleration, sliding, theta)
+        return ca.substitute(self._regressor, self._arguments, arguments)
 
-    def _check_parameters(self, given: ca.SX) -> None:
-        """Refuses parameters that W is not linear in, or that anything else depends on."""
-        dae, name = self.model.dae, self.model.name
-        for own, parameter in self.parameters.items():
-            if ca.depends_on(
-                ca.vertcat(dae.k, self.positions, ca.vec(self.shares)), (parameter.symbol)
-            ):
+    def _check_parameters(self, motion: ca.SX) -> None:
+        """Refuses parameters that W is not linear in, or that anything else depends on.
+
+        Args:
+            motion: The symbols of acceleration and sliding in W.
+        """
+        dae = self.model.dae
+        others = ca.vertcat(dae.k, self.positions, ca.vec(self.shares))
+        for name, parameter in self.parameters.items():
+            refused = f"{self.model.name}: '{name}' cannot be adapted:"
+            if ca.depends_on(others, parameter.symbol):
                 raise ModelError(
-                    f"{name}: '{own}' cannot be adapted: constraints or outputs depend on it, not "
-                    "the balance of forces alone"
+                    f"{refused} constraints or outputs depend on it, not the balance of forces "
+                    "alone"
                 )
             if not ca.depends_on(self._needed, parameter.symbol):
-                raise ModelError(f"{name}: '{own}' cannot be adapted: no force depends on it")
+                raise ModelError(f"{refused} no force depends on it")
         if not ca.depends_on(self._regressor, self.theta):
             return
-        inputs = [dae.state, given, dae.parameter_symbol]
+        inputs = [dae.state, motion, dae.parameter_symbol]
         function = ca.Function("Y", inputs, [ca.densify(self._regressor)])
         random, values = np.random.default_rng(0), dae.parameter_values
-        for own in self.parameters:
+        for name in self.parameters:
             for _ in range(4):
                 state = dae.nominal_state + random.normal(size=dae.num_states)
-                other = values.copy()
-                place = dae.parameter_slice(own)
-                other[place] += 1.0 + np.abs(other[place])
-                motion = random.normal(size=given.numel())
-                one, two = (_numbers(function(state, motion, p)) for p in (values, other))
-                if not np.allclose(one, two, rtol=0.0, atol=_CLOSE * np.abs(one).max()):
+                changed = values.copy()
+                place = dae.parameter_slice(name)
+                changed[place] += 1.0 + np.abs(changed[place])
+                rates = random.normal(size=motion.numel())
+                before, after = (_numbers(function(state, rates, p)) for p in (values, changed))
+                if not np.allclose(before, after, rtol=0.0, atol=_CLOSE * np.abs(before).max()):
                     raise ModelError(
-                        f"{name}: '{own}' cannot be adapted: the forces are not linear in it, or "
-                        "not together with another adapted parameter"
+                        f"{self.model.name}: '{name}' cannot be adapted: the forces are not linear "
+                        "in it, or not together with another adapted parameter"
                     )
 
 
@@ -140,8 +144,8 @@ def _check_robot(model: RobotModel) -> None:
     """Refuses a robot for which the proof does not hold."""
     dae, name = model.dae, model.name
     nq, nv = model.links.q.numel(), model.links.v.numel()
-    found = _why_not(model)
-    if found is None and dae.num_states == nq + nv:
+    reason = _why_not(model)
+    if reason is None and dae.num_states == nq + nv:
         friction = ca.jacobian(dae.k, model.links.q).T - dae.g[nq:, :]
         inputs = [dae.state, dae.parameter_symbol]
         function = ca.Function("friction", inputs, [ca.densify(friction)])
@@ -149,25 +153,26 @@ def _check_robot(model: RobotModel) -> None:
         for _ in range(4):
             state = dae.nominal_state + random.normal(size=dae.num_states)
             if np.any(np.abs(_numbers(function(state, dae.parameter_values))) > _CLOSE):
-                found = "its constraint forces have power: friction that grows with the force"
-    if found is not None:
-        raise ModelError(f"{name}: an adaptive law does not fit: {found}")
+                reason = "its constraint forces have power: friction that grows with the force"
+    if reason is not None:
+        raise ModelError(f"{name}: an adaptive law does not fit: {reason}")
 
 
 def _why_not(model: RobotModel) -> str | None:
+    """The reason why an adaptive law does not fit a robot; None if it does."""
     dae, links = model.dae, model.links
     nv, m = links.v.numel(), dae.num_constraints
     if model.stages:
         return "its joints are not rigid; take the links alone, as link_side(model)"
     if not velocities_are_rates(links):
-        return "the velocities of a body that is free to turn are no rates of its coordinates"
+        return "the velocities of a body that is free to turn are not the rates of its coordinates"
     if dae.num_controls != nv:
         return f"it has {dae.num_controls} actuators for {nv} coordinates; each needs its own"
     drive = dae.h[links.q.numel() :, :]
     if not drive.is_constant():
-        return "what its actuators drive depends on the configuration"
+        return "the effect of its actuators depends on the configuration"
     if dae.exogenous.moving:
-        return "parameters that move are not supported"
+        return "exogenous parameters are not supported"
     if dae.sharing is not None:
         return "its constraints are redundant"
     if ca.depends_on(dae.k, links.v):
@@ -177,5 +182,5 @@ def _why_not(model: RobotModel) -> str | None:
     rows = dae.m[dae.num_outputs - m :, :]
     above = dae.m[: dae.num_outputs - m, :]
     if above.nnz() or rows.shape != (m, m) or dae.l[dae.num_outputs - m :, :].nnz():
-        return "all of its constraint forces must be outputs, behind the positions"
+        return "all of its constraint forces must be outputs, after the positions"
     return None

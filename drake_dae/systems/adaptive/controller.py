@@ -25,29 +25,32 @@ from drake_dae.systems.blocks.traced import (
     Block,
     Computation,
     Update,
+    zero,
 )
 from drake_dae.systems.blocks.trials import state_tickets
-from drake_dae.systems.control.contract import Controller, Derived
+from drake_dae.systems.control.contract import Controller, Derived, output_errors
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {
-    "observer": "an adaptive law and an observer would both answer the same error of the model; "
-    "take one of them",
-    "governed": "a governor plans by what the model needs, which an adaptive law does not know yet",
+    "observer": "an adaptive law and an observer would both compensate the same model error; take "
+    "one of them",
+    "governed": "a governor plans with the parameters of the model, which an adaptive law does not "
+    "know yet",
 }
+"""The settings of a loop that it does not support, each with the reason."""
 
 
 @checked(ModelError)
 class AdaptiveController(ParameterizedSystem, Controller):
-    """An `AdaptiveLaw`, whose class comment has equations and proof, with its estimates as state.
+    """An `AdaptiveLaw` with its estimates as state; that class has the equations and the proof.
 
     Input ports:
         estimated_state: x = (q, v), shape (n,).
         reference: R, as for a `TrackingLaw` of the same system.
-        measured_force: lambda from a sensor, shape (m,); with a force_rate. It is integrated only.
-        hold: While it is not 0 estimates and integrals stay as they are, shape (1,): a drive at its
-            limit. Without a wire it is 0.
+        measured_force: lambda from a sensor, shape (m,); with a force_rate. It is only integrated.
+        hold: While it is not 0, estimates and integrals are not updated, shape (1,), for example
+            while a drive is at its limit. Without a wire it is 0.
 
     Output ports:
         control: u, shape (p,).
@@ -57,21 +60,21 @@ class AdaptiveController(ParameterizedSystem, Controller):
         force_integral: zeta, shape (m,); with a force_rate.
         tracking_error: e of the positions by the model, and 0 for forces, shape (p,).
 
-    Numeric parameter 0 has all parameters of the model; those that are adapted only give M_0 of the
-    damping. With a sample period the estimates are held between samples and move by T theta^', and
-    the block does not convert to AutoDiffXd.
+    Numeric parameter 0 has all parameters of the model; the adapted ones are used only for M_0 of
+    the damping. With a sample period the estimates are held between samples and change by T theta^'
+    at each, and the block does not convert to AutoDiffXd.
 
-    `predicted_error` is e(0) exp(-L t), that of exact parameters and s = 0 at the start. Other
-    values leave what V allows.
+    `predicted_error` is e(0) exp(-L t), that of exact parameters and s = 0 at the start. With other
+    values only the bound by V holds.
 
     Args:
         adaptive: The law.
         sample_period: T in s; 0 for continuous estimates.
 
     Raises:
-        ModelError: The period makes no sense.
-        SingularityError: The outputs' rates and J are dependent on the way.
-        NonFiniteError: A value is not finite on the way.
+        ModelError: The period is not valid.
+        SingularityError: The outputs' rates and J are dependent during a run.
+        NonFiniteError: A value is not finite during a run.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -110,12 +113,12 @@ class AdaptiveController(ParameterizedSystem, Controller):
             self.DeclareDiscreteState(start)
             # Unrestricted, as the step of a discrete MultibodyPlant, so that both see one instant.
             self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-            own = {self.xd_ticket()}
+            by_state = {self.xd_ticket()}
         else:
             self.DeclareContinuousState(start)
-            own = state_tickets(self)
-        seen = {self.input_port_ticket(port.get_index()) for port in ports}
-        seen |= own | {self.all_parameters_ticket()}
+            by_state = state_tickets(self)
+        sources = {self.input_port_ticket(port.get_index()) for port in ports}
+        sources |= by_state | {self.all_parameters_ticket()}
         for place, (name, size) in enumerate(
             {
                 "control": dae.num_controls,
@@ -123,24 +126,24 @@ class AdaptiveController(ParameterizedSystem, Controller):
                 "sliding": adaptive.model.links.v.numel(),
             }.items()
         ):
-            self.DeclareVectorOutputPort(name, size, weakly(self._calc, place), seen)
+            self.DeclareVectorOutputPort(name, size, weakly(self._calc, place), sources)
         count, forces = len(adaptive.signals), len(adaptive.force_signals)
         self._parts = {"parameter_estimate": slice(0, count)}
         if forces:
             self._parts["force_integral"] = slice(count, count + forces)
         for name, part in self._parts.items():
             size = part.stop - part.start
-            self.DeclareVectorOutputPort(name, size, weakly(self._copy, part), own)
+            self.DeclareVectorOutputPort(name, size, weakly(self._copy, part), by_state)
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         law = self.adaptive
         speeds = law.model.links.velocity_signals
-        found: dict[str, Sequence[Signal]] = {
+        signals: dict[str, Sequence[Signal]] = {
             "parameter_estimate": law.signals,
-            "sliding": [Signal(f"sliding of {each.name}", each.unit) for each in speeds],
+            "sliding": [Signal(f"sliding of {speed.name}", speed.unit) for speed in speeds],
         }
-        return {**found, **({"force_integral": law.force_signals} if law.force_rate else {})}
+        return {**signals, **({"force_integral": law.force_signals} if law.force_rate else {})}
 
     def set_estimate(self, context: Context, theta: ArrayLike) -> None:
         """Sets the estimates at the start, and integrals of the force to 0.
@@ -163,9 +166,9 @@ class AdaptiveController(ParameterizedSystem, Controller):
         return self.law.all_parameters(self.parameters(context))
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        own = super().parameters_along(context, times)
-        gains = self.law.all_parameters()[own.shape[1] :]
-        return np.hstack([own, np.tile(gains, (own.shape[0], 1))])
+        values = super().parameters_along(context, times)
+        gains = self.law.all_parameters()[values.shape[1] :]
+        return np.hstack([values, np.tile(gains, (values.shape[0], 1))])
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         if not np.array_equal(self.law.design(gains).matrix, self.law.gains.matrix):
@@ -184,9 +187,7 @@ class AdaptiveController(ParameterizedSystem, Controller):
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """`desired_output` r and `tracking_error` z - r, from "reference" and z."""
-        desired, signals = values["reference"][:, self.law.layout.lowest], self.dae.output_signals
-        error = values["controlled_output"] - desired
-        return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
+        return output_errors(self.law, values)
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -202,18 +203,18 @@ class AdaptiveController(ParameterizedSystem, Controller):
             return context.get_discrete_state(0).CopyToVector()
         return context.get_continuous_state_vector().CopyToVector()
 
-    def _calc(self, place: int, context: Context, output: BasicVector) -> None:
-        given = [read(context) for read in self._read]
-        found = self._checked(self.adaptive.function, context, *given, self._memory(context))
-        output.SetFromVector(found[place])
+    def _calc(self, index: int, context: Context, output: BasicVector) -> None:
+        inputs = [read(context) for read in self._read]
+        values = self._checked(self.adaptive.function, context, *inputs, self._memory(context))
+        output.SetFromVector(values[index])
 
     def _copy(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._memory(context)[part])
 
     def _rate(self, context: Context) -> FloatArray:
-        given = [read(context) for read in (*self._read, *self._force)]
+        inputs = [read(context) for read in (*self._read, *self._force)]
         memory = self._memory(context)
-        rate = self._checked(self.adaptive.rates, context, *given, memory)[0]
+        rate = self._checked(self.adaptive.rates, context, *inputs, memory)[0]
         if self._hold.HasValue(context) and self._hold.Eval(context)[0] != 0.0:
             return 0.0 * memory
         return rate
@@ -232,21 +233,21 @@ class AdaptiveController(ParameterizedSystem, Controller):
         read, last = ("estimated_state", "reference"), (memory, PARAMETERS)
         force = ("measured_force",) if law.force_rate else ()
         size = law.start.size
-        own, rate, hold = ca.SX.sym("memory", size), ca.SX.sym("rate", size), ca.SX.sym("hold", 1)
+        held, rate, hold = ca.SX.sym("memory", size), ca.SX.sym("rate", size), ca.SX.sym("hold", 1)
         moves = ca.if_else(hold != 0, 0, rate)
-        after = own + self.sample_period * moves if self.sample_period else moves
-        shown = [own[part.start : part.stop] for part in self._parts.values()]
+        after = held + self.sample_period * moves if self.sample_period else moves
+        shown = [held[part] for part in self._parts.values()]
         moved = Computation(
-            ca.Function("adapted", [rate, own, hold], [after]),
+            ca.Function("adapted", [rate, held, hold], [after]),
             ("memory_rate", memory, "hold"),
             (memory if self.sample_period else DERIVATIVE,),
         )
         computations = [
             Computation.of(law.function, (*read, *last), ("control", "tracking_error", "sliding")),
             Computation.of(law.rates, (*read, *force, *last), ("memory_rate",)),
-            Computation(ca.Function("shown", [own], shown), (memory,), tuple(self._parts)),
+            Computation(ca.Function("shown", [held], shown), (memory,), tuple(self._parts)),
         ]
-        none = Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",))
+
         updates: tuple[Update, ...] = ()
         if self.sample_period:
             updates = (Update(moved, self.sample_period, 0.0, True),)
@@ -256,7 +257,7 @@ class AdaptiveController(ParameterizedSystem, Controller):
             self,
             tuple(computations),
             updates,
-            unwired={"hold": none},
+            unwired={"hold": zero("hold")},
             model=self.dae,
             signals=self._signals,
             ports={
@@ -278,10 +279,10 @@ class AdaptiveController(ParameterizedSystem, Controller):
             sources = [named.get(name, name) for name in function.input_names]
             return TracedFormula(function, output, sources, self._signals)
 
-        found = {name: formula(law.function, name) for name in law.function.output_names}
-        found["derivative"] = formula(law.rates, "memory_rate")
+        formulas = {name: formula(law.function, name) for name in law.function.output_names}
+        formulas["derivative"] = formula(law.rates, "memory_rate")
         memory = ca.SX.sym("memory", law.start.size)
         for name, part in self._parts.items():
-            own = TracedFunction(name, {"state": memory}, {"value": memory[part.start : part.stop]})
-            found[name] = TracedFormula(own)
-        return found
+            function = TracedFunction(name, {"state": memory}, {"value": memory[part]})
+            formulas[name] = TracedFormula(function)
+        return formulas

@@ -20,10 +20,10 @@ from drake_dae.trace.functions import TracedFunction
 
 @checked(ModelError)
 class AdaptiveLaw:
-    """A law that learns parameters of a robot in contact while it tracks, with a proof.
+    """A law that adapts parameters of a robot in contact while it tracks, with a proof.
 
     With rigid joints, M v' = F(q, v) + J^T lambda + B u and J v = 0, where M and F are linear in
-    the adapted parameters theta. From the wanted outputs z_d and the error e = h_1 - z_d follow a
+    the adapted parameters theta. The desired outputs z_d and the error e = h_1 - z_d define a
     velocity and an acceleration in the tangent space of the constraints,
 
         T v_r = (z_d' - L e, 0),    T = (dh_1/dq; J),
@@ -34,40 +34,41 @@ class AdaptiveLaw:
         u = B^-1 (W(theta^) - K s - J^T S^-1 (z_2d - k_F zeta)),    zeta' = z_2 - z_2d,
         theta^' = -Gamma Y^T s,    Y = dW/dtheta,    K = k M_0(q).
 
-    With theta~ = theta^ - theta and the wanted force lambda_c the loop is M s' = Y theta~ -
+    With theta~ = theta^ - theta and the desired force lambda_c the loop is M s' = Y theta~ -
     (C + K) s + J^T (lambda - lambda_c). Of the function
 
         V = s^T M s / 2 + theta~^T Gamma^-1 theta~ / 2
 
-    the derivative is, since s^T (M' - 2 C) s = 0 and no contact force has power on s,
+    the derivative is, since s^T (M' - 2 C) s = 0 and contact forces have no power on s,
 
         V' = -s^T K s <= 0.
 
-    So s and theta~ stay bounded by V at the start; where the wanted motion is bounded s goes to 0,
-    with it e, as e' + L e = (dh_1/dq) s, and the rates of the estimates. The estimates go to theta
-    where the motion excites them: where the integral of Y_t^T Y_t grows over each period, with Y_t
-    the part of Y in the tangent space. A direction that is not excited stays where it is.
+    So s and theta~ stay bounded by V at the start. If the desired motion is bounded, s goes to 0,
+    and so do e, by e' + L e = (dh_1/dq) s, and the rates of the estimates. The estimates converge
+    to theta if the motion excites them, that is, if the integral of Y_t^T Y_t grows over each
+    period, with the part Y_t of Y in the tangent space. Directions that are not excited do not
+    change.
 
     The force has the error of the model along the normals, lambda - lambda_c = -A^-1 (J M^-1
     (Y theta~ - (C + K) s) + J' s): it goes to zero with theta~ and s, and is bounded otherwise.
-    With a force that is measured, k_F > 0, its error obeys e_F' = -k_F e_F + d', so that it goes to
-    zero wherever the error d of the model comes to rest.
+    With a measured force, k_F > 0, its error obeys e_F' = -k_F e_F + d', and goes to zero if the
+    model error d becomes constant.
 
     Sources: Slotine and Li, "On the adaptive control of robot manipulators" (1987), for s and Y;
     Arimoto, Liu and Naniwa (1993) and Parra-Vega and Arimoto (1996) for constraints.
 
     Limits. The plant has exactly this structure, contacts stay closed and frictionless (viscous
-    friction may be adapted), and the state is measured. What is not of the model (other friction, a
-    drive at its limit, a compliant contact, where J s is not 0) adds a term to V', and estimates
-    may drift where nothing excites them. Estimates may be unphysical on the way: the law does not
-    invert M. With Coulomb friction of 0.3 on Drake's contact the tool of the seven-joint wall is
-    taken for 1.8 kg in place of 1.1, with 43 mm of error. Sampled, the error is of the order of T,
-    and V rises at times by the order of T^2.
+    friction may be adapted), and the state is measured. Other effects (other friction, a drive at
+    its limit, a compliant contact, for which J s is not 0) add a term to V', and estimates may
+    drift in directions that are not excited. Estimates may be temporarily unphysical: the law does
+    not invert M. With Coulomb friction of 0.3 on Drake's contact, the mass of the tool of the
+    seven-joint wall is estimated as 1.8 kg instead of 1.1, with 43 mm of error. With samples the
+    error is of the order of T, and V may rise by the order of T^2.
 
     Beside a `DisturbanceObserver`: with a link 10 % heavier than known, samples of 1 ms and poles
     at -4 1/s this law leaves 0.05 mm of error, the observer 0.9 mm at 10 1/s and 0.3 mm at 50 1/s.
-    Take this law where what is wrong has a name and the motion excites it, the observer where it
-    has none or changes with time.
+    Use this law if the errors are in known parameters and the motion excites them, the observer if
+    they are not, or change with time.
 
     Args:
         model: The robot, with rigid joints, as many actuators as coordinates, constraints of
@@ -82,7 +83,7 @@ class AdaptiveLaw:
 
     Attributes:
         model, adapted, rate, damping, force_rate, structure: The arguments.
-        layout: How references are stacked, as for a `TrackingLaw`.
+        layout: The layout of references, as for a `TrackingLaw`.
         entries: The entries of theta among the parameters.
         signals: Names and units of theta.
         force_signals: Names and units of zeta; empty without measured force.
@@ -94,7 +95,7 @@ class AdaptiveLaw:
     Raises:
         AssumptionError: The system violates an assumption of the theory.
         ModelError: A parameter does not enter linearly, constraints or outputs depend on it, or the
-            robot is none of these.
+            robot does not fit.
     """
 
     def __init__(
@@ -119,11 +120,11 @@ class AdaptiveLaw:
                 f"degree 0, got {self.structure.output_degrees}"
             )
         self.entries, self.signals = balance.entries, balance.signals
-        wanted = model.dae.output_signals[count:]
+        force_outputs = model.dae.output_signals[count:]
         self.force_signals: tuple[Signal, ...] = ()
         if self.force_rate:
             self.force_signals = tuple(
-                Signal(f"integral of {signal.name}", f"{signal.unit} s") for signal in wanted
+                Signal(f"integral of {signal.name}", f"{signal.unit} s") for signal in force_outputs
             )
         sizes = [
             balance.parameters[name].value.size * [positive(f"adapted['{name}']", gain)]
@@ -145,8 +146,8 @@ class AdaptiveLaw:
 
     def memory(self, theta: ArrayLike) -> FloatArray:
         """(theta^, zeta) of given estimates, shape (k,), without integrals of the force."""
-        given = vector("theta", theta, len(self.signals))
-        return np.concatenate([given, np.zeros(len(self.force_signals))])
+        estimates = vector("theta", theta, len(self.signals))
+        return np.concatenate([estimates, np.zeros(len(self.force_signals))])
 
     def _trace(self) -> None:
         dae, balance, layout = self.model.dae, self._balance, self.layout
@@ -156,29 +157,29 @@ class AdaptiveLaw:
         integral = ca.SX.sym("integral", len(self.force_signals))
         memory = ca.vertcat(estimate, integral)
 
-        # The wanted motion in the tangent space.
+        # The desired motion in the tangent space.
         lowest = layout.lowest.tolist()
-        wanted, pushed = reference[lowest[:n], :], reference[lowest[n:], :]
+        desired, desired_force = reference[lowest[:n], :], reference[lowest[n:], :]
         speed = reference[[i + 1 for i in lowest[:n]], :]
         acceleration = reference[[i + 2 for i in lowest[:n]], :]
-        error, moves = balance.positions - wanted, ca.jtimes(balance.positions, q, v)
+        error, moves = balance.positions - desired, ca.jtimes(balance.positions, q, v)
         tangent = Factorization(balance.rows)
         still = ca.SX.zeros(balance.num_forces)
-        wished = tangent.solve(ca.vertcat(speed - self.rate * error, still))
-        held = ca.SX.sym("held", wished.numel())
-        turned = ca.jtimes(ca.mtimes(balance.rows, held), q, v)
-        turned = ca.substitute(turned, held, wished)
+        tangent_velocity = tangent.solve(ca.vertcat(speed - self.rate * error, still))
+        symbols = ca.SX.sym("held", tangent_velocity.numel())
+        turned = ca.jtimes(ca.mtimes(balance.rows, symbols), q, v)
+        turned = ca.substitute(turned, symbols, tangent_velocity)
         rises = ca.vertcat(acceleration - self.rate * (moves - speed), still)
-        wished_rate = tangent.solve(rises - turned)
-        sliding = v - wished
+        tangent_acceleration = tangent.solve(rises - turned)
+        sliding = v - tangent_velocity
 
         # The law.
         shares = Factorization(balance.shares)
         pivot = ca.fmin(tangent.pivot, shares.pivot)
-        force, regressor = pushed, balance.regressor(wished_rate, sliding, estimate)
+        force, regressor = desired_force, balance.regressor(tangent_acceleration, sliding, estimate)
         if self.force_rate:
-            force = pushed - self.force_rate * integral
-        effort = balance.needed(wished_rate, sliding, estimate)
+            force = desired_force - self.force_rate * integral
+        effort = balance.needed(tangent_acceleration, sliding, estimate)
         effort -= self.damping * ca.mtimes(balance.mass, sliding)
         if balance.num_forces:
             effort -= ca.mtimes(balance.jacobian.T, shares.solve(force))
@@ -187,7 +188,7 @@ class AdaptiveLaw:
         gamma = ca.DM(self.gamma)
         rate = -gamma * ca.mtimes(regressor.T, sliding)
         if self.force_rate:
-            rate = ca.vertcat(rate, ca.mtimes(balance.shares, measured) - pushed)
+            rate = ca.vertcat(rate, ca.mtimes(balance.shares, measured) - desired_force)
 
         theta = ca.SX.sym("theta", len(self.signals))
         real = ca.substitute(balance.mass, balance.theta, theta)
@@ -197,9 +198,9 @@ class AdaptiveLaw:
         )
         lost = -self.damping * ca.bilin(balance.mass, sliding, sliding)  # V'
 
-        known = {"state": dae.state, "reference": reference}
-        given = {"measured_force": measured} if self.force_rate else {}
-        last = {"memory": memory, "parameters": dae.parameter_symbol}
+        inputs = {"state": dae.state, "reference": reference}
+        force_inputs = {"measured_force": measured} if self.force_rate else {}
+        memory_inputs = {"memory": memory, "parameters": dae.parameter_symbol}
         outputs = {
             "control": control,
             "tracking_error": ca.vertcat(error, still),
@@ -208,7 +209,7 @@ class AdaptiveLaw:
         regular = "the outputs' rates and J, or S, of the adaptive law"
         self.function = TracedFunction(
             f"{dae.name} adaptive law",
-            {**known, **last},
+            {**inputs, **memory_inputs},
             outputs,
             pivot,
             regular,
@@ -216,7 +217,7 @@ class AdaptiveLaw:
         )
         self.rates = TracedFunction(
             f"{dae.name} adaptation",
-            {**known, **given, **last},
+            {**inputs, **force_inputs, **memory_inputs},
             {"memory_rate": rate},
             pivot,
             regular,
@@ -224,7 +225,7 @@ class AdaptiveLaw:
         )
         self.energy = TracedFunction(
             f"{dae.name} energy of the adaptive law",
-            {**known, **last, "theta": theta},
+            {**inputs, **memory_inputs, "theta": theta},
             {"value": energy, "rate": lost, "regressor": regressor},
             pivot,
             regular,

@@ -1,9 +1,8 @@
 """A block on AutoDiffXd.
 
 Drake's Linearize, FirstOrderTaylorApproximation, DirectCollocation and DirectTranscription convert
-a system to AutoDiffXd and read gradients. CasADi has the derivatives already: a converted block
-evaluates the same traced functions as before, and multiplies their traced Jacobians with the
-gradients of its inputs, state and parameters.
+a system to AutoDiffXd and read gradients. A converted block evaluates the same traced functions,
+and multiplies their traced Jacobians with the gradients of its inputs, state and parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,9 +31,10 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
 
     Args:
         original: The block.
-        formulas: Name of an output port -> what it computes; "derivative" -> the time derivative.
-        places: Where parameters stand that come from an input port `exogenous`.
-        references: What the input port `reference` has where it has no wire; None if it needs one.
+        formulas: Name of an output port -> its formula; "derivative" -> that of the time
+            derivative.
+        places: The indices of parameters that come from an input port `exogenous`.
+        references: The value of the input port `reference` without a wire; None if it needs one.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -81,16 +81,13 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             if port.get_data_type() == PortDataType.kAbstractValued:
                 self._law = formulas["control"]
                 self.DeclareAbstractOutputPort(
-                    name,
-                    nothing,
-                    weakly(self._calc_feedback),
-                    tickets["parameters"] | of_reference,
+                    name, nothing, weakly(self._calc_feedback), tickets["parameters"] | of_reference
                 )
                 continue
             if name not in formulas:
                 raise ModelError(
-                    f"{original.get_name()} does not convert to AutoDiffXd: nothing tells how to "
-                    f"differentiate its output port '{name}'; add it to _formulas()"
+                    f"{original.get_name()} does not convert to AutoDiffXd: its output port "
+                    f"'{name}' has no formula; add it to _formulas()"
                 )
             self.DeclareVectorOutputPort(
                 name,
@@ -126,56 +123,58 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:
         """The value with its gradient, an array of AutoDiffXd."""
-        given = [self._source(name, context) for name in formula.sources]
-        return _chained(formula, context.get_time(), given)
+        arguments = [self._source(name, context) for name in formula.sources]
+        return _chained(formula, context.get_time(), arguments)
 
     def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
-        port, known = self.GetInputPort("reference"), {}
+        port, constants = self.GetInputPort("reference"), {}
         if port.HasValue(context):
-            known["reference"] = port.Eval(context)
-        known["parameters"] = self._source("parameters", context)
-        value.set_value(_Feedback(self._law, self._references, known))
+            constants["reference"] = port.Eval(context)
+        constants["parameters"] = self._source("parameters", context)
+        value.set_value(_Feedback(self._law, self._references, constants))
 
 
 class _Feedback(Immutable):
-    """A law as a value on a wire, as `Feedback`.
+    """A law as the value of a port, as `Feedback`.
 
     Args:
         law: The law.
-        references: What its references are.
-        known: Its parameters; and its references, if they are fixed.
+        references: Its references as a function of time.
+        constants: Its parameters; and its references, if they are fixed.
     """
 
-    def __init__(self, law: Formula, references: Formula | None, known: Mapping[str, Any]) -> None:
-        self._law, self._references, self._known = law, references, known
+    def __init__(
+        self, law: Formula, references: Formula | None, constants: Mapping[str, Any]
+    ) -> None:
+        self._law, self._references, self._constants = law, references, constants
 
     def control(self, time: AutoDiffXd, state: Any) -> Any:
         """u at a time and a state, an array of AutoDiffXd."""
-        given = {"estimated_state": state, **self._known}
-        if "reference" not in given and self._references is not None:
-            given["reference"] = _chained(self._references, time, [np.array([time])])
-        return _chained(self._law, time, [given[name] for name in self._law.sources])
+        inputs = {"estimated_state": state, **self._constants}
+        if "reference" not in inputs and self._references is not None:
+            inputs["reference"] = _chained(self._references, time, [np.array([time])])
+        return _chained(self._law, time, [inputs[name] for name in self._law.sources])
 
 
-def _chained(formula: Formula, time: AutoDiffXd, given: Sequence[Any]) -> Any:
+def _chained(formula: Formula, time: AutoDiffXd, arguments: Sequence[Any]) -> Any:
     """A formula's value with its gradient, by the chain rule; an array of AutoDiffXd.
 
     Args:
         formula: The formula.
         time: The time, in s.
-        given: Its arguments, arrays of AutoDiffXd.
+        arguments: Its arguments, arrays of AutoDiffXd.
     """
-    arguments = [ExtractValue(values).reshape(-1) for values in given]
-    gradients = [ExtractGradient(values) for values in given]
-    value = formula.value(time.value(), *arguments)
+    values = [ExtractValue(argument).reshape(-1) for argument in arguments]
+    gradients = [ExtractGradient(argument) for argument in arguments]
+    value = formula.value(time.value(), *values)
     moving = tuple(i for i, gradient in enumerate(gradients) if gradient.size)
     total = np.zeros((value.size, 0))
     if moving:
-        slope = formula.slope(moving, time.value(), *arguments)
+        slope = formula.slope(moving, time.value(), *values)
         total = slope @ np.vstack([gradients[i] for i in moving])
     return InitializeAutoDiff(value, total).reshape(-1)
 
 
 def _read(sources: Sequence[str], places: Sequence[int]) -> set[str]:
-    """What a formula's sources read: where parameters move, they come from a port as well."""
+    """The sources of a formula, and the port of exogenous parameters if it takes them."""
     return {*sources, *(["exogenous"] if places and "parameters" in sources else [])}

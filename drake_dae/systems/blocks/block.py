@@ -1,7 +1,8 @@
-"""What our LeafSystems share: parameters, checked functions, and conversion to AutoDiffXd."""
+"""Base classes of LeafSystems: parameters, checked functions, and conversion to AutoDiffXd."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,7 @@ from pydrake.systems.framework import (
     LeafSystem_,
     OutputPort,
     PortDataType,
+    System,
     SystemScalarConverter,
 )
 
@@ -31,18 +33,29 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
 
+Alternative = Callable[
+    [TracedFunction, FloatArray, Sequence[FloatArray], FloatArray], tuple[FloatArray, ...] | None
+]
+"""A function of a traced function, its state, its inputs and its parameters."""
+
+NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"
+"""The reason why a sampled block does not convert to AutoDiffXd."""
+
 
 @checked(ModelError)
 class DifferentiableSystem(LeafSystem):
     """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
 
     The converted system has the same ports, continuous state and numeric parameters, and exact
-    gradients. It has no events: a converted plant does not project its state onto N*, nor does it
-    refuse a start that is off N*.
+    gradients. It has no events: a converted plant does not project its state onto N*, and accepts
+    a start off N*.
 
+    Attributes:
+        no_gradient: The reason why it does not convert, for messages; empty if it does.
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient: ClassVar[str] = ""
 
     def __init__(self) -> None:
         converter = SystemScalarConverter()
@@ -53,18 +66,22 @@ class DifferentiableSystem(LeafSystem):
         inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
         outputs = [self.get_output_port(i) for i in range(self.num_output_ports())]
         ports = [
-            f"{kind}={listed([_shown(port) for port in found])}"
-            for kind, found in (("inputs", inputs), ("outputs", outputs))
+            f"{kind}={listed([_shown(port) for port in some])}"
+            for kind, some in (("inputs", inputs), ("outputs", outputs))
         ]
         return f"{type(self).__name__}('{self.get_name()}', {', '.join(ports)})"
 
     @cached_property
     def formulas(self) -> dict[str, Formula]:
-        """Name of an output port -> what it computes; "derivative" -> the time derivative.
+        """Name of an output port -> its formula; "derivative" -> that of the time derivative.
 
         Raises:
             ModelError: The system does not convert to AutoDiffXd.
         """
+        if self.no_gradient:
+            raise ModelError(
+                f"{self.get_name()} does not convert to AutoDiffXd: {self.no_gradient}"
+            )
         return self._formulas()
 
     def _formulas(self) -> dict[str, Formula]:
@@ -72,22 +89,16 @@ class DifferentiableSystem(LeafSystem):
 
     @property
     def references_by_time(self) -> Formula | None:
-        """What an input port `reference` has where it has no wire; None if it needs one."""
+        """The value of an input port `reference` without a wire; None if it needs one."""
         return None
 
     def check_context(self, context: Context) -> None:
         """Refuses the context of another system.
 
         Raises:
-            ModelError: It is none of this system.
+            ModelError: It belongs to another system.
         """
-        try:
-            self.ValidateContext(context)
-        except RuntimeError:
-            raise ModelError(
-                f"the context is not that of '{self.get_name()}'; of a diagram's context take "
-                "system.GetMyMutableContextFromRoot(context)"
-            ) from None
+        check_context(self, context)
 
     def ToAutoDiffXd(self) -> LeafSystem_[AutoDiffXd]:
         """The converted system. Drake's own method would wrap it and rename its ports.
@@ -102,24 +113,25 @@ class DifferentiableSystem(LeafSystem):
 class ParameterizedSystem(DifferentiableSystem):
     """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
-    So a study changes numbers in a context without tracing again, and a controller can be given
-    other numbers than its plant. Those parameters that move, the exogenous signals w, come through
-    an input port `exogenous` with the derivatives that the block needs, stacked as references are:
-    w_1, w_1', ..., w_2, ...; `exogenous_layout` tells how many. Without a wire they stand still at
-    their parameters' values.
+    So a study changes numbers in a context without tracing again, and a controller can have other
+    numbers than its plant. Varying parameters, the exogenous signals w, come through an input port
+    `exogenous` with the derivatives that the block needs, stacked like references: w_1, w_1', ...,
+    w_2, ...; see `exogenous_layout`. Without a wire they keep the values of the parameters.
 
     Attributes:
-        exogenous_layout: How the port's entries are stacked.
-        exogenous_places: Where they stand among the parameters.
+        exogenous_layout: The layout of the port's entries.
+        exogenous_places: Their indices among the parameters.
 
     Args:
         dae: The system.
-        values: The default: `dae.parameter_values`, and what else the block appends.
+        values: The defaults: `dae.parameter_values`, followed by further numbers of the block.
         signals: Name of an input of the block's functions -> names of its entries, for messages.
-        sees_steps: Whether it sees the steps of a simulation; without, no state is a trial.
+        sees_steps: Whether it distinguishes trial states from accepted ones; see `StepWatch`.
     """
 
     __slots__ = SHARED_DICTIONARY
+    _otherwise: Alternative | None = None
+    """Other values of a function whose own are not valid; they may be None, too."""
 
     def __init__(
         self,
@@ -141,10 +153,10 @@ class ParameterizedSystem(DifferentiableSystem):
         """Declares the input port of the exogenous signals, if there are any.
 
         Args:
-            degrees: How many derivatives of each entry of w the block's functions need.
+            degrees: The number of derivatives of each entry of w in the block's functions.
 
         Returns:
-            What all parameters depend on.
+            The dependencies of all parameters.
         """
         tickets = {self.all_parameters_ticket()}
         if degrees:
@@ -156,7 +168,7 @@ class ParameterizedSystem(DifferentiableSystem):
         return tickets
 
     def _values(self, context: Context) -> FloatArray:
-        """All parameters, those that move as the input port says; not to be changed."""
+        """All parameters, exogenous ones from the input port; the array must not be changed."""
         values = context.get_numeric_parameter(0).value()
         if self._exogenous is not None and self._exogenous.HasValue(context):
             values = values.copy()
@@ -172,35 +184,26 @@ class ParameterizedSystem(DifferentiableSystem):
             SingularityError: A matrix in it is singular; the exception has time and state.
             NonFiniteError: A value is not finite, likewise.
         """
-        if self._exogenous is None:  # Without a call more, in each evaluation.
+        if self._exogenous is None:  # Called in each evaluation, so without another call.
             parameters = context.get_numeric_parameter(0).value()
         else:
             parameters = self._values(context)
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
-        known = self._otherwise(function, state, inputs, parameters)
-        if known is not None:
-            return known
+        if self._otherwise is not None:
+            alternative = self._otherwise(function, state, inputs, parameters)
+            if alternative is not None:
+                return alternative
         time, state = context.get_time(), state.copy()
         error = simulation_error(function.failure(), time, state, self._signals)
         self._steps.tolerate(context, self._explained(error, parameters, *inputs))
         return function.nowhere()
 
-    def _otherwise(
-        self,
-        function: TracedFunction,
-        state: FloatArray,
-        inputs: Sequence[FloatArray],
-        parameters: FloatArray,
-    ) -> tuple[FloatArray, ...] | None:
-        """The values of a function by another way, where its own are not valid; None if none."""
-        return None
-
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
-        """The error, or a better one for what a function of such inputs has no value."""
+        """The error of a function without a value at these inputs, or a more precise one."""
         return error
 
     def parameters(self, context: Context) -> FloatArray:
@@ -210,14 +213,14 @@ class ParameterizedSystem(DifferentiableSystem):
         return np.array(values[: self.dae.parameter_values.size])
 
     def current_parameters(self, context: Context) -> FloatArray:
-        """All parameters as `parameters`, those that move as they are at the context's time."""
+        """All parameters as `parameters`, with exogenous ones at the context's time."""
         self.check_context(context)
         return np.array(self._values(context)[: self.dae.parameter_values.size])
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """What the block's functions take as parameters, as it was at the accepted times of a run.
+        """The parameters of the block's functions at accepted times of a run.
 
-        Parameters that move stand still at their values; see `exogenous_places`.
+        Exogenous ones have their values in the context; see `exogenous_places`.
 
         Args:
             context: The context of the run.
@@ -260,6 +263,21 @@ class ParameterizedSystem(DifferentiableSystem):
             if parameter.name == name:
                 parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
+def check_context(system: System, context: Context) -> None:
+    """Refuses the context of another system.
+
+    Raises:
+        ModelError: It belongs to another system.
+    """
+    try:
+        system.ValidateContext(context)
+    except RuntimeError:
+        raise ModelError(
+            f"the context is not that of '{system.get_name()}'; of a diagram's context take "
+            "system.GetMyMutableContextFromRoot(context)"
+        ) from None
 
 
 def _shown(port: InputPort | OutputPort) -> str:

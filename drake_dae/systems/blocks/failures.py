@@ -1,4 +1,4 @@
-"""How a simulation tells that a function has no value."""
+"""The exceptions of a simulation, with time and state."""
 
 from collections.abc import Mapping, Sequence
 
@@ -33,26 +33,23 @@ def cannot_go_on(
     """
     return SimulationError(
         f"the simulation cannot go on at t = {time:.6g} s, state {show_state(state)}: "
-        f"{reason.rstrip('.')}. Where the state grows without bound or a reference leaves what the "
-        f"robot can reach, change these; otherwise {remedy}",
+        f"{reason.rstrip('.')}. If the state grows without bound, or a reference is out of "
+        f"reach, change these; otherwise {remedy}",
         time,
         state,
     )
 
 
 def simulation_error(
-    failure: Failure,
-    time: float,
-    state: FloatArray,
-    signals: Mapping[str, Sequence[Signal]],
+    failure: Failure, time: float, state: FloatArray, signals: Mapping[str, Sequence[Signal]]
 ) -> SimulationError:
-    """The exception for a function that has no value in a simulation.
+    """The exception for a function without a valid value.
 
     Args:
-        failure: What was wrong with the values.
+        failure: The failure of the function.
         time: The time, in s.
         state: The state, shape (n,).
-        signals: Name of an input -> names of its entries; the name of the input serves otherwise.
+        signals: Name of an input -> names of its entries; by default the name of the input.
     """
     where = f"at t = {time:.6g} s, state {show_state(state)}"
     bad = ", ".join(
@@ -68,7 +65,7 @@ def simulation_error(
         case FailureKind.OVERFLOW:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
-                "without bound. Look at the gains, and at what the model has wrong",
+                "without bound. Check the gains and the errors of the model",
                 time,
                 state,
             )
@@ -97,14 +94,14 @@ def simulation_error(
 def no_step_leads_on(
     name: str, time: float, state: FloatArray, reason: SimulationError, text: str
 ) -> SimulationError:
-    """The exception where every trial failed, of the kind of the reason, however short the step.
+    """The exception if each trial step failed; it has the class of the reason.
 
     Args:
-        name: The block.
+        name: The name of the block.
         time: The time of the last accepted state, in s.
         state: That state.
-        reason: A trial's failure.
-        text: What the earliest trial said.
+        reason: The error of a trial.
+        text: The message of the earliest trial.
     """
     return reason.retold(
         f"{name}: no step leads on from t = {time:.6g} s{_at(state)} since each that was tried "
@@ -117,13 +114,13 @@ def no_step_leads_on(
 def spoilt_step(
     name: str, start: float, end: float, state: FloatArray, text: str
 ) -> NonFiniteError:
-    """The exception where an integrator without error control accepted a trial that failed.
+    """The exception if an integrator without error control accepted a trial that failed.
 
     Args:
-        name: The block.
+        name: The name of the block.
         start, end: The times of the step, in s.
-        state: Where it began.
-        text: What the earliest trial said; empty if none failed.
+        state: The state at its start.
+        text: The message of the earliest trial; empty if none failed.
     """
     reason = f": {text}" if text else ""
     return NonFiniteError(
@@ -137,30 +134,30 @@ def spoilt_step(
 def endless_steps(
     name: str, steps: int, start: float, end: float, state: FloatArray
 ) -> SimulationError:
-    """The exception where many steps hardly led on.
+    """The exception if many steps together advance the time very little.
 
     Args:
-        name: The block.
-        steps: How many.
-        start, end: The times that they led from and to, in s.
-        state: Where they led.
+        name: The name of the block.
+        steps: The number of steps.
+        start, end: The times before and after them, in s.
+        state: The state after them.
     """
     return SimulationError(
         f"{name}: the last {steps} steps led from t = {start:.12g} s only to {end:.12g} s"
-        f"{_at(state)} where it grows without bound, or jumps. Look at the gains and at what the "
-        "model has wrong; where that is in order, choose a fixed step",
+        f"{_at(state)} where it grows without bound, or jumps. Check the gains and the errors of "
+        "the model; if these are in order, choose a fixed step",
         end,
         state,
     )
 
 
 def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError) -> SimulationError:
-    """The exception where a state cannot be projected onto N*.
+    """The exception if a state cannot be projected onto N*.
 
     Args:
         time: The time, in s.
         state: The state, shape (n,).
-        reason: What the projection said.
+        reason: The error of the projection.
     """
     return SimulationError(
         f"the state left the constraint too far at t = {time:.6g} s, state {show_state(state)}: "
@@ -180,7 +177,7 @@ def off_start(name: str, manifold: Manifold, residual: FloatArray) -> Inconsiste
     Args:
         name: The system's name.
         manifold: N*.
-        residual: How far each of its equations is from holding, shape (k,).
+        residual: The residual of its equations, shape (k,).
     """
     table = ", ".join(
         f"{signal.name} = {value:.3g} {signal.unit}"
@@ -197,13 +194,13 @@ def off_start(name: str, manifold: Manifold, residual: FloatArray) -> Inconsiste
 def assembled_otherwise(
     name: str, left_out: Manifold, state: FloatArray, residual: FloatArray
 ) -> InconsistentStateError:
-    """The exception for a start at which redundant constraints that were left out do not hold.
+    """The exception for a start that violates redundant constraints that were left out.
 
     Args:
         name: The system's name.
-        left_out: What these constraints hold.
+        left_out: The manifold of these constraints.
         state: The start, shape (n,).
-        residual: How far each of their equations is from holding, shape (k,).
+        residual: The residual of their equations, shape (k,).
     """
     worst = int(np.argmax(np.abs(residual)))
     signal = left_out.residual_signals[worst]
@@ -227,7 +224,7 @@ def jammed_contact(
 
     Args:
         structure: The structure of the system.
-        error: What says that A(x) is singular, with time and state.
+        error: The error of a singular A(x), with time and state.
         control: u, shape (p,).
         parameters: Values of all parameters.
         force: v there, shape (m,).
@@ -249,15 +246,15 @@ def jammed_contact(
     free = np.abs(fields["f"])
     if control.size:
         free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(control)
-    found = painleve_outcome(A, A_0, force, np.abs(gradient) @ free, frictional.rows)
+    outcome = painleve_outcome(A, A_0, force, np.abs(gradient) @ free, frictional.rows)
     names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in frictional.rows)
-    outcome = f". What becomes of it is {found.value}" if found else ""
+    remark = f". What becomes of it is {outcome.value}" if outcome else ""
     return PainleveError(
         f"{dae.name}: Painleve paradox at the contact of {names} at t = {error.time:.6g} s, "
         f"state {show_state(error.state)}: a principal minor of A(x) has come to "
-        f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
+        f"{reserve:.2g} of what it is without friction{remark}. Lower the friction, slide the "
         "other way, or hold the robot less steeply to the surface",
         error.time,
         error.state,
-        found,
+        outcome,
     )

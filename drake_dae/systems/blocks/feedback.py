@@ -1,4 +1,4 @@
-"""A law as a value on a wire: what a plant needs to compute its control itself."""
+"""A law as the value of a port, with which a plant computes its control itself."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
@@ -15,14 +15,14 @@ from drake_dae.trace.functions import TracedFunction
 
 
 class Immutable:
-    """A value on a wire that never changes, so that the contexts of a diagram may share it."""
+    """The value of an abstract port that never changes, so that contexts may share it."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
 
 
 def nothing() -> AbstractValue:
-    """What stands on such a wire before something is computed."""
+    """The value of such a port before it is computed."""
     return AbstractValue.Make(Immutable())
 
 
@@ -30,9 +30,9 @@ class Feedback(Immutable):
     """A law with its references and parameters: the control as a function of time and state.
 
     Attributes:
-        function: The law, of state, reference and parameters; its first output is the control.
-        reference: R(t), at a time in s.
-        parameters: What the law takes as parameters; not to be changed.
+        function: The law of state, reference and parameters; its first output is the control.
+        reference: R as a function of the time in s.
+        parameters: The parameters of the law; the array must not be changed.
 
     Args:
         function, reference, parameters: The attributes.
@@ -50,7 +50,7 @@ class Feedback(Immutable):
         self.parameters, self._signals = parameters, signals
 
     def control(self, time: float, state: FloatArray) -> FloatArray | None:
-        """u, shape (p,), overwritten by the next call; None where it has no value.
+        """u, shape (p,), overwritten by the next call; None without a value.
 
         Args:
             time: The time, in s.
@@ -71,8 +71,9 @@ class Feedback(Immutable):
         """x' as a function of time and state, overwritten by the next call; None without a value.
 
         Args:
-            function: Law and plant as `motion_under` makes them.
-            parameters: The plant's, not to be changed; an array of this motion alone.
+            function: Law and plant, by `motion_under`.
+            parameters: The parameters of the plant; an array of this motion alone, which must not
+                be changed.
             latest: The `parameters` of the motion that called the function last.
         """
         x, r, of_law, of_plant = function.arguments
@@ -81,21 +82,21 @@ class Feedback(Immutable):
         def motion(time: float, state: FloatArray) -> FloatArray | None:
             r[...] = reference(time)
             x[...] = state
-            if latest[0] is not parameters:  # Else they stand there.
+            if latest[0] is not parameters:  # Otherwise they are still in place.
                 latest[0], of_law[...], of_plant[...] = parameters, of_this_law, parameters
             return rate if function.run() else None
 
         return motion
 
     def error(self, time: float, state: FloatArray) -> SimulationError:
-        """Why the last call had no value, at its time and state."""
+        """The error of the last call, at its time and state."""
         return simulation_error(self.function.failure(), time, state, self._signals)
 
 
 def motion_under(
     law: TracedFunction, dynamics: TracedFunction, compiled: Compiled
 ) -> TracedFunction:
-    """Law and plant as one function: what both compute of the state is computed once.
+    """Law and plant as one function, with their common subexpressions computed once.
 
     Args:
         law: The law, of state, reference and its parameters.
@@ -104,7 +105,7 @@ def motion_under(
 
     Returns:
         A function of "state", "reference", and the parameters of "law" and "plant"; it returns the
-        control, x', and a number that is finite if both are of use.
+        control, x', and a number that is finite if both are valid.
     """
     names = ("state", "reference", "law", "plant")
     sizes = (*law.sizes, dynamics.sizes[-1])

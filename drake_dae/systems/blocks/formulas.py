@@ -1,4 +1,4 @@
-"""What a block computes, as functions that can be differentiated."""
+"""The output ports of a block as functions with derivatives."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -9,14 +9,14 @@ from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.trace.functions import TracedFunction
 
 STATES = ("state", "estimated_state")
-"""The names of the argument of a formula that says where the system is."""
+"""The names of the argument of a formula that is the state."""
 
 
 class Formula(Protocol):
-    """What an output port, or the time derivative, computes.
+    """The computation of an output port, or of the time derivative.
 
     Attributes:
-        sources: Where each argument comes from: "time", "state", "parameters", or the name of an
+        sources: The source of each argument: "time", "state", "parameters", or the name of an
             input port.
     """
 
@@ -35,8 +35,8 @@ class TracedFormula:
 
     Args:
         function: The function.
-        output: Which of its outputs.
-        sources: Where its arguments come from, as in `Formula`; their own names if None.
+        output: The name of the output.
+        sources: The sources of its arguments, as in `Formula`; their own names if None.
         signals: Name of an argument -> names of its entries, for messages.
     """
 

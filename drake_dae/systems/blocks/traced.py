@@ -1,4 +1,4 @@
-"""What a block computes, as traced functions: the seam between a Drake diagram and its compiler."""
+"""The computations of a block as traced functions: the interface between diagram and compiler."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,32 +13,32 @@ from drake_dae.errors import ModelError, SimulationError
 from drake_dae.trace.functions import TracedFunction
 
 TIME, STATE, HELD, PARAMETERS, NOISE = "$time", "$state", "$held", "$parameters", "$noise"
-"""What a computation reads besides input ports: the time in s, the block's own continuous state,
-all groups of its discrete state below each other, those of its numeric parameters, and new random
-numbers of deviation 1."""
+"""The sources of a computation besides input ports: the time in s, the block's continuous state,
+all groups of its discrete state stacked, all groups of its numeric parameters stacked, and new
+random numbers of deviation 1."""
 
 DERIVATIVE = "$derivative"
-"""The time derivative of a block's continuous state, among its outputs; its next discrete state is
-HELD there."""
+"""The time derivative of a block's continuous state, among the outputs of its computations; the
+next discrete state is HELD there."""
 
 MARGINS, GAPS, RATES = "$margins", "$gaps", "$rates"
-"""What a guard computes; see `Guard`."""
+"""The outputs of a guard; see `Guard`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Computation:
-    """Some columns that a block computes together.
+    """A function that computes some values of a block.
 
     Attributes:
         function: A CasADi function of columns; its first results are `outputs`.
-        sources: Where each argument comes from: TIME, STATE, HELD, PARAMETERS, NOISE, the name of
-            an input port, or that of an output of another computation of the block.
-        outputs: What the first results are: names of output ports, DERIVATIVE, HELD, or names that
-            other computations of the block have among their sources. "" is of no interest.
-        traced: The same function, whose last result is finite where its values are of use, and
-            which can say why they are not; None if it has values wherever its arguments have.
-        choice: (flag, one, other), three of the sources: only one has to be of use where the flag
-            is above 1 / 2, else only the other. None where all have to.
+        sources: The source of each argument: TIME, STATE, HELD, PARAMETERS, NOISE, the name of an
+            input port, or of an output of another computation of the block.
+        outputs: The names of the first results: output ports, DERIVATIVE, HELD, or sources of other
+            computations of the block. Results named "" are not used.
+        traced: The same function, whose last result is finite if its values are valid, and which
+            has the reason if they are not; None if valid arguments always give valid values.
+        choice: (flag, first, second), three of the sources: if the flag is above 1 / 2, only the
+            first must be valid, otherwise only the second. None if all must be valid.
     """
 
     function: ca.Function
@@ -51,19 +51,24 @@ class Computation:
     def of(
         cls, traced: TracedFunction, sources: tuple[str, ...], outputs: tuple[str, ...]
     ) -> "Computation":
-        """What a traced function computes."""
+        """The computation by a traced function."""
         return cls(traced.function, sources, outputs, traced)
+
+
+def zero(name: str, size: int = 1) -> Computation:
+    """Zeros for an input port without a wire, shape (size,)."""
+    return Computation(ca.Function("zero", [], [ca.SX.zeros(size)]), (), (name,))
 
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a block does with its discrete state at t_k = offset + k period.
+    """The update of a block's discrete state at t_k = offset + k period.
 
     Attributes:
-        computation: It has HELD among its outputs.
-        period, offset: In s.
-        is_unrestricted: Whether it is an unrestricted update. Drake makes those of an instant
-            first, and all at once; then the discrete ones, all at once.
+        computation: The computation, with HELD among its outputs.
+        period, offset: Period and offset, in s.
+        is_unrestricted: Whether it is an unrestricted update. At one instant Drake makes first all
+            unrestricted updates together, then all discrete ones together.
     """
 
     computation: Computation
@@ -74,14 +79,14 @@ class Update:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """How a block's state is brought onto a manifold at the start of each step.
+    """The projection of a block's state onto a manifold at the start of each step.
 
     Attributes:
-        newton: (state, start, parameters, held) -> a Newton step in units of `scale`; gradients
-            are those at the start.
+        newton: (state, start, parameters, held) -> a Newton step in units of `scale`, with the
+            gradients at the start.
         scale: The sizes of the states, shape (n,).
-        project: (state, parameters, held) -> the state on the manifold, where Newton's steps do
-            not reach it; raises InconsistentStateError.
+        project: (state, parameters, held) -> the state on the manifold, if Newton's steps do not
+            converge; raises InconsistentStateError.
     """
 
     newton: ca.Function
@@ -91,17 +96,15 @@ class Projection:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """When a block changes its states at a moment that a run has to find, and how.
+    """A change of a block's states at a time that a run must locate.
 
     Attributes:
-        computation: Its outputs are MARGINS, numbers of which each is positive until the block
-            changes; GAPS, distances that must not fall through zero within a step either, also
-            where they come out again, any number of them; and RATES, their derivatives.
-        react: (context, state) -> the status: what Drake does then. It reads the block's context,
-            and changes a state of the block, which is a copy of the context's. It keeps in the
-            context what a record has of it.
-        in_samples: Whether it is looked at when the block is updated, and only then, in place of
-            that update.
+        computation: Its outputs are MARGINS, numbers that are positive until the block changes;
+            GAPS, any number of distances that must not be negative, even within a step; and RATES,
+            their derivatives.
+        react: (context, state) -> the status of Drake's event. It reads the block's context, and
+            changes a copy of its state. It stores events for a record in the context.
+        in_samples: Whether it is evaluated only at the updates of the block, in place of these.
     """
 
     computation: Computation
@@ -111,21 +114,21 @@ class Guard:
 
 @dataclass(frozen=True, eq=False)
 class DrakeStepped:
-    """What Drake steps in a block at t_k = k period, as its own contact, since it is not traced.
+    """The part of a block that is not traced: Drake steps it at t_k = k period.
 
-    The first entries of the block's HELD are the values of some output ports of that system, below
-    each other. They change at t_k alone, as by an unrestricted update; its step depends on them, on
-    what one of its input ports reads at t_k, and on t_k. Other entries have updates as usual.
+    The first entries of the block's HELD are the values of some output ports of that system,
+    stacked. They change only at t_k, like by an unrestricted update; its step depends on them, on
+    one of its input ports at t_k, and on t_k. Other entries have updates as usual.
 
     Attributes:
-        system: What Drake steps: the block, or a diagram in it.
-        period: In s.
+        system: The system that Drake steps: the block, or a diagram in it.
+        period: The period, in s.
         ports: The names of these output ports.
         into: The name of that input port.
-        reads: What it reads: the name of an input port of the block, or of an output that one of
-            its computations has.
+        reads: The source of that input port: the name of an input port of the block, or of an
+            output of one of its computations.
         held: The context of the block -> HELD, shape (size,).
-        put: (context of the system, HELD) -> None; puts in what it steps from.
+        put: (context of the system, HELD) -> None; sets the state before a step.
         size: The number of entries of HELD.
     """
 
@@ -141,32 +144,32 @@ class DrakeStepped:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """What one system of a diagram computes.
+    """The computations of one system of a diagram.
 
     Attributes:
         system: The system.
         computations: All of its outputs that can be traced, and the derivative of its state.
-        updates: Its updates of the discrete state.
-        initial: What it holds when a run begins, where that is not a number; it has HELD among its
-            outputs, and does not read it. None where it is a number.
-        check_start: (state, parameters) -> None; raises where no run may start. For a block with
-            state; None where any state will do.
-        projection: How its state stays on a manifold, if it does.
+        updates: The updates of its discrete state.
+        initial: The computation of HELD at the start of a run if the default is not finite; it
+            does not read HELD. None if the default is finite.
+        check_start: (state, parameters) -> None; raises if no run may start there. None if any
+            state is allowed, or without a state.
+        projection: The projection of its state onto a manifold, if it has one.
         scale: The sizes of its continuous states, shape (n,); ones if None.
-        unwired: Name of an input port -> what stands there without a wire and without a value.
-        moving: The entries of its parameters that come through an input port "exogenous".
-        guard: When and how it changes at moments that a run has to find; None if at none.
-        stepped: What Drake steps in it; None if all of it is traced.
-        draws: Whether its update takes new random numbers.
-        model: What its first parameters are those of, such as a DaeSystem; None for nothing that
-            another block has.
-        under: For a controller: a computation of this block's sources that gives what the
-            computation with DERIVATIVE of its plant gives, in fewer operations, where plant and
-            law have the same model and numbers and nothing stands between; None if there is none.
+        unwired: Name of an input port -> its value if it has neither a wire nor a fixed value.
+        moving: The indices of its parameters that come through an input port "exogenous".
+        guard: Its changes at times that a run must locate; None if there are none.
+        stepped: The part that Drake steps; None if all of it is traced.
+        draws: Whether its update uses new random numbers.
+        model: The owner of its first parameters, such as a DaeSystem; None if no other block shares
+            it.
+        under: For a controller: a computation of this block's sources with the same values as the
+            computation of DERIVATIVE of its plant, in fewer operations, if plant and law have the
+            same model and numbers and are wired directly; None if there is none.
         signals: Name of an argument -> names and units of its entries, for messages.
         ports: Name of an output port -> names and units of its entries, as far as they are known.
-        failure: (time, arguments) -> why its update ends a run, where its values are not valid;
-            None for what any function says.
+        failure: (time, arguments) -> the error of an update whose values are not valid; None for
+            the error of its function.
     """
 
     system: System
@@ -189,10 +192,10 @@ class Block:
 
 
 def not_traced(what: str) -> ModelError:
-    """The error of a block of ours that Drake's Simulator alone runs.
+    """The error of a block that only Drake's Simulator can run.
 
     Args:
-        what: What it is, in the user's words.
+        what: The block, in the user's words.
     """
     return ModelError(
         f"{what} cannot be traced: a rollout does not know it; run the loop by simulate"
@@ -201,24 +204,25 @@ def not_traced(what: str) -> ModelError:
 
 @runtime_checkable
 class Traced(Protocol):
-    """A LeafSystem that tells what it computes.
+    """A LeafSystem with traced computations.
 
-    Rules, which one suite holds every such block against:
+    Rules, which one test suite checks for each such block:
 
-    1. `traced()` returns the same `Block` at each call, without a context: all that differs from
-       run to run is state, discrete state, numeric parameters and inputs.
-    2. The value of each output port that a computation names is what the port shows in any
-       context, by the time, states, parameters and inputs of that context.
-    3. DERIVATIVE is what `CalcTimeDerivatives` gives, and is there if there is continuous state.
-    4. Each HELD is what the event of that period does to the discrete state, and there is one for
-       each periodic event that changes it.
-    5. An output depends on an input port in the same instant exactly if its sources lead there:
-       Drake's `HasDirectFeedthrough` says the same.
-    6. An output that cannot be traced is left out; what nobody can trace raises a ModelError that
-       says why, in one sentence.
-    7. What changes its states at other moments than these has a guard, whose margins fall through
-       zero at the moments that Drake's Simulator finds.
+    1. `traced()` returns the same `Block` at each call, without a context: only state, discrete
+       state, numeric parameters and inputs differ from run to run.
+    2. The output of a computation that is named like an output port has the value of that port in
+       any context, at the time, states, parameters and inputs of that context.
+    3. DERIVATIVE is the result of `CalcTimeDerivatives`; it is an output if there is a continuous
+       state.
+    4. HELD of an update is the result of the periodic event of that period, and there is one update
+       for each periodic event that changes the discrete state.
+    5. An output depends on an input port in the same instant if and only if its sources lead there,
+       in agreement with Drake's `HasDirectFeedthrough`.
+    6. Outputs that cannot be traced are omitted; a block that cannot be traced at all raises a
+       ModelError with the reason, in one sentence.
+    7. A block whose states change at other times has a guard, whose margins fall through zero at
+       the times that Drake's Simulator locates.
     """
 
     def traced(self) -> Block:
-        """What the block computes."""
+        """The computations of the block."""

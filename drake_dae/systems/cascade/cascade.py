@@ -30,13 +30,13 @@ _SAMPLES = 501
 class SpringCascade(Diagram, Controller):
     """A cascade for a robot with springs in its joints: the rigid law, and a loop on the torques.
 
-    The law (28) of the links alone, `link_side(model)`, gives the torque tau_d that they need; a
-    `TorqueLoop` makes the springs have it. So no derivative of the model is taken beyond those of
-    the rigid law, where the law (28) of the whole robot takes four: it needs smooth friction, an
-    exact model and little noise. In exchange the errors no longer follow (30) exactly: by singular
-    perturbation the springs add errors of the order of the squared ratio of the rates of motion and
-    loop, of which `spring_error_bound` is a bound. A `DisturbanceObserver` of the rigid law takes
-    the torque of the springs as its control, so that it sees disturbances of the links without the
+    The law (28) of the links alone, `link_side(model)`, computes the torque tau_d that they need,
+    and a `TorqueLoop` controls the springs to this torque. So only the derivatives of the rigid law
+    are needed, whereas the law (28) of the whole robot takes four, and needs smooth friction, an
+    exact model and little noise. In exchange the errors do not follow (30) exactly: by singular
+    perturbation, the springs add errors of the order of the squared ratio of the rates of motion
+    and loop, bounded by `spring_error_bound`. A `DisturbanceObserver` of the rigid law takes the
+    torque of the springs as its control, so that it observes disturbances of the links without the
     loop in between.
 
     Input ports:
@@ -47,7 +47,7 @@ class SpringCascade(Diagram, Controller):
     Output ports:
         control: u of the motors, or their voltages, shape (p,).
         tracking_error, integral: As of a `TrackingController`.
-        link_state, joint_torque: As of a `SpringView`; what an observer takes as state and control.
+        link_state, joint_torque: As of a `SpringView`; state and control of an observer.
         wanted_torque: tau_d in N m (N), shape (p,).
         motor_disturbance: As of a `TorqueLoop`.
 
@@ -64,7 +64,7 @@ class SpringCascade(Diagram, Controller):
         view, controller, torque_loop: The blocks in it.
 
     Raises:
-        ModelError: Law and robot do not fit, or what drives the joints is not supported.
+        ModelError: Law and robot do not fit, or the actuation is not supported.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -126,12 +126,12 @@ class SpringCascade(Diagram, Controller):
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         torques = tuple(self.model.links.actuator_signals)
-        found: dict[str, Sequence[Signal]] = {
+        return {
+            **self.controller.further_signals,
             "joint_torque": torques,
             "wanted_torque": torques,
             "motor_disturbance": self.torque_loop.disturbance_signals,
         }
-        return {**self.controller.further_signals, **found}
 
     @property
     def observed(self) -> tuple[str, str]:
@@ -141,21 +141,20 @@ class SpringCascade(Diagram, Controller):
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def current_parameters(self, context: Context) -> FloatArray:
-        own = self.GetSubsystemContext(self.controller, context)
-        return self.controller.current_parameters(own)
+        return self.controller.current_parameters(
+            self.GetSubsystemContext(self.controller, context)
+        )
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
-        own = self.GetMutableSubsystemContext(self.controller, context)
-        self.controller.set_gains(own, gains)
+        self.controller.set_gains(self.GetMutableSubsystemContext(self.controller, context), gains)
 
     def check_plant(self, plant: Plant) -> None:
-        dae, own = plant.dae, self.model.dae
-        sizes = [(each.num_states, each.num_controls) for each in (own, dae)]
+        sizes = [(dae.num_states, dae.num_controls) for dae in (self.model.dae, plant.dae)]
         if sizes[0] != sizes[1]:
             needs, has = ("{} states, {} controls".format(*size) for size in sizes)
             raise WiringError(
-                f"the cascade is for '{own.name}' with {needs}, the plant '{dae.name}' has {has}. "
-                "Make it with the plant's model"
+                f"the cascade is for '{self.model.dae.name}' with {needs}, the plant "
+                f"'{plant.dae.name}' has {has}. Make it with the plant's model"
             )
 
     def derived(
@@ -166,14 +165,14 @@ class SpringCascade(Diagram, Controller):
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """That of the rigid law, as if the springs had the wanted torque."""
+        """The predicted error of the rigid law, for springs that have the desired torque."""
         states = np.asarray(values["state"])[:, : self.law.system.num_states]
         return self.controller.predicted_error(times, {**values, "state": states}, parameters)
 
     def error_bound(
         self, reference: Callable[[float], FloatArray], times: FloatArray, state: FloatArray
     ) -> FloatArray | None:
-        """The `spring_error_bound` along the reference; None where no motion leads along it."""
+        """The `spring_error_bound` along the reference; None if no motion follows it."""
         law, links = self.law, self.law.system.num_states
         if times.size < 2 or not times[-1] > times[0]:
             return None
@@ -184,13 +183,10 @@ class SpringCascade(Diagram, Controller):
         if motion.ending is not None:
             return None
         spring = stages_of(self.model)[0]
-        function = self.model.dae.trace(
-            "springs", {"K": spring.stiffness, "B": spring.inertia}, often=False
-        )
-        p = self.model.dae.num_controls
-        dae = self.model.dae
+        dae, p = self.model.dae, self.model.dae.num_controls
+        function = dae.trace("springs", {"K": spring.stiffness, "B": spring.inertia}, often=False)
         matrices = function(dae.nominal_state, dae.parameter_values)
-        stiffness, inertia = (np.array(each).reshape(p, p) for each in matrices)
+        stiffness, inertia = (np.array(matrix).reshape(p, p) for matrix in matrices)
         return spring_error_bound(
             law,
             grid,

@@ -1,14 +1,16 @@
-"""What the links of a robot with springs in its joints move by: their state and the torques."""
+"""The state of the links of a robot with springs in its joints, and the torques on them."""
 
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation
+from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
@@ -47,17 +49,13 @@ class SpringView(ParameterizedSystem):
             "joint_torque": dae.trace("torque of the springs", {"value": model.joint_force}),
         }
         self._port = self.DeclareVectorInputPort("estimated_state", dae.num_states)
-        tickets = {
-            self.input_port_ticket(self._port.get_index()),
-            self.all_parameters_ticket(),
-        }
+        tickets = {self.input_port_ticket(self._port.get_index()), self.all_parameters_ticket()}
         for name, function in self._functions.items():
-            count = function.outputs[0].size
-            self.DeclareVectorOutputPort(name, count, weakly(self._calc, name), tickets)
+            value = port_value(self._value, function)
+            self.DeclareVectorOutputPort(name, function.outputs[0].size, value, tickets)
 
-    def _calc(self, name: str, context: Context, output: BasicVector) -> None:
-        state = self._port.Eval(context)
-        output.SetFromVector(self._checked(self._functions[name], context, state)[0])
+    def _value(self, function: TracedFunction, context: Context) -> FloatArray:
+        return self._checked(function, context, self._port.Eval(context))[0]
 
     def _formulas(self) -> dict[str, Formula]:
         return {

@@ -1,8 +1,8 @@
-"""A loop around the springs of a robot's joints, which makes their torque follow a wanted one."""
+"""A loop that controls the torque of the springs in a robot's joints."""
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, EventStatus, State
+from pydrake.systems.framework import Context, EventStatus, State
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
@@ -13,20 +13,20 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.stage import AttachedStage, Spring
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.block import NO_TIME_DERIVATIVE, ParameterizedSystem
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 _EXCESS = 0.01
-"""The largest torque in effort limits by which the motors go ahead of a measured acceleration."""
+"""The largest deviation of the model's acceleration from the measured one, as a torque in effort
+limits."""
 
 
 @checked(ModelError)
 class TorqueLoop(ParameterizedSystem):
-    """The inner loop of a cascade: the torque tau of the springs follows a wanted one, tau_d.
+    """The inner loop of a cascade: the torque tau of the springs follows the desired one, tau_d.
 
     With the shafts B q_2'' = tau_m - tau - f and the springs tau = K (q_2 - q), it is
 
@@ -44,17 +44,18 @@ class TorqueLoop(ParameterizedSystem):
     The motors' inertia is shaped to K / w^2 (the gain of the torque is w^2 B / K, one for each
     joint, so that stiff and soft springs have one rate).
 
-    Where friction holds the tool the law wants accelerations that the links do not have: e would
-    grow to K / w^2 a_d, and throw the tool off the surface when it breaks away. So a_d stays within
-    0.01 effort limits, as a torque K / w^2 a, of the measured acceleration, 2 w (v - its lag).
+    While friction holds the tool, the law commands accelerations that the links do not have: e
+    would grow to K / w^2 a_d, and throw the tool off the surface when it breaks away. So a_d is
+    limited to the measured acceleration, 2 w (v - its lag), plus or minus 0.01 effort limits as a
+    torque K / w^2 a.
 
-    The disturbance f is observed on the side of the motors, by their momentum B q_2':
+    The disturbance f is observed from the momentum B q_2' of the motors:
 
         f_o' = k_m (f_k - f_o),    f_k = mean(tau_m - tau) - B (q_2',k - q_2',k-1) / T.
 
-    Behind `DcMotors` tau_m is the torque of the currents, and the voltage makes them follow tau_m +
+    With `DcMotors` tau_m is the torque of the currents, and the voltage makes them follow tau_m +
     tau_m' / k_i at the rate k_i, where tau_m' follows from tau'' = K (B^-1 (tau_m - tau - f_o) -
-    a_d): so the lag of the currents is compensated.
+    a_d): this compensates the lag of the currents.
 
     Input ports:
         estimated_state: x = (q, v, s), shape (n,).
@@ -64,11 +65,11 @@ class TorqueLoop(ParameterizedSystem):
 
     Output ports:
         control: tau_m, or the voltages, shape (p,).
-        motor_disturbance: -f_o in N m, shape (p,), held between samples: friction is negative where
+        motor_disturbance: -f_o in N m, shape (p,), held between samples; friction is negative while
             a motor turns forward.
 
     Args:
-        model: The robot with springs, and perhaps motors behind them.
+        model: The robot with springs, with or without motors that drive them.
         law: The rigid law, of `link_side(model)`.
         loop: The rates.
         sample_period: T in s.
@@ -76,10 +77,11 @@ class TorqueLoop(ParameterizedSystem):
             `DisturbanceObserver`.
 
     Raises:
-        ModelError: The joints have no springs, or what stands behind them is not supported.
+        ModelError: The joints have no springs, or the stage that drives them is not supported.
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient = NO_TIME_DERIVATIVE
 
     def __init__(
         self,
@@ -91,17 +93,17 @@ class TorqueLoop(ParameterizedSystem):
     ) -> None:
         spring, drive = stages_of(model)
         dae, system = model.dae, law.system
-        own = [parameter for stage in model.stages for parameter in stage.parameters]
-        values = np.concatenate([system.parameter_values, *(one.value for one in own)])
+        of_stages = [parameter for stage in model.stages for parameter in stage.parameters]
+        values = np.concatenate([system.parameter_values, *(p.value for p in of_stages)])
         signals = {"state": dae.state_signals, "control": dae.control_signals}
         super().__init__(system, values, signals, sees_steps=False)
         self.set_name("torque_loop")
         self.loop, self.sample_period = loop, positive("sample_period", sample_period)
         self._drive, self._lag, self._model = drive, control_lag, model
+        numbers = ca.vertcat(system.parameter_symbol, *(p.symbol for p in of_stages))
         p = dae.num_controls
-        numbers = ca.vertcat(system.parameter_symbol, *(one.symbol for one in own))
         self._memory = [ca.SX.sym("held", p) for _ in range(7)]
-        self._seen = ca.SX.sym("seen", 1)
+        self._has_sample = ca.SX.sym("has_sample", 1)
         self._sampled, self._function = self._trace(law.structure, spring, numbers)
         self.disturbance_signals = tuple(
             Signal(f"disturbance of {signal.name}", signal.unit)
@@ -113,51 +115,50 @@ class TorqueLoop(ParameterizedSystem):
         self._held = self.DeclareDiscreteState(np.zeros(7 * p + 1))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        # What acts on the plant enters the control one sample later.
+        # The acting control enters the control one sample later.
         held = {self.discrete_state_ticket(self._held)}
         read = [self.GetInputPort(name) for name in self._ports if name != "control"]
         read += [] if self._exogenous is None else [self._exogenous]
         sources = held | {self.input_port_ticket(port.get_index()) for port in read}
         sources.add(self.all_parameters_ticket())
-        self.DeclareVectorOutputPort("control", p, weakly(self._calc_control), sources)
-        self.DeclareVectorOutputPort("motor_disturbance", p, weakly(self._calc_shown), held)
+        self.DeclareVectorOutputPort("control", p, port_value(self._control), sources)
+        self.DeclareVectorOutputPort("motor_disturbance", p, port_value(self._disturbance), held)
 
     def _trace(
         self, structure: Structure, spring: Spring, numbers: ca.SX
     ) -> tuple[TracedFunction, TracedFunction]:
-        """What is held after a sample, and the control."""
+        """The discrete state after a sample, and the control, as functions."""
         model, loop, period = self._model, self.loop, self.sample_period
         state, p = model.dae.state, model.dae.num_controls
-        wanted, acting = ca.SX.sym("wanted_torque", p), ca.SX.sym("control", p)
-        seen = self._seen
-        disturbance, last_wanted, slope, momentum, torque, last, slow = self._memory
+        desired, acting = ca.SX.sym("wanted_torque", p), ca.SX.sym("control", p)
+        has_sample = self._has_sample
+        disturbance, last_desired, slope, momentum, torque, last, slow = self._memory
         position, velocity, shaft = self._velocities()
         tau = model.joint_force
 
-        # The slope of the wanted torque, the motors' disturbance, the links' acceleration.
+        # The slope of the desired torque, the motors' disturbance, the links' acceleration.
         def follow(old: ca.SX, new: ca.SX, rate: float) -> ca.SX:
-            return old + seen * -np.expm1(-rate * period) * (new - old)
+            return old + has_sample * -np.expm1(-rate * period) * (new - old)
 
         efforts = np.array(model.links.effort_limits)
-        rise = _within((wanted - last_wanted) / period, ca.DM(loop.slope * efforts))
+        rise = _within((desired - last_desired) / period, ca.DM(loop.slope * efforts))
         slope = follow(slope, rise, 2.0 * loop.rate)
-        own = ca.mtimes(spring.inertia, shaft)
+        new_momentum = ca.mtimes(spring.inertia, shaft)
         if self._drive is None:
             now, acted = acting, self._lag * last + (1.0 - self._lag) * acting
         else:
             now = self._drive.force(position, shaft)
             acted = (last + now) / 2.0
-        lost = acted - (torque + tau) / 2.0 - (own - momentum) / period
+        lost = acted - (torque + tau) / 2.0 - (new_momentum - momentum) / period
         slower = ca.if_else(
-            seen, slow + -np.expm1(-2.0 * loop.rate * period) * (velocity - slow), velocity
+            has_sample, slow + -np.expm1(-2.0 * loop.rate * period) * (velocity - slow), velocity
         )
-        after = ca.vertcat(
-            follow(disturbance, -lost, loop.motor_rate), wanted, slope, own, tau, now, slower, 1.0
-        )
+        new_disturbance = follow(disturbance, -lost, loop.motor_rate)
+        after = ca.vertcat(new_disturbance, desired, slope, new_momentum, tau, now, slower, 1.0)
 
         # The acceleration by the model, near the measured one.
         elimination, rows = structure.elimination, self._rows()
-        rate = elimination.f_star + ca.mtimes(elimination.h_star, wanted)  # On N*.
+        rate = elimination.f_star + ca.mtimes(elimination.h_star, desired)  # On N*.
         B = ca.SX(ca.sparsify(ca.DM(model.links.actuation_matrix)))
         springs = PositiveDefiniteFactorization(spring.stiffness)
         measured = 2.0 * loop.rate * (velocity - slower)
@@ -168,7 +169,7 @@ class TorqueLoop(ParameterizedSystem):
         # The law.
         w, zeta = loop.rate, loop.damping
         moves = ca.mtimes(spring.stiffness, shaft - velocity)
-        v = w**2 * (wanted - tau) + 2.0 * zeta * w * (slope - moves)
+        v = w**2 * (desired - tau) + 2.0 * zeta * w * (slope - moves)
         control = tau + ca.mtimes(spring.inertia, ahead + springs.solve(v)) - disturbance
         if self._drive is not None:
             assert self._drive.drive_for is not None
@@ -176,11 +177,11 @@ class TorqueLoop(ParameterizedSystem):
             bends = ca.mtimes(spring.stiffness, inner - ahead)  # tau''.
             change = w**2 * (slope - moves) - 2.0 * zeta * w * bends  # v'.
             rises = moves + ca.mtimes(spring.inertia, springs.solve(change))
-            wished = control + rises / loop.current_rate
-            control = self._drive.drive_for(wished, shaft, ca.SX(loop.current_rate))
-        held = ca.vertcat(*self._memory, seen)
+            target = control + rises / loop.current_rate
+            control = self._drive.drive_for(target, shaft, ca.SX(loop.current_rate))
+        held = ca.vertcat(*self._memory, has_sample)
         name, compiled = model.dae.name, model.dae.compiled
-        inputs = {"state": state, "wanted_torque": wanted}
+        inputs = {"state": state, "wanted_torque": desired}
         rest = {"held": held, "parameters": numbers}
         sample = TracedFunction(
             f"{name} sample of the torque loop",
@@ -210,33 +211,28 @@ class TorqueLoop(ParameterizedSystem):
         B = ca.SX(ca.sparsify(ca.DM(self._model.links.actuation_matrix)))
         return shaft[0], ca.mtimes(B.T, self._model.links.v), shaft[1]
 
-    def _given(self, context: Context, *names: str) -> list[FloatArray]:
+    def _inputs(self, context: Context, *names: str) -> list[FloatArray]:
+        """The values of input ports, and the discrete state."""
         held = context.get_discrete_state(self._held).value()
         return [*(self._ports[name].Eval(context) for name in names), held]
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        given = self._given(context, "estimated_state", "wanted_torque", "control")
-        found = self._checked(self._sampled, context, *given)[0]
-        state.get_mutable_discrete_state().set_value(self._held, found)
+        inputs = self._inputs(context, "estimated_state", "wanted_torque", "control")
+        after = self._checked(self._sampled, context, *inputs)[0]
+        state.get_mutable_discrete_state().set_value(self._held, after)
         return EventStatus.Succeeded()
 
-    def _calc_control(self, context: Context, output: BasicVector) -> None:
-        given = self._given(context, "estimated_state", "wanted_torque")
-        output.SetFromVector(self._checked(self._function, context, *given)[0])
+    def _control(self, context: Context) -> FloatArray:
+        inputs = self._inputs(context, "estimated_state", "wanted_torque")
+        return self._checked(self._function, context, *inputs)[0]
 
-    def _calc_shown(self, context: Context, output: BasicVector) -> None:
+    def _disturbance(self, context: Context) -> FloatArray:
         held = context.get_discrete_state(self._held).value()
-        output.SetFromVector(held[: len(self.disturbance_signals)])
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
-            "derivative by the time"
-        )
+        return held[: len(self.disturbance_signals)]
 
     def traced(self) -> Block:
         read, last = ("estimated_state", "wanted_torque"), (HELD, PARAMETERS)
-        held = ca.vertcat(*self._memory, self._seen)
+        held = ca.vertcat(*self._memory, self._has_sample)
         shown = ca.Function("shown", [held], [self._memory[0]])
         update = Computation.of(self._sampled, (*read, "control", *last), (HELD,))
         return Block(
@@ -258,14 +254,14 @@ def _within(value: ca.SX, limits: ca.DM) -> ca.SX:
 
 
 def stages_of(model: RobotModel) -> tuple[Spring, AttachedStage | None]:
-    """The springs of a robot, and what stands behind them.
+    """The springs of a robot, and the stage that drives them; None without one.
 
     Args:
         model: The robot.
 
     Raises:
-        ModelError: There are no springs at the joints, or what stands behind them cannot be driven
-            for a wanted force.
+        ModelError: There are no springs at the joints, or the stage that drives them cannot be
+            commanded a force.
     """
     if not model.stages or model.stages[0].spring is None:
         raise ModelError(

@@ -1,4 +1,4 @@
-"""References that a person changes while they run: what makes them smooth.      (28)
+"""The filter that makes commanded changes of references smooth.      (28)
 
 A law needs a reference r with mu derivatives, and a person gives a number c that jumps. So c passes
 through mu + 1 lags of rate w, the first of limited speed:
@@ -32,7 +32,7 @@ SPEED = Signal("path.speed")
 @checked(ModelError)
 @dataclass(frozen=True)
 class CommandLimits:
-    """How fast references follow what a person commands; see `CommandFilter`.
+    """The rates and speeds at which references follow commands; see `CommandFilter`.
 
     Attributes:
         rates: Unit -> the rate w of its lags, in 1/s.
@@ -66,14 +66,14 @@ class CommandFilter:
     Args:
         signals: Names and units of the references.
         degrees: mu_1, ..., mu_p.
-        limits: How fast they follow.
-        has_speed: Whether the speed s' along the path is commanded, too; else s = t.
-        depth: The number of lags at least, as where another filter has the same commands and more
+        limits: The rates and speeds at which they follow.
+        has_speed: Whether the speed s' along the path is commanded, too; otherwise s = t.
+        depth: The least number of lags, for another filter with the same commands and more
             derivatives.
 
     Attributes:
-        commands: Names and units of what is commanded: the speed, if it is, then a change of each
-            reference.
+        commands: Names and units of the commands: the speed, if it is commanded, then a change of
+            each reference.
         defaults: Their defaults: speed 1, no change.
         num_states: The number of states: s and the stages of its speed, then the stages of each
             change.
@@ -124,13 +124,13 @@ class CommandFilter:
         base = ca.SX.sym("base", DerivativeLayout(tuple(degrees)).reference_size)
         rows, first = [ca.SX(0, 1)], 0
         for change, degree in zip(changes, degrees, strict=True):
-            own = base[first : first + degree + 1]  # r and its derivatives by s
-            value, path_rate = own[0], along(s)
+            by_path = base[first : first + degree + 1]  # r and its derivatives by s
+            value, path_rate = by_path[0], along(s)
             for order in range(degree + 1):
                 rows.append(value + change)
                 if order < degree:
                     # r(s(t)): the chain rule, where each derivative by s leads to the next one.
-                    by_s = ca.jtimes(value, own[:-1, :], own[1:, :])
+                    by_s = ca.jtimes(value, by_path[:-1, :], by_path[1:, :])
                     value, change = by_s * path_rate + along(value), along(change)
             first += degree + 1
         self.rate = TracedFunction(
@@ -143,9 +143,9 @@ class CommandFilter:
         )
 
     def start(self, time: float) -> FloatArray:
-        """The state at a start: the references as they are."""
-        found = np.zeros(self.num_states)
+        """The state at the start, without changes."""
+        state = np.zeros(self.num_states)
         if self.has_speed:
-            found[0] = time
-            found[1 : 1 + self._stages] = 1.0
-        return found
+            state[0] = time
+            state[1 : 1 + self._stages] = 1.0
+        return state

@@ -8,16 +8,8 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState, Dep
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, ReferenceSignalError
-from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.traced import (
-    DERIVATIVE,
-    PARAMETERS,
-    STATE,
-    TIME,
-    Block,
-    Computation,
-)
+from drake_dae.errors import ReferenceSignalError
+from drake_dae.systems.blocks.traced import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
 from drake_dae.systems.control.command_filter import CommandFilter, CommandLimits
 from drake_dae.systems.control.references import ReferenceGenerator, traced_references
 
@@ -26,7 +18,7 @@ from drake_dae.systems.control.references import ReferenceGenerator, traced_refe
 class CommandedReferences(ReferenceGenerator):
     """References with changes that are commanded while they run; see `CommandFilter`.
 
-    Numeric parameter 0 is what is commanded, named by `commands`: the speed along the path, 1 by
+    Numeric parameter 0 has the commands, named by `commands`: the speed along the path, 1 by
     default, and a change of each reference in its unit, 0 by default. It may jump at any time; the
     reference is smooth and within `limits`. The state is the time s along the path and the stages
     of the filter.
@@ -47,6 +39,8 @@ class CommandedReferences(ReferenceGenerator):
     Raises:
         ReferenceSignalError: As of `ReferenceGenerator`; or a reference has parameters.
     """
+
+    no_gradient = "commands pass a filter with kinks"
 
     def __init__(
         self,
@@ -71,7 +65,7 @@ class CommandedReferences(ReferenceGenerator):
 
     @property
     def commands(self) -> tuple[Signal, ...]:
-        """Names and units of what is commanded, the entries of numeric parameter 0."""
+        """Names and units of the commands, the entries of numeric parameter 0."""
         return self.filter.commands
 
     def _sources(self) -> set[DependencyTicket]:
@@ -93,16 +87,10 @@ class CommandedReferences(ReferenceGenerator):
         s = state[0] if self.filter.has_speed else time
         at = ca.SX.sym("s")
         base = ca.Function("base", [at], [traced_references(self.references, self.degrees, at)])
-        given = ca.Function("base", [time, state], [base(s)])
+        at_time = ca.Function("base", [time, state], [base(s)])
         computations = (
-            Computation(given, (TIME, STATE), ("base",)),
+            Computation(at_time, (TIME, STATE), ("base",)),
             Computation.of(self.filter.stacked, (TIME, STATE, PARAMETERS, "base"), ("reference",)),
             Computation.of(self.filter.rate, (STATE, PARAMETERS), (DERIVATIVE,)),
         )
         return Block(self, computations, signals={"commands": self.commands})
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.get_name()} does not convert to AutoDiffXd: what is commanded passes a filter "
-            "with kinks"
-        )

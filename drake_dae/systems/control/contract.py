@@ -31,7 +31,7 @@ SIGNAL = "signal_"
 """The beginning of the name of an input port for a signal."""
 
 Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
-"""Outputs z, what they should be, both of shape (k,), and their names and units."""
+"""Outputs z and their desired values, shape (k,) each, and their names and units."""
 
 
 @checked(ModelError)
@@ -67,8 +67,8 @@ class Controller(System):
     8. Observers. A controller whose law has another state and control than the plant names its
        output ports with these in `observed`, and has the input port `acting_control` for what acts
        on the plant. None if they are those of the plant.
-    9. Phases. `changes` are the times at which phases of a run began, with reasons; empty without
-       phases.
+    9. Phases. `changes` are the times at which phases of a run began, with reasons, and
+       `phase_ends` the signals for which phases wait, "" for none; both empty without phases.
     """
 
     __slots__ = ()
@@ -126,10 +126,7 @@ class Controller(System):
         check_law(plant.dae, self.law)
 
     def derived(
-        self,
-        context: Context | None,
-        times: FloatArray,
-        values: Mapping[str, FloatArray],
+        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """Derived signals of a record: desired outputs, errors and others.
 
@@ -142,7 +139,7 @@ class Controller(System):
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
-        """The outputs now and what they should be, with their names; None if unknown.
+        """The current outputs and their desired values, with their names; None if unknown.
 
         Args:
             context: The context of this system.
@@ -154,7 +151,7 @@ class Controller(System):
         return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
 
     def reference_now(self, context: Context) -> FloatArray | None:
-        """R: what is wired or fixed, or what the references are by themselves; None without any."""
+        """R from the wire or fixed value, or from references by time; None without any."""
         port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
         return port.Eval(context) if port is not None and port.HasValue(context) else None
 
@@ -186,26 +183,38 @@ class Controller(System):
         """The start of each phase of a run, with the reason."""
         return ()
 
+    @property
+    def phase_ends(self) -> tuple[str, ...]:
+        """The signal for which each phase waits, "" for none; empty without phases."""
+        return ()
 
-def check_law(own: DaeSystem, law: TrackingLaw) -> None:
+
+def output_errors(law: TrackingLaw, values: Mapping[str, FloatArray]) -> Derived:
+    """`desired_output` r and `tracking_error` z - r (29), from "reference" and z of a record."""
+    desired, signals = values["reference"][:, law.layout.lowest], law.system.output_signals
+    error = values["controlled_output"] - desired
+    return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
+
+
+def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
     """Refuses a law for a system of another size than the plant's.
 
     Args:
-        own: The plant's system.
+        dae: The plant's system.
         law: The law.
 
     Raises:
         WiringError: The sizes differ.
     """
     remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
-    check_same_sizes(own, law.system, "law", f"{remedy} a model of the same structure")
+    check_same_sizes(dae, law.system, "law", f"{remedy} a model of the same structure")
 
 
-def check_same_sizes(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
+def check_same_sizes(dae: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
     """Refuses a law or model for a system of another size than the plant's.
 
     Args:
-        own: The plant's system.
+        dae: The plant's system.
         other: The system that it is for.
         what: The name of the wired part.
         remedy: The remedy.
@@ -213,10 +222,10 @@ def check_same_sizes(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -
     Raises:
         WiringError: The sizes differ.
     """
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
+    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (dae, other)]
     if sizes[0] != sizes[1]:
         has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
         raise WiringError(
-            f"the {what} is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. "
+            f"the {what} is for '{other.name}' with {takes}, the plant '{dae.name}' has {has}. "
             f"Make {remedy}"
         )

@@ -25,10 +25,10 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.feedback import Feedback, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
-from drake_dae.systems.control.contract import Controller, Derived
+from drake_dae.systems.control.contract import Controller, Derived, output_errors
 from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.traced_law import traced_law
@@ -81,7 +81,7 @@ class TrackingController(ParameterizedSystem, Controller):
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
-        ModelError: The law cannot be fed back, or a limit or period makes no sense.
+        ModelError: The law cannot be fed back, or a limit or period is not valid.
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
@@ -143,16 +143,16 @@ class TrackingController(ParameterizedSystem, Controller):
         )
 
     def _add_integrals(self, limits: ArrayLike, sample_period: float) -> set[DependencyTicket]:
-        """Declares the integrals, and returns what the control depends on."""
+        """Declares the integrals, and returns the dependencies of the control."""
         count = len(self.law.integral.outputs)
-        given = np.asarray(limits, dtype=float)
-        if given.shape not in ((), (count,)) or not np.all(given > 0.0):
+        largest = np.asarray(limits, dtype=float)
+        if largest.shape not in ((), (count,)) or not np.all(largest > 0.0):
             raise ModelError(
                 f"integral_limits must be a positive number or shape ({count},), got {limits!r}"
             )
         if not sample_period >= 0.0:
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
-        self._limits, self.sample_period = np.broadcast_to(given, (count,)), sample_period
+        self._limits, self.sample_period = np.broadcast_to(largest, (count,)), sample_period
         self._hold = self.DeclareVectorInputPort("hold", count)
         if sample_period:
             self.DeclareDiscreteState(count)
@@ -169,7 +169,7 @@ class TrackingController(ParameterizedSystem, Controller):
             # Any value: reading it would close an algebraic loop.
             nothing = np.zeros(self.dae.num_constraints)
             self._evaluators[2] = lambda context: nothing
-        self.DeclareVectorOutputPort("integral", count, weakly(self._copy_integrals), tickets)
+        self.DeclareVectorOutputPort("integral", count, port_value(self._integrals), tickets)
         read = ["estimated_state", "reference", "exogenous"]
         read += ["measured_force"] if self.law.control_takes_force else []
         ports = [self.GetInputPort(name) for name in read if self.HasInputPort(name)]
@@ -206,9 +206,6 @@ class TrackingController(ParameterizedSystem, Controller):
             rate[self._hold.Eval(context) != 0.0] = 0.0
         return rate
 
-    def _copy_integrals(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._integrals(context))
-
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         """Changes the gains in a context.
 
@@ -224,7 +221,7 @@ class TrackingController(ParameterizedSystem, Controller):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def all_parameters(self, context: Context) -> FloatArray:
-        """What the law's function takes as parameters: the model's at the context's time, and K."""
+        """The parameters of the law's function: the model's at the context's time, and K."""
         self.check_context(context)
         return np.array(self._values(context))
 
@@ -237,9 +234,7 @@ class TrackingController(ParameterizedSystem, Controller):
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """`desired_output` r and `tracking_error` z - r (29), from "reference" and z."""
-        desired, signals = values["reference"][:, self.law.layout.lowest], self.dae.output_signals
-        error = values["controlled_output"] - desired
-        return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
+        return output_errors(self.law, values)
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -331,8 +326,9 @@ class TrackingController(ParameterizedSystem, Controller):
                 function, "integral_rate", sources, self._signals
             )
             sigma = self.law.integral.symbol
-            own = TracedFunction("integral", {"state": sigma}, {"value": sigma})
-            formulas["integral"] = TracedFormula(own)
+            formulas["integral"] = TracedFormula(
+                TracedFunction("integral", {"state": sigma}, {"value": sigma})
+            )
         return formulas
 
 

@@ -129,11 +129,11 @@ class SystemReference(Reference):
             )
         ports = [system.get_output_port(index) for index in range(system.num_output_ports())]
         if [port.size() for port in ports] != [size]:
-            found = ", ".join(f"{port.get_name()} ({port.size()})" for port in ports) or "none"
+            outputs = ", ".join(f"{port.get_name()} ({port.size()})" for port in ports) or "none"
             raise ReferenceSignalError(
                 f"'{name}' must have one output port, of size {size}: each output with its "
                 f"{', '.join(map(str, self.degrees))} derivatives, as r_1, r_1', ..., r_2, ...; it "
-                f"has {found}"
+                f"has {outputs}"
             )
 
     @property
@@ -141,10 +141,10 @@ class SystemReference(Reference):
         return len(self.degrees)
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        for row, (needed, given) in enumerate(zip(degrees, self.degrees, strict=True)):
-            if needed > given:
+        for row, (needed, available) in enumerate(zip(degrees, self.degrees, strict=True)):
+            if needed > available:
                 raise ReferenceSignalError(
-                    f"the law needs {needed} derivatives of row {row}, its system gives {given}"
+                    f"the law needs {needed} derivatives of row {row}, its system gives {available}"
                 )
         context, port = self.system.CreateDefaultContext(), self.system.get_output_port()
         table = DerivativeLayout(self.degrees)

@@ -3,11 +3,12 @@
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.systems.blocks.traced import Block, Computation
 
 
@@ -16,11 +17,11 @@ class ControlLimits(LeafSystem):
     """Limits each control, and reports the excess.
 
     Input port:
-        control: The wanted control, shape (p,).
+        control: The control before the limits, shape (p,).
 
     Output ports:
         control: The limited control, max(-limit, min(limit, control)), shape (p,).
-        excess: Wanted minus limited control, shape (p,): 0 within the limits.
+        excess: The control minus the limited control, shape (p,): 0 within the limits.
         is_limited: 1 while any control is limited, else 0, shape (1,); for the `hold` of a
             `TrackingController` with integrals.
 
@@ -42,25 +43,24 @@ class ControlLimits(LeafSystem):
         size = self.limits.size
         self._port = self.DeclareVectorInputPort("control", size)
         source = {self.input_port_ticket(self._port.get_index())}
-        self.DeclareVectorOutputPort("control", size, weakly(self._calc_control), source)
-        self.DeclareVectorOutputPort("excess", size, weakly(self._calc_excess), source)
-        self.DeclareVectorOutputPort("is_limited", 1, weakly(self._calc_is_limited), source)
+        self.DeclareVectorOutputPort("control", size, port_value(self._limited), source)
+        self.DeclareVectorOutputPort("excess", size, port_value(self._excess), source)
+        self.DeclareVectorOutputPort("is_limited", 1, port_value(self._is_limited), source)
 
-    def _calc_control(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(np.clip(self._port.Eval(context), -self.limits, self.limits))
+    def _limited(self, context: Context) -> FloatArray:
+        return np.clip(self._port.Eval(context), -self.limits, self.limits)
 
-    def _calc_excess(self, context: Context, output: BasicVector) -> None:
-        wanted = self._port.Eval(context)
-        output.SetFromVector(wanted - np.clip(wanted, -self.limits, self.limits))
+    def _excess(self, context: Context) -> FloatArray:
+        return np.asarray(self._port.Eval(context) - self._limited(context))
 
-    def _calc_is_limited(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([float(np.any(np.abs(self._port.Eval(context)) > self.limits))])
+    def _is_limited(self, context: Context) -> list[float]:
+        return [float(np.any(np.abs(self._port.Eval(context)) > self.limits))]
 
     def traced(self) -> Block:
-        wanted = ca.SX.sym("wanted", self.limits.size)
-        given = ca.fmax(-self.limits, ca.fmin(self.limits, wanted))
-        is_limited = ca.mmax(ca.fabs(wanted) - self.limits) > 0
-        function = ca.Function("limits", [wanted], [given, wanted - given, is_limited])
+        control = ca.SX.sym("control", self.limits.size)
+        limited = ca.fmax(-self.limits, ca.fmin(self.limits, control))
+        is_limited = ca.mmax(ca.fabs(control) - self.limits) > 0
+        function = ca.Function("limits", [control], [limited, control - limited, is_limited])
         return Block(
             self, (Computation(function, ("control",), ("control", "excess", "is_limited")),)
         )

@@ -13,17 +13,17 @@ class PhaseChange:
 
     Attributes:
         time: The time, in s.
-        phase: The name of the phase that begins, "Approach" for example; "done" where the task is
-            done, "held" where it ends in another way.
+        phase: The name of the phase that begins, "Approach" for example; "done" if the task is
+            done, "held" if it ends in another way.
         place: Its index in the task, from 0; the number of phases when done or held.
         in_contact: Whether the law for contact is active from then on.
         reason: The reason for the end of the previous phase.
         force: The measured force of the contact then, in N.
         distance: The distance by the law's model then, in m.
         distance_rate: Its derivative, in m/s.
-        chosen: What was chosen to follow the phase before: the name of a phase, "next", "approach",
-            "hold", "leave" or "stop"; empty at the begin.
-        failed: Whether the phase before has failed.
+        chosen: The key word that led here from the phase before: the name of a phase, "next",
+            "approach", "hold", "leave" or "stop"; empty at the start.
+        failed: Whether the phase before failed.
     """
 
     time: float

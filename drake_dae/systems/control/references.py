@@ -38,17 +38,18 @@ class ReferenceGenerator(DifferentiableSystem):
 
     Attributes:
         references, degrees: The arguments.
-        reference_parameters: Name -> default of each parameter of its references, shape (k,); they
-            stand below each other in numeric parameter 0. Those of one name are one.
-        function: R(t) with these defaults as a function of the time in s, whose array the next call
-            overwrites.
+        reference_parameters: Name -> default of each parameter of its references, shape (k,),
+            stacked in numeric parameter 0. References may share a parameter by its name.
+        function: R(t) with these defaults as a function of the time in s; the next call overwrites
+            its array.
 
-    The block converts to AutoDiffXd. If the time has derivatives, each reference needs one more.
+    The block converts to AutoDiffXd. If the time has a gradient, each reference needs one more
+    derivative.
 
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
-            enough; or two of them have a parameter of one name and different values.
-        NonFiniteError: A reference is not finite on the way; the exception has the time.
+            enough; or two of them have different values of a parameter with the same name.
+        NonFiniteError: A reference is not finite during a run; the exception has the time.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -75,7 +76,7 @@ class ReferenceGenerator(DifferentiableSystem):
         )
 
     def _sources(self) -> set[DependencyTicket]:
-        """What R depends on."""
+        """The dependencies of R."""
         return {self.time_ticket(), self.all_parameters_ticket()}
 
     @property
@@ -93,7 +94,7 @@ class ReferenceGenerator(DifferentiableSystem):
         return self.function(time).copy()
 
     def along(self, times: ArrayLike, context: Context | None = None) -> FloatArray:
-        """R(t) at many times in s, one row for each; nan for times without a value.
+        """R(t) at many times in s, one row for each; nan without a value.
 
         Args:
             times: The times.
@@ -113,7 +114,7 @@ class ReferenceGenerator(DifferentiableSystem):
         """R(t) as a function of the time alone.
 
         Raises:
-            ModelError: It has parameters, whose values stand in a context.
+            ModelError: It has parameters, whose values are in a context.
         """
         if self.reference_parameters:
             raise ModelError(
@@ -146,7 +147,7 @@ class ReferenceGenerator(DifferentiableSystem):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def places(self, name: str) -> slice:
-        """Where a parameter stands in numeric parameter 0."""
+        """The part of numeric parameter 0 that is a parameter."""
         first = 0
         for known, value in self.reference_parameters.items():
             if known == name:
@@ -163,10 +164,10 @@ class ReferenceGenerator(DifferentiableSystem):
         values = context.get_numeric_parameter(0).value()
 
         def evaluate(time: float) -> FloatArray:
-            (found,) = self._traced.evaluate(np.array([time]), values)
+            (reference,) = self._traced.evaluate(np.array([time]), values)
             if not self._traced.is_valid:
-                raise not_finite(time, found)
-            return found
+                raise not_finite(time, reference)
+            return reference
 
         return evaluate
 
@@ -175,12 +176,12 @@ class ReferenceGenerator(DifferentiableSystem):
 
     @cached_property
     def _traced(self) -> TracedFunction:
-        """R by the time and, if there are any, the parameters."""
+        """R as a function of the time and, if there are any, the parameters."""
         inputs = {"time": ca.SX.sym("t")}
         symbols = {
             name: ca.SX.sym(name, value.size) for name, value in self.reference_parameters.items()
         }
-        references = [each.with_parameters(symbols) for each in self.references]
+        references = [reference.with_parameters(symbols) for reference in self.references]
         rows = traced_references(references, self.degrees, inputs["time"])
         if symbols:
             inputs["parameters"] = ca.vertcat(*symbols.values())
@@ -202,15 +203,15 @@ def _common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]
     Raises:
         ReferenceSignalError: Two have different values for one name.
     """
-    found: dict[str, FloatArray] = {}
+    common: dict[str, FloatArray] = {}
     for reference in references:
         for name, value in reference.parameters.items():
-            if not np.array_equal(found.setdefault(name, value), value):
+            if not np.array_equal(common.setdefault(name, value), value):
                 raise ReferenceSignalError(
-                    f"two references have a parameter '{name}', with {found[name]} and {value}: "
+                    f"two references have a parameter '{name}', with {common[name]} and {value}: "
                     "give them one value, or two names"
                 )
-    return found
+    return common
 
 
 def traced_references(
@@ -222,8 +223,8 @@ def traced_references(
         ModelError: One is no expression of time.
     """
     rows = [ca.SX(0, 1)]
-    for reference, own in with_degrees(references, degrees):
-        row = reference.expression(own, time)
+    for reference, its_degrees in with_degrees(references, degrees):
+        row = reference.expression(its_degrees, time)
         if row is None:
             whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ModelError(

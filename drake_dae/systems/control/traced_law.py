@@ -18,6 +18,7 @@ from drake_dae.systems.blocks.traced import (
     Block,
     Computation,
     Update,
+    zero,
 )
 from drake_dae.systems.control.references import ReferenceGenerator
 
@@ -57,8 +58,7 @@ def traced_law(
         computations, updates = _traced_integrals(
             law, limits, sample_period, sources, shown, memory
         )
-        none = ca.Function("none", [], [ca.SX.zeros(limits.size)])
-        unwired["hold"] = Computation(none, (), ("hold",))
+        unwired["hold"] = zero("hold", limits.size)
     return Block(
         block,
         computations,
@@ -94,10 +94,12 @@ def _traced_integrals(
             ca.SX.sym(name, size)
             for name, size in zip(function.input_names, function.sizes, strict=True)
         ]
-        given = [*inputs]
-        given[place] = ca.SX.zeros(function.sizes[place])
+        without_force = [*inputs]
+        without_force[place] = ca.SX.zeros(function.sizes[place])
         without = ca.Function(
-            "control", [*inputs[:place], *inputs[place + 1 :]], function.function.call(given)
+            "control",
+            [*inputs[:place], *inputs[place + 1 :]],
+            function.function.call(without_force),
         )
         acts = Computation(without, (*sources[:place], *sources[place + 1 :]), shown, function)
     rates = Computation.of(function, sources, ("", "", "integral_rate"))
@@ -121,7 +123,7 @@ def _traced_integrals(
 
 
 def _motion_under(law: TrackingLaw, sources: tuple[str, ...]) -> Computation | None:
-    """x' and v of a plant that is the law's own model, from the wanted derivatives."""
+    """x' and v of a plant that is the law's own model, from the desired derivatives."""
     motion = law.trace_motion()
     if motion is None:
         return None

@@ -1,4 +1,4 @@
-"""Drives with limits, by which the error leaves its prediction least, as a LeafSystem."""
+"""A control within limits that changes the outputs' derivatives least, as a LeafSystem."""
 
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
@@ -20,20 +20,21 @@ OUTPUTS = ("control", "excess", "departure", "is_limited")
 
 @checked(ModelError)
 class FeasibleControl(LeafSystem):
-    """The control within limits that is nearest to a wanted one in the outputs' derivatives.
+    """The control within limits that is nearest to the commanded one in the outputs' derivatives.
 
-    See `feasible_control` for the law. Within all limits it is the wanted control.
+    See `feasible_control` for the law. If the commanded control is within all limits, it does not
+    change.
 
     Input ports:
         estimated_state: x, shape (n,).
-        control: The wanted control, shape (p,).
+        control: The commanded control, shape (p,).
 
     Output ports:
         control: u, shape (p,).
-        excess: Wanted minus given control, shape (p,): 0 within the limits.
-        departure: ubar - ubar_d, by how much the highest derivatives of the outputs are off those
-            of (28), shape (p,): 0 while errors follow their prediction (30).
-        is_limited: 1 while the control is not the wanted one, else 0, shape (1,).
+        excess: The commanded control minus u, shape (p,): 0 within the limits.
+        departure: ubar - ubar_d, the deviation of the outputs' highest derivatives from those of
+            (28), shape (p,): 0 while errors follow their prediction (30).
+        is_limited: 1 while u is not the commanded control, otherwise 0, shape (1,).
 
     Numeric parameter 0 holds the model's parameters.
 
@@ -56,7 +57,7 @@ class FeasibleControl(LeafSystem):
         self._steps = StepWatch(self)
         self.DeclareNumericParameter(BasicVector(system.parameter_values))
         self._state = self.DeclareVectorInputPort("estimated_state", system.num_states)
-        self._wanted = self.DeclareVectorInputPort("control", system.num_controls)
+        self._commanded = self.DeclareVectorInputPort("control", system.num_controls)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         for index, name in enumerate(OUTPUTS):
             size = self.function.outputs[index].size
@@ -71,9 +72,9 @@ class FeasibleControl(LeafSystem):
         )
 
     def _values(self, context: Context) -> tuple[FloatArray, ...]:
-        state, wanted = self._state.Eval(context), self._wanted.Eval(context)
+        state, control = self._state.Eval(context), self._commanded.Eval(context)
         parameters = context.get_numeric_parameter(0).value()
-        values = self.function.evaluate(state, wanted, parameters)
+        values = self.function.evaluate(state, control, parameters)
         if self.function.is_finite:
             return values
         names = {"state": self.dae.state_signals, "control": self.dae.control_signals}

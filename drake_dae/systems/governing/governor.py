@@ -1,4 +1,4 @@
-"""References whose time goes as fast as the present state allows, as a LeafSystem."""
+"""References that slow down where limits require it, as a LeafSystem."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,6 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.failures import simulation_error
-from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import weakly
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
@@ -42,17 +41,17 @@ PATH_SIGNALS = (Signal("s", "s"), Signal("s'", ""), Signal("s''", "1/s"), Signal
 
 @checked(ReferenceSignalError)
 class PathGovernor(ReferenceGenerator):
-    """References whose time s is slowed where a limit would be exceeded; see `Governing`.
+    """References whose time s slows down where a limit would be exceeded; see `Governing`.
 
-    s starts at the start time, with s' = 0, and s' returns to 1 where the limits allow it.
+    s starts at the start time with s' = 0, and s' returns to 1 if the limits allow it.
 
     Input port:
         estimated_state: x, shape (n,).
 
     Output ports:
         reference: R of (28) for r(s(t)), shape (sum (mu_i + 1),).
-        path: s, s', s'' and the room for s'' between its limits, shape (4,): the room is negative
-            where no s'' is within all limits.
+        path: s, s', s'' and the range of s'' between its limits, shape (4,): the range is negative
+            if no s'' is within all limits.
 
     The state is (s, s'), continuous, or with a sample period discrete; s'' is then constant in a
     sample. Numeric parameter 0 is that of the law's function. The block does not convert to
@@ -68,6 +67,8 @@ class PathGovernor(ReferenceGenerator):
     Raises:
         ReferenceSignalError, ModelError: As of `Governing`.
     """
+
+    no_gradient = "the rate of its references has kinks where limits are reached"
 
     def __init__(
         self,
@@ -164,16 +165,7 @@ class PathGovernor(ReferenceGenerator):
             updates,
             model=self.law.system,
             signals={"state": self.law.system.state_signals},
-            ports={
-                "reference": tuple(self.law.reference_signals),
-                "path": PATH_SIGNALS,
-            },
-        )
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.get_name()} does not convert to AutoDiffXd: the rate of its references has "
-            "kinks where limits are reached"
+            ports={"reference": tuple(self.law.reference_signals), "path": PATH_SIGNALS},
         )
 
 

@@ -7,20 +7,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    EventStatus,
-    State,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, EventStatus, State, ValueProducer
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation, Update
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 from drake_dae.systems.observing.observer_rates import Observing
@@ -31,20 +25,20 @@ from drake_dae.systems.observing.observing_system import ObservingSystem
 class StateEstimator(ObservingSystem):
     """Estimates the state of a robot with rigid joints from its encoders, with model errors.
 
-    Between samples the state and the disturbance r are predicted by the model,
+    Between samples the model predicts the state and the disturbance r,
 
         q' = v,    M v' = f + C mu + r + g lambda + h u,
 
     with the control u that acted and the measured force lambda; so velocities need no differences.
-    Viscous friction D in joints, which makes light links stiff, is taken implicitly: M + T D then
-    stands in place of M in the prediction and before K_3.
+    Viscous friction D in joints, which makes light links stiff, is implicit: M + T D then replaces
+    M in the prediction and before K_3.
     At a sample the error of the predicted positions, e = qm - q, corrects all of them,
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,
 
     where (K_1, K_2, K_3) is the gain of the stationary Kalman filter of each position; see
     `ChainFilter`. Since r is an acceleration there, M^-1 r, one gain serves all postures, and the
-    errors of the estimate are those of a linear filter whatever the motion. Along the constrained
+    errors of the estimate are those of a linear filter for any motion. Along the constrained
     directions, M^-1 J^T A^-1 J e, the gains are those of k_n in place of k_o. Measured velocities,
     if their noise is given, correct likewise. Friction takes its share of r as in a
     `DisturbanceObserver`, and so does a contact that sticks.
@@ -60,9 +54,9 @@ class StateEstimator(ObservingSystem):
         estimated_state: The estimate of (q, v) at the present sample, shape (n,).
         exogenous, disturbance, friction, hold: As of a `DisturbanceObserver`, at the present
             sample.
-        estimated_force: If the law measures no force: that of the model in the last sample, v =
-            alpha(x) + beta(x) u (25) with the disturbance and the friction that are observed, shape
-            (m,). A model error along the constrained directions stays in it.
+        estimated_force: Only if the law measures no force: that of the model in the last sample, v
+            = alpha(x) + beta(x) u (25) with the observed disturbance and friction, shape (m,). It
+            has the model errors along the constrained directions.
 
     Args:
         law: The law, for a system that `with_disturbance` made.
@@ -109,18 +103,18 @@ class StateEstimator(ObservingSystem):
         ]
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
-        self._functions = found = EstimatorFunctions(law, observing, *timing, filters)
-        start = np.zeros(found.size + law.system.num_controls + law.system.num_constraints)
+        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters)
+        start = np.zeros(functions.size + law.system.num_controls + law.system.num_constraints)
         start[0] = -1.0
-        self._declare(law, found, "measured_state", start)
-        self._read = found.reads
+        self._declare(law, functions, "measured_state", start)
+        self._read = functions.reads
         held = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
         names = "measured_state", *self._read
         read = {self.input_port_ticket(self._ports[name].get_index()) for name in names}
         entry = self.DeclareCacheEntry(
             "estimate",
             ValueProducer(
-                lambda: AbstractValue.Make(start[: found.size].copy()), weakly(self._calc)
+                lambda: AbstractValue.Make(start[: functions.size].copy()), weakly(self._calc)
             ),
             held | read | {self.time_ticket()},
         )
@@ -130,25 +124,30 @@ class StateEstimator(ObservingSystem):
             force = self.input_port_ticket(self._ports["measured_force"].get_index())
         self._declare_hold(force)
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        also = {self.input_port_ticket(self._ports["reference"].get_index())}
-        for name, calc, size, more in (
-            ("estimated_state", self._copy_state, law.system.num_states, set()),
-            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, {force, *also}),
-            ("disturbance", self._copy_disturbance, count, set()),
-            ("friction", self._copy_friction, len(self.friction_signals), set()),
-        ):
-            tickets = {entry.ticket(), self.all_parameters_ticket(), *more}
-            self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
+        sources = {entry.ticket(), self.all_parameters_ticket()}
+        read = {force, self.input_port_ticket(self._ports["reference"].get_index())}
+        size, value = functions.exogenous.outputs[0].size, port_value(self._exogenous_values)
+        self.DeclareVectorOutputPort("exogenous", size, value, sources | read)
+        parts = zip(("estimated_state", "disturbance", "friction"), self._parts, strict=False)
+        for name, part in parts:
+            size, value = part.stop - part.start, port_value(self._part, part)
+            self.DeclareVectorOutputPort(name, size, value, sources)
         if not self._measures:
             size = law.system.num_constraints
-            self.DeclareVectorOutputPort(_FORCE, size, weakly(self._copy_force), {force})
+            self.DeclareVectorOutputPort(_FORCE, size, port_value(self._force), {force})
 
     @property
-    def _places(self) -> tuple[slice, ...]:
-        """Where state, disturbance, friction and force stand in an estimate."""
-        known = self._functions.estimate
-        parts = known.sample, known.state, known.disturbance, known.friction, known.force
-        ends = np.cumsum([part.numel() for part in parts]).tolist()
+    def _parts(self) -> tuple[slice, ...]:
+        """The parts of an estimate: state, disturbance, friction and force."""
+        estimate = self._functions.estimate
+        columns = (
+            estimate.sample,
+            estimate.state,
+            estimate.disturbance,
+            estimate.friction,
+            estimate.force,
+        )
+        ends = np.cumsum([column.numel() for column in columns]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
 
     @property
@@ -158,72 +157,62 @@ class StateEstimator(ObservingSystem):
     @property
     def further_signals(self) -> dict[str, Sequence[Signal]]:
         """Name of an output port in a record -> names and units of its entries."""
-        known = dict(super().further_signals)
+        signals = dict(super().further_signals)
         if not self._measures:
-            known[_FORCE] = self.dae.constraint_input_signals
-        return known
+            signals[_FORCE] = self.dae.constraint_input_signals
+        return signals
 
     def _force(self, context: Context) -> FloatArray:
         if self._measures:
             return super()._force(context)
-        return self._estimate(context)[self._places[3]]
+        return self._estimate(context)[self._parts[3]]
 
     @property
     def _mu(self) -> slice:
-        return self._places[2]
+        return self._parts[2]
 
     def _calc(self, context: Context, value: AbstractValue) -> None:
-        (x,), held = (
-            self._given(context, "measured_state"),
-            context.get_discrete_state(self._held).value(),
-        )
-        read = [*self._given(context, *self._read[:-1]), self._holds(context)]
+        (x,) = self._inputs(context, "measured_state")
+        held = context.get_discrete_state(self._held).value()
+        read = [*self._inputs(context, *self._read[:-1]), self._hold_input(context)]
         time = np.array([context.get_time()])
-        found = self._checked(self._functions.now, context, x, held, *read, time)
-        value.set_value(found[0].copy())
+        (estimate, *_) = self._checked(self._functions.now, context, x, held, *read, time)
+        value.set_value(estimate.copy())
 
     def _estimate(self, context: Context) -> FloatArray:
-        found: FloatArray = self.get_cache_entry(self._index).Eval(context)
-        return found
+        estimate: FloatArray = self.get_cache_entry(self._index).Eval(context)
+        return estimate
+
+    def _part(self, part: slice, context: Context) -> FloatArray:
+        return self._estimate(context)[part]
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        held = [self._estimate(context), *self._given(context, "control"), self._force(context)]
+        held = [self._estimate(context), *self._inputs(context, "control"), self._force(context)]
         state.get_mutable_discrete_state().set_value(self._held, np.concatenate(held))
         return EventStatus.Succeeded()
 
-    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
-        found = self._estimate(context)
-        x = found[self._places[0]]
-        given = found, self._force(context), self._reference(context, x)
-        output.SetFromVector(self._checked(self._functions.exogenous, context, x, *given)[0])
-
-    def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate(context)[self._places[0]])
-
-    def _copy_disturbance(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate(context)[self._places[1]])
-
-    def _copy_friction(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._estimate(context)[self._places[2]])
-
-    def _copy_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._force(context))
+    def _exogenous_values(self, context: Context) -> FloatArray:
+        estimate = self._estimate(context)
+        x = estimate[self._parts[0]]
+        inputs = estimate, self._force(context), self._reference(context, x)
+        return self._checked(self._functions.exogenous, context, x, *inputs)[0]
 
     def traced(self) -> Block:
-        functions, known = self._functions, self._functions.estimate
+        functions, estimate = self._functions, self._functions.estimate
         sources = ("measured_state", HELD, *self._read, TIME, PARAMETERS)
         now = Computation.of(functions.now, sources, (_NOW,))
         force = "measured_force" if self._measures else _FORCE
         state = ("estimated_state", _NOW, force, "reference", PARAMETERS)
         parts = {
-            "estimated_state": known.state,
-            "disturbance": known.disturbance,
-            "friction": known.friction,
+            "estimated_state": estimate.state,
+            "disturbance": estimate.disturbance,
+            "friction": estimate.friction,
         }
-        parts |= {} if self._measures else {_FORCE: known.force}
-        shown = ca.Function("shown", [known.column], list(parts.values()))
-        u, v = (ca.SX.sym("given", n) for n in (self.dae.num_controls, self.dae.num_constraints))
-        after = ca.Function("after", [known.column, u, v], [ca.vertcat(known.column, u, v)])
+        parts |= {} if self._measures else {_FORCE: estimate.force}
+        column = estimate.column
+        shown = ca.Function("shown", [column], list(parts.values()))
+        u, v = ca.SX.sym("u", self.dae.num_controls), ca.SX.sym("v", self.dae.num_constraints)
+        after = ca.Function("after", [column, u, v], [ca.vertcat(column, u, v)])
         return Block(
             self,
             (
@@ -247,11 +236,11 @@ class StateEstimator(ObservingSystem):
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
     """One number for each position."""
-    found = numbers(name, given)
-    if found.shape not in ((), (count,)) or not np.all(found >= 0.0):
+    deviations = numbers(name, given)
+    if deviations.shape not in ((), (count,)) or not np.all(deviations >= 0.0):
         raise ModelError(f"{name} must be 0 or more, a number or shape ({count},), got {given!r}")
-    return np.broadcast_to(found, (count,))
+    return np.broadcast_to(deviations, (count,))
 
 
 _NOW, _FORCE = "estimate", "estimated_force"
-"""The name of the estimate among the computations of the block, and a port."""
+"""The name of the estimate among the computations of the block, and the port of the force."""

@@ -1,4 +1,4 @@
-"""What a `StateEstimator` computes at its samples, as traced functions."""
+"""The computations of a `StateEstimator` at its samples, as traced functions."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -19,7 +19,7 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What an estimator knows at a sample, as columns that stand below each other.
+    """The estimate at a sample, as columns that are stacked.
 
     Attributes:
         sample: The index k of the sample t_k = k T; -1 before the first, shape (1,).
@@ -37,7 +37,7 @@ class Estimate:
 
     @classmethod
     def of(cls, states: int, frictions: int, forces: int) -> Self:
-        """Symbols, where x, mu and the force have so many entries."""
+        """Symbols for given sizes of x, mu and the force."""
         sizes = (1, states, states // 2, frictions, forces)
         return cls(*(ca.SX.sym("estimate", size) for size in sizes))
 
@@ -48,7 +48,7 @@ class Estimate:
 
     @property
     def column(self) -> ca.SX:
-        """All of it."""
+        """The whole estimate as one column."""
         return ca.vertcat(*vars(self).values())
 
 
@@ -62,11 +62,12 @@ class EstimatorFunctions(Observed):
             is the estimate of a sample before, with u and v of that sample. It has no argument u
             where the plant uses the previous control alone, and no v if the law measures no force.
         measures: Whether the constraint force is measured, or there is none.
-        reads: Its arguments u, v and hold, as names of the ports.
-        exogenous: (x, estimate, v, R, parameters) -> what to cancel, mu, and their derivatives.
+        reads: The names of the ports of its arguments u, v and hold.
+        exogenous: (x, estimate, v, R, parameters) -> the disturbance to compensate, mu, and their
+            derivatives.
 
     Args:
-        law, observing: As of the estimator.
+        law, observing: The arguments of the estimator.
         period, lag, delay, step: Its `sample_period`, `control_lag`, `control_delay` and
             `plant_step`.
         filters: Its filters along the free and the constrained directions, one for each position.
@@ -106,7 +107,7 @@ class EstimatorFunctions(Observed):
         measured, v, count = system.state, self._force, len(self.observation.rows)
         u = ca.SX.sym("control", system.num_controls)
         time, hold = ca.SX.sym("time"), ca.SX.sym("hold", 1)
-        last_u, last_v = (ca.SX.sym("before", each.numel()) for each in (u, v))
+        last_u, last_v = (ca.SX.sym("before", symbol.numel()) for symbol in (u, v))
         acted = self._lag * last_u + (1.0 - self._lag) * u
         share = (1.0 + self._step / period) / 2.0  # A discrete plant's force is that of its step.
         force = share * v + (1.0 - share) * last_v
@@ -129,55 +130,56 @@ class EstimatorFunctions(Observed):
         moved = qd + period * stepping.solve(push)
         ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
 
-        # Correction by what is measured, along the free and the constrained directions.
+        # Correction by the measurements, along the free and the constrained directions.
         steps = [
-            sum((kind * e for kind, e in zip(kinds, errors, strict=True)), ca.SX(0))
-            for errors in [(measured[:count] - ahead, measured[count:] - moved)]
-            for kinds in self._gains()
+            by_position * (measured[:count] - ahead) + by_velocity * (measured[count:] - moved)
+            for by_position, by_velocity in self._gains()
         ]
         free, constrained = steps[:3], steps[3:]
         difference = ca.horzcat(*free) - ca.horzcat(*constrained)
         turned = factors.solve(ca.mtimes(contact.free, ca.mtimes(mass, difference[:, :2])))
-        found_q = ahead + constrained[0] + turned[:, 0]
-        found_v = moved + constrained[1] + turned[:, 1]
+        new_q = ahead + constrained[0] + turned[:, 0]
+        new_v = moved + constrained[1] + turned[:, 1]
         jump = ca.mtimes(moves, constrained[2])
         jump += ca.mtimes(contact.free, ca.mtimes(moves, difference[:, 2]))
-        found_r = r + beside(contact.held, contact.metric, jump)
+        new_r = r + beside(contact.held, contact.metric, jump)
 
         # Friction takes its share of the disturbance.
-        change = self.change(contact, mu, found_r, hold)
-        found_r -= ca.mtimes(contact.friction, change)
-        found = ca.vertcat(found_q, found_v, found_r, mu + change)
-        begun, valid = ca.vertcat(measured, r, mu), contact.valid
+        change = self.change(contact, mu, new_r, hold)
+        new_r -= ca.mtimes(contact.friction, change)
+        corrected = ca.vertcat(new_q, new_v, new_r, mu + change)
+        first, valid = ca.vertcat(measured, r, mu), contact.valid
         if not self.measures:
-            by_model = self._forces(middle, acted, r, mu)
-            found, valid = ca.substitute([found, valid], [v], [by_model])
-            state, r_now, mu_now = ca.vertsplit(found, [0, 2 * count, 3 * count, found.numel()])
-            found = ca.vertcat(found, self._forces(state, acted, r_now, mu_now))
-            begun = ca.vertcat(begun, ca.SX.zeros(v.numel()))  # No control has acted yet.
+            by_model = self._forces(middle, r, mu, acted)
+            corrected, valid = ca.substitute([corrected, valid], [v], [by_model])
+            ends = [0, 2 * count, 3 * count, corrected.numel()]
+            state, new_r, new_mu = ca.vertsplit(corrected, ends)
+            corrected = ca.vertcat(corrected, self._forces(state, new_r, new_mu, acted))
+            first = ca.vertcat(first, ca.SX.zeros(v.numel()))  # No control has acted yet.
         sample = ca.floor(time / period + _SAME)
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
-        fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, found, begun))
-        shown = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
-        known = {"control": u, "measured_force": v, "hold": hold}
-        inputs = {name: known[name] for name in self.reads} | {"time": time}
+        fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, corrected, first))
+        estimate = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
+        symbols = {"control": u, "measured_force": v, "hold": hold}
+        inputs = {name: symbols[name] for name in self.reads} | {"time": time}
         return system.trace(
             "estimate of the state",
-            {"estimate": shown, "valid": ca.if_else(is_corrected, valid, 0)},
+            {"estimate": estimate, "valid": ca.if_else(is_corrected, valid, 0)},
             {"held": ca.vertcat(old.column, last_u, last_v), **inputs},
         )
 
-    def _forces(self, state: ca.SX, control: ca.SX, r: ca.SX, mu: ca.SX) -> ca.SX:
-        """v = alpha(x) + beta(x) u (25) with the disturbance and the friction that are observed."""
+    def _forces(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
+        """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""
         system, (alpha, beta) = self._system, self._model_force
         parameters = self._parameters(mu)
         parameters[system.parameter_slice(DISTURBANCE)] = r
         inputs = [system.state, system.parameter_symbol]
-        found = ca.Function("force", inputs, [alpha, ca.densify(beta)])(state, parameters)
-        return found[0] + ca.mtimes(found[1], control)
+        function = ca.Function("force", inputs, [alpha, ca.densify(beta)])
+        alpha, beta = function(state, parameters)
+        return alpha + ca.mtimes(beta, control)
 
     def _balance(self) -> ca.Function:
-        """(x, u, v, parameters) -> M, the force that accelerates it, and the joints' damping."""
+        """(x, u, v, parameters) -> M, the total force without M v', and the joints' damping."""
         system, rows = self._system, list(self.observation.rows)
         u, v, speed = ca.SX.sym("u", system.num_controls), self._force, self._system.state[rows]
         push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
@@ -189,17 +191,17 @@ class EstimatorFunctions(Observed):
 
     def _gains(self) -> list[tuple[ca.DM, ca.DM]]:
         """The gains of q, v and a by errors of positions and velocities; free, constrained."""
-        found = []
-        for kinds in self._filters:
-            gains = np.zeros((len(kinds), 3, 2))
-            for i, kind in enumerate(kinds):
-                gains[i, :, : kind.gain.shape[1]] = kind.gain
-            found += [tuple(ca.DM(gains[:, j, e]) for e in range(2)) for j in range(3)]
-        return found
+        pairs = []
+        for filters in self._filters:
+            gains = np.zeros((len(filters), 3, 2))
+            for i, chain_filter in enumerate(filters):
+                gains[i, :, : chain_filter.gain.shape[1]] = chain_filter.gain
+            pairs += [tuple(ca.DM(gains[:, j, e]) for e in range(2)) for j in range(3)]
+        return pairs
 
 
 _SAME = 1e-9
-"""Times that differ by less than this, in periods, are one."""
+"""Times that differ by less than this, in periods, count as equal."""
 
 
 def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:

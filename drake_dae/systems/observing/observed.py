@@ -1,4 +1,4 @@
-"""What observers of a law's disturbance share: friction's part, and what the law compensates."""
+"""The functions that all observers share: the part of friction, and the signals for the law."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,11 +12,12 @@ from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 _SHARP = 10.0
-"""Friction here is that of a motion so many times as fast: full from v_s / 10 on."""
+"""Friction here is that of a motion faster by this factor: it is fully developed from v_s / 10 on.
+"""
 
 
 class Estimates(Protocol):
-    """What an observer holds of the disturbance, as columns of expressions.
+    """The estimates of an observer, as columns of expressions.
 
     Attributes:
         disturbance: r, shape (k,).
@@ -36,7 +37,7 @@ class Estimates(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ContactTerms:
-    """What friction and constraints do at a state, as expressions.
+    """The directions of friction and constraints at a state, as expressions.
 
     Attributes:
         friction: C, the friction force per unit of each coefficient, shape (k, c).
@@ -59,14 +60,14 @@ class ContactTerms:
 
 
 class Observed:
-    """What observers of a law's disturbance share: friction's part, and what the law compensates.
+    """The functions that all observers of a law's disturbance share.
 
     Attributes:
-        observation: What is observed.
-        hold: (v, hold) -> 1 where integrals stand still, else 0.
+        observation: The observed functions.
+        hold: (v, hold) -> 1 if integrals are not updated, otherwise 0.
 
     Args:
-        law, observing: As of the observer.
+        law, observing: The arguments of the observer.
         period: Its sample period in s.
 
     Raises:
@@ -74,26 +75,26 @@ class Observed:
     """
 
     def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
-        self.observation = found = Observation.of(law.structure)
+        self.observation = observation = Observation.of(law.structure)
         self._system, self._observing, self._period = law.system, observing, period
         self._force = ca.SX.sym("constraint_input", law.system.num_constraints)
-        pressed = [self._force[i] for i in found.frictions.values()]
-        self._is_lost = ca.vertcat(ca.SX(0, 1), *pressed) < observing.least_force
+        normal_forces = [self._force[i] for i in observation.frictions.values()]
+        self._is_lost = ca.vertcat(ca.SX(0, 1), *normal_forces) < observing.least_force
         hold = ca.SX.sym("hold", 1)
-        holds = ca.fmax(hold != 0, ca.mmax(self._is_lost) if pressed else 0)
+        holds = ca.fmax(hold != 0, ca.mmax(self._is_lost) if normal_forces else 0)
         self.hold = TracedFunction(
             "hold", {"constraint_input": self._force, "hold": hold}, {"hold": holds}
         )
 
     def _parameters(self, friction: ca.SX) -> ca.SX:
         """The model's parameters with other coefficients of friction."""
-        found, system = ca.SX(self._system.parameter_symbol), self._system
+        parameters = ca.SX(self._system.parameter_symbol)
         for j, name in enumerate(self.observation.frictions):
-            found[system.parameter_slice(name)] = friction[j]
-        return found
+            parameters[self._system.parameter_slice(name)] = friction[j]
+        return parameters
 
     def contact(self, state: ca.SX, parameters: ca.SX) -> ContactTerms:
-        """What friction and constraints do at a state."""
+        """The directions of friction and constraints at a state."""
         observation, size = self.observation, len(self.observation.rows)
         friction = observation.friction.function(self._faster(state), self._force, parameters)
         directions = observation.directions.function(state, self._force, parameters)
@@ -106,23 +107,23 @@ class Observed:
         return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
 
     def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
-        """How mu changes at a sample, at which friction takes its share of r."""
+        """The change of mu at a sample, by which friction takes its share of r."""
         gain = -np.expm1(-self._observing.friction_rate * self._period)
-        known = contact.friction, contact.planes, contact.velocity, contact.metric
-        found = mu + contact.slides * gain * shares(*known, r)
-        found = ca.fmin(ca.fmax(found, 0.0), self._observing.largest_friction)
-        return ca.if_else(hold != 0, 0, found - mu)
+        terms = contact.friction, contact.planes, contact.velocity, contact.metric
+        after = mu + contact.slides * gain * shares(*terms, r)
+        after = ca.fmin(ca.fmax(after, 0.0), self._observing.largest_friction)
+        return ca.if_else(hold != 0, 0, after - mu)
 
     def compensated(
         self, law: TrackingLaw, delay: float, held: ca.SX, estimates: Estimates
     ) -> TracedFunction:
-        """What the law compensates: disturbance, coefficients of friction and their derivatives.
+        """The signals for the law: disturbance, coefficients of friction and their derivatives.
 
         Args:
             law: The law.
             delay: The mean time in s until its control acts.
-            held: The symbols of the memory.
-            estimates: What the memory has of the disturbance.
+            held: The symbols of the discrete state.
+            estimates: The estimates in it.
 
         Returns:
             (x, held, v, R, parameters) -> the port `exogenous` of its controller.
@@ -136,20 +137,20 @@ class Observed:
             if observation.wanted is not None:
                 wanted = observation.wanted.function(x, reference, delay, parameters)
                 goal, pivot = wanted[:2]
-            own, goes = (
-                observation.friction.function(each, v, parameters)[0]
-                for each in (x, self._faster(goal))
+            friction, goal_friction = (
+                observation.friction.function(state, v, parameters)[0]
+                for state in (x, self._faster(goal))
             )
-            r = r + ca.mtimes(goes - own, mu)
+            r = r + ca.mtimes(goal_friction - friction, mu)
         size, rates = r.numel(), estimates.rates
         rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
         zeros = [ca.SX(0.0)] * (rates.numel() // size)
         for j, name in enumerate(observation.frictions):
             rows[name] = [[mu[j], *zeros]]
-        stacked, left = list[ca.SX](), iter(law.exogenous_degrees)
+        stacked, degrees = list[ca.SX](), iter(law.exogenous_degrees)
         for p in self._system.exogenous.moving:
             for row in rows[p.name]:
-                stacked += row[: 1 + next(left)]
+                stacked += row[: 1 + next(degrees)]
         return self._system.trace(
             "exogenous signals of the observer",
             {"exogenous": ca.vertcat(*stacked)},
@@ -158,7 +159,7 @@ class Observed:
         )
 
     def _faster(self, state: ca.SX) -> ca.SX:
-        """The state in a motion that is so fast that friction is full."""
-        found, rows = ca.SX(state), list(self.observation.rows)
-        found[rows] = _SHARP * found[rows]
-        return found
+        """The state with velocities increased by `_SHARP`."""
+        faster, rows = ca.SX(state), list(self.observation.rows)
+        faster[rows] = _SHARP * faster[rows]
+        return faster

@@ -2,12 +2,13 @@
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, EventStatus, State
+from pydrake.systems.framework import Context, EventStatus, State
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing
@@ -40,7 +41,7 @@ class DisturbanceObserver(ObservingSystem):
         measured_force: v, shape (m,).
         hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire. Then mu is not
             updated; r is, since it depends on the applied u.
-        reference: R, as that of the controller; may be without a wire.
+        reference: R of the controller; without a wire the current outputs and rates.
 
     Output ports:
         exogenous: The disturbance to compensate, and mu, each with the derivatives that the law
@@ -84,22 +85,22 @@ class DisturbanceObserver(ObservingSystem):
     ) -> None:
         super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("disturbance_observer")
-        self._functions = found = ObserverFunctions(
+        self._functions = functions = ObserverFunctions(
             law, observing, sample_period, control_lag, control_delay
         )
-        start = np.zeros(found.memory.column.numel())
-        self._declare(law, found, "estimated_state", start)
+        start = np.zeros(functions.memory.column.numel())
+        self._declare(law, functions, "estimated_state", start)
         self._declare_hold(self.input_port_ticket(self._ports["measured_force"].get_index()))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
-        for name, calc, count, read in (
-            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, _READ),
-            ("disturbance", self._calc_disturbance, self._mu.start, ()),
-            ("friction", self._calc_friction, len(self.friction_signals), ()),
-        ):
-            tickets = {self.input_port_ticket(self._ports[port].get_index()) for port in read}
-            self.DeclareVectorOutputPort(name, count, weakly(calc), sources | tickets)
+        reads = {self.input_port_ticket(self._ports[port].get_index()) for port in _READ}
+        count = functions.exogenous.outputs[0].size
+        value = port_value(self._exogenous_values)
+        self.DeclareVectorOutputPort("exogenous", count, value, sources | reads)
+        for name, part in (("disturbance", slice(0, self._mu.start)), ("friction", self._mu)):
+            value = port_value(self._part, part)
+            self.DeclareVectorOutputPort(name, part.stop - part.start, value, sources)
 
     @property
     def _mu(self) -> slice:
@@ -108,28 +109,20 @@ class DisturbanceObserver(ObservingSystem):
         return slice(first, first + memory.friction.numel())
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        x, u, force = self._given(context, "estimated_state", "control", "measured_force")
-        held = context.get_discrete_state(self._held).value()
-        given = held, u, force, self._holds(context)
-        found = self._checked(self._functions.sample, context, x, *given)[0]
-        state.get_mutable_discrete_state().set_value(self._held, found)
+        x, u, force = self._inputs(context, "estimated_state", "control", "measured_force")
+        inputs = context.get_discrete_state(self._held).value(), u, force, self._hold_input(context)
+        after = self._checked(self._functions.sample, context, x, *inputs)[0]
+        state.get_mutable_discrete_state().set_value(self._held, after)
         return EventStatus.Succeeded()
 
-    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
-        x, force = self._given(context, "estimated_state", "measured_force")
-        held, reference = (
-            context.get_discrete_state(self._held).value(),
-            self._reference(context, x),
-        )
-        function = self._functions.exogenous
-        output.SetFromVector(self._checked(function, context, x, held, force, reference)[0])
-
-    def _calc_disturbance(self, context: Context, output: BasicVector) -> None:
+    def _exogenous_values(self, context: Context) -> FloatArray:
+        x, force = self._inputs(context, "estimated_state", "measured_force")
         held = context.get_discrete_state(self._held).value()
-        output.SetFromVector(held[: self._mu.start])
+        inputs = x, held, force, self._reference(context, x)
+        return self._checked(self._functions.exogenous, context, *inputs)[0]
 
-    def _calc_friction(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._held).value()[self._mu])
+    def _part(self, part: slice, context: Context) -> FloatArray:
+        return context.get_discrete_state(self._held).value()[part]
 
     def traced(self) -> Block:
         functions, memory = self._functions, self._functions.memory

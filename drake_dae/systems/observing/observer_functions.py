@@ -1,4 +1,4 @@
-"""What a `DisturbanceObserver` computes at its samples, as traced functions."""
+"""The computations of a `DisturbanceObserver` at its samples, as traced functions."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -15,15 +15,15 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class ObserverMemory:
-    """What an observer holds between samples, as columns that stand below each other.
+    """The discrete state of an observer, as columns that are stacked.
 
     Attributes:
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
         rates: r', ..., r^(n), shape (n k,).
-        lags: What r lags behind, shape (n k,).
+        lags: The inputs of the lags before r, shape (n k,).
         momentum, drift, control: p, its rate without inputs, and u of the sample before.
-        seen: 0 before the first sample, then 1, shape (1,).
+        has_sample: 0 before the first sample, then 1, shape (1,).
     """
 
     disturbance: ca.SX
@@ -33,18 +33,18 @@ class ObserverMemory:
     momentum: ca.SX
     drift: ca.SX
     control: ca.SX
-    seen: ca.SX
+    has_sample: ca.SX
 
     @classmethod
     def of(cls, size: int, frictions: int, degree: int, controls: int) -> Self:
-        """Symbols, where r, mu and u have so many entries, and r has so many derivatives."""
+        """Symbols for given sizes of r, mu and u, and a given number of derivatives of r."""
         chain = degree * size
         sizes = (size, frictions, chain, chain, size, size, controls, 1)
-        return cls(*(ca.SX.sym("held", each) for each in sizes))
+        return cls(*(ca.SX.sym("held", count) for count in sizes))
 
     @property
     def column(self) -> ca.SX:
-        """All of it."""
+        """The whole state as one column."""
         return ca.vertcat(*vars(self).values())
 
 
@@ -52,12 +52,13 @@ class ObserverFunctions(Observed):
     """The functions of a `DisturbanceObserver`, whose class has the equations.
 
     Attributes:
-        memory: What is held between samples.
-        sample: (x, held, u, v, hold, parameters) -> what is held after a sample.
-        exogenous: (x, held, v, R, parameters) -> what to cancel, mu, and their derivatives.
+        memory: The symbols of the discrete state.
+        sample: (x, held, u, v, hold, parameters) -> the discrete state after a sample.
+        exogenous: (x, held, v, R, parameters) -> the disturbance to compensate, mu, and their
+            derivatives.
 
     Args:
-        law, observing: As of the observer.
+        law, observing: The arguments of the observer.
         period, lag, delay: Its `sample_period`, `control_lag` and `control_delay`.
 
     Raises:
@@ -78,11 +79,11 @@ class ObserverFunctions(Observed):
         self.exogenous = self.compensated(law, delay, memory.column, memory)
 
     def _sampled(self, hold: ca.SX) -> TracedFunction:
-        """What is held after a sample."""
+        """The discrete state after a sample."""
         observation, memory = self.observation, self.memory
         x, v, size = self._system.state, self._force, len(observation.rows)
         u = ca.SX.sym("control", self._system.num_controls)
-        r, mu, late = memory.disturbance, memory.friction, self._lag * memory.seen
+        r, mu, late = memory.disturbance, memory.friction, self._lag * memory.has_sample
         parameters = self._parameters(ca.SX.zeros(mu.numel()))
         acted = late * memory.control + (1.0 - late) * u
         momentum = observation.momentum.function(x, acted, v, parameters)
@@ -91,22 +92,22 @@ class ObserverFunctions(Observed):
         d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
         d -= ca.mtimes(contact.friction, mu)
 
-        # Each lag is a column. What a contact that sticks may hold is not believed.
+        # Each lag is a column. A sticking contact may hide forces, so these do not enter.
         fast, slow = self._lags
         chain = ca.horzcat(ca.reshape(memory.lags, size, fast.degree), r)
         by_fast, by_slow = (
-            beside(contact.held, contact.metric, memory.seen * (lags.after(chain, d) - chain))
+            beside(contact.held, contact.metric, memory.has_sample * (lags.after(chain, d) - chain))
             for lags in (fast, slow)
         )
         chain += by_slow + ca.mtimes(contact.free, by_fast - by_slow)
 
-        # Friction takes its share of it.
+        # Friction takes its share of r.
         change = self.change(contact, mu, chain[:, -1], hold)
         chain -= ca.repmat(ca.mtimes(contact.friction, change), 1, chain.shape[1])
         moves = ca.mtimes(contact.free, chain)
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         after = [chain[:, -1], mu + change, ca.vec(rates), ca.vec(chain[:, :-1]), p, drift, u, 1.0]
-        # What is not finite may end at a limit.
+        # A value that is not finite may be hidden by a limit.
         valid = momentum[-1] + contact.valid
         return self._system.trace(
             "sample of the observer",

@@ -1,21 +1,19 @@
-"""What observers of model errors share as Drake systems: ports, friction, integrals that wait."""
+"""The base class of observers of model errors: their ports, and the hold of integrals."""
 
 from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket
+from pydrake.systems.framework import Context, DependencyTicket
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import PARAMETERS, Computation
+from drake_dae.systems.blocks.block import NO_TIME_DERIVATIVE, ParameterizedSystem
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
+from drake_dae.systems.blocks.traced import PARAMETERS, Computation, zero
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
 
@@ -41,6 +39,7 @@ class ObservingSystem(ParameterizedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient = NO_TIME_DERIVATIVE
 
     def __init__(
         self,
@@ -63,17 +62,19 @@ class ObservingSystem(ParameterizedSystem):
         if not control_delay >= 0.0:
             raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
 
-    def _declare(self, law: TrackingLaw, found: Observed, state: str, start: FloatArray) -> None:
-        """Declares inputs and held values.
+    def _declare(
+        self, law: TrackingLaw, functions: Observed, state: str, start: FloatArray
+    ) -> None:
+        """Declares input ports and the discrete state.
 
         Args:
             law: The law.
-            found: The functions.
+            functions: The functions of the observer.
             state: The name of the port of the state.
-            start: What is held before the first sample, with zeros for friction at `_mu`.
+            start: The discrete state before the first sample, with zeros for friction at `_mu`.
         """
-        system, self._observed = law.system, found
-        self.observation = observation = found.observation
+        system, self._observed = law.system, functions
+        self.observation = observation = functions.observation
         names = list(observation.frictions)
         self.disturbance_signals = tuple(
             Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
@@ -95,7 +96,7 @@ class ObservingSystem(ParameterizedSystem):
     def _declare_hold(self, force: DependencyTicket) -> None:
         """Declares the output port `hold`, which depends on the force."""
         tickets = {force, self.input_port_ticket(self._ports["hold"].get_index())}
-        self.DeclareVectorOutputPort("hold", 1, weakly(self._calc_hold), tickets)
+        self.DeclareVectorOutputPort("hold", 1, port_value(self._hold_output), tickets)
 
     @property
     def _measures(self) -> bool:
@@ -108,14 +109,14 @@ class ObservingSystem(ParameterizedSystem):
 
     @property
     def _mu(self) -> slice:
-        """Where mu stands among the held values."""
+        """The part of the discrete state that is mu."""
         raise NotImplementedError
 
     @property
     def further_signals(self) -> dict[str, Sequence[Signal]]:
         """Name of an output port in a record -> names and units of its entries."""
-        known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
-        return {name: signals for name, signals in known.items() if signals}
+        ports = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
+        return {name: signals for name, signals in ports.items() if signals}
 
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
         """Sets the initial coefficients of friction, shape (c,), or a number for all.
@@ -135,36 +136,33 @@ class ObservingSystem(ParameterizedSystem):
         values[self._mu] = given
         context.SetDiscreteState(self._held, values)
 
-    def _given(self, context: Context, *names: str) -> list[FloatArray]:
+    def _inputs(self, context: Context, *names: str) -> list[FloatArray]:
+        """The values of input ports."""
         return [self._ports[name].Eval(context) for name in names]
 
-    def _holds(self, context: Context) -> FloatArray:
-        """What the input port `hold` has; 0 without a wire."""
+    def _hold_input(self, context: Context) -> FloatArray:
+        """The input port `hold`; 0 without a wire."""
         port = self._ports["hold"]
         return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
 
     def _reference(self, context: Context, state: FloatArray) -> FloatArray:
-        """What the input port `reference` has; without a wire the present rates."""
+        """The input port `reference`; without a wire the current rates."""
         port = self._ports["reference"]
         if port.HasValue(context):
             return np.asarray(port.Eval(context))
         return self._checked(self.observation.moving, context, state)[0].copy()
 
-    def _calc_hold(self, context: Context, output: BasicVector) -> None:
-        given = self._force(context), self._holds(context)
-        output.SetFromVector(self._observed.hold.evaluate(*given)[0])
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
-            "derivative by the time"
-        )
+    def _hold_output(self, context: Context) -> FloatArray:
+        return self._observed.hold.evaluate(self._force(context), self._hold_input(context))[0]
 
     def _traced_hold(self, force: str = "measured_force") -> Computation:
         return Computation.of(self._observed.hold, (force, "hold"), ("hold",))
 
     def _unwired(self, state: str) -> dict[str, Computation]:
-        """What stands at inputs without a wire, by the name of the state among the sources."""
+        """The values of input ports without a wire.
+
+        Args:
+            state: The name of the state among the sources.
+        """
         moving = Computation.of(self.observation.moving, (state, PARAMETERS), ("reference",))
-        none = ca.Function("none", [], [ca.SX.zeros(1)])
-        return {"hold": Computation(none, (), ("hold",)), "reference": moving}
+        return {"hold": zero("hold"), "reference": moving}

@@ -47,8 +47,8 @@ class ContactEvent:
         names = ", ".join(self.contacts)
         text = f"{self.time:.12g} s: {names} {self.kind.value}"
         if any(self.impulses):
-            given = ", ".join(f"{impulse:.6g}" for impulse in self.impulses)
-            text += f", {given} N s, {self.energy_lost:.6g} J lost"
+            impulses = ", ".join(f"{impulse:.6g}" for impulse in self.impulses)
+            text += f", {impulses} N s, {self.energy_lost:.6g} J lost"
         if self.rest_time is not None:
             text += f", bouncing ends at {self.rest_time:.12g} s"
         return f"{text}; closed: {', '.join(self.closed) or 'none'}"

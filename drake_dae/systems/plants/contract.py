@@ -16,6 +16,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.block import check_context
 from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.trace.functions import TracedFunction
 
@@ -131,11 +132,11 @@ class Plant(System):
 
     def friction(self, context: Context) -> dict[str, float]:
         """Name of a constraint -> its coefficient of friction, of those that have one."""
-        values, found = self.parameters(context), dict[str, float]()
+        values, coefficients = self.parameters(context), dict[str, float]()
         for constraint in self.model.constraints if self.model is not None else ():
             if (name := constraint.friction_parameter) is not None:
-                found[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
-        return found
+                coefficients[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
+        return coefficients
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
         """The parameters at the times of a run, in s, one row for each."""
@@ -156,6 +157,7 @@ class Plant(System):
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
+        check_context(self, context)
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -164,8 +166,9 @@ class Plant(System):
         A run is refused from a state that is not on N*.
 
         Raises:
-            ModelError: The shape is wrong.
+            ModelError: The shape is wrong, or the context is that of another system.
         """
+        check_context(self, context)
         context.SetContinuousState(self.dae.state_vector(state))
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
@@ -190,6 +193,16 @@ class Plant(System):
         """Law and plant as one function, for a plant that takes a law as a value."""
         raise ModelError(f"{self.dae.name}: no law can be fed back to a {type(self).__name__}")
 
+    @property
+    def port_signals(self) -> dict[str, tuple[Signal, ...]]:
+        """Name of an output port of rule 1 -> names and units of its entries."""
+        return {
+            "state": tuple(self.dae.state_signals),
+            "constraint_force": tuple(self.dae.force_signals),
+            "constraint_residual": tuple(self.structure.manifold.residual_signals),
+            "controlled_output": tuple(self.dae.output_signals),
+        }
+
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Adds the plant's own part of the Meshcat view, with its wires.
 
@@ -209,6 +222,6 @@ class Plant(System):
         """
         if self.model is None:
             raise ModelError(
-                f"{needed_by} needs a robot, as of a RobotPlant, and '{self.dae.name}' is none"
+                f"{needed_by} needs a robot, such as a RobotPlant, and '{self.dae.name}' is none"
             )
         return self.model

@@ -58,18 +58,18 @@ class Crossing:
             inputs: The control, if the function takes it.
             parameters: Values of all parameters.
         """
-        own = tuple(value.copy() for value in function.evaluate(state, *inputs, parameters))
-        if not all(np.isfinite(given).all() for given in (state, *inputs)):
+        values = tuple(value.copy() for value in function.evaluate(state, *inputs, parameters))
+        if not all(np.isfinite(known).all() for known in (state, *inputs)):
             return None
         is_regular = function.is_regular
         control = inputs[0] if inputs else np.zeros(self._num_controls)
-        found = self._passage.motion(state, control, parameters)
-        if found is None:
-            return own if is_regular else None
+        crossed = self._passage.motion(state, control, parameters)
+        if crossed is None:
+            return values if is_regular else None
         if function is self._dynamics:
-            return found[:1]
-        given = self._known.get(function)
-        return None if given is None else (given(state, found[1], parameters)[0],)
+            return crossed[:1]
+        known = self._known.get(function)
+        return None if known is None else (known(state, crossed[1], parameters)[0],)
 
     def happens(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> bool:
         """Whether the system passes a singular configuration near a state."""

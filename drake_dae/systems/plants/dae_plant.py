@@ -1,6 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,6 +8,7 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     ContinuousState,
+    DependencyTicket,
     EventStatus,
     State,
 )
@@ -17,12 +18,7 @@ from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import (
-    InconsistentStateError,
-    ModelError,
-    SimulationError,
-    SingularityError,
-)
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.failures import (
@@ -33,7 +29,7 @@ from drake_dae.systems.blocks.failures import (
 )
 from drake_dae.systems.blocks.feedback import Feedback
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
@@ -135,17 +131,14 @@ class DaePlant(ParameterizedSystem, Plant):
         constraint_input = derivatives.expand(derivatives.constraint_input)
         output = system.outputs(constraint_input)
         force = system.forces(constraint_input)
-        self._force_needs_control = elimination.beta.nnz() > 0
-        self._output_needs_control = elimination.n_star.nnz() > 0
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
         self._crossing = Crossing(structure)
-        doubt = self._crossing.doubt
+        self._otherwise, doubt = self._crossing.values, self._crossing.doubt
         self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
-        self._force = structure.trace("constraint force", force, self._force_needs_control, doubt)
-        self._output = structure.trace(
-            "controlled output", output, self._output_needs_control, doubt
-        )
+        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0, doubt)
+        needs_control = elimination.n_star.nnz() > 0
+        self._output = structure.trace("controlled output", output, needs_control, doubt)
         self.functions: dict[str, TracedFunction] = {
             "constraint_force": self._force,
             "constraint_residual": structure.manifold.residual_function,
@@ -158,40 +151,32 @@ class DaePlant(ParameterizedSystem, Plant):
         residual = structure.manifold.residual_expression
         self._left_out = manifold_of_left_out(system)
         degrees = system.exogenous.degrees(rate, force, output, residual)
-        by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
+        self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
         self._declare_feedback(feedback)
-        self._by_control = by_state | self._control_tickets
         self.DeclareVectorOutputPort(
             "state", system.num_states, weakly(self._copy_state), state_tickets(self)
         )
-        self.DeclareVectorOutputPort(
-            "constraint_force",
-            len(system.force_signals),
-            weakly(self._calc_force),
-            self._by_control if self._force_needs_control else by_state,
-        )
-        self.DeclareVectorOutputPort(
-            "constraint_residual",
-            len(structure.manifold.residual_signals),
-            weakly(self._calc_residual),
-            by_state,
-        )
-        self.DeclareVectorOutputPort(
-            "controlled_output",
-            system.num_outputs,
-            weakly(self._calc_output),
-            self._by_control if self._output_needs_control else by_state,
-        )
+        for name, function in self.functions.items():
+            calculate = port_value(self._evaluate, function)
+            if name == "constraint_residual":
+                calculate = port_value(self._residual)
+            size = function.outputs[0].size
+            self.DeclareVectorOutputPort(name, size, calculate, self._tickets(function))
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
         self.projects = bool(project and system.num_constraints)
         if self.projects:
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
 
-    def _declare_feedback(self, wanted: bool) -> None:
+    def _tickets(self, function: TracedFunction) -> set[DependencyTicket]:
+        """The dependencies of the values of a function."""
+        takes_control = "control" in function.input_names
+        return self._by_state | (self._control_tickets if takes_control else set())
+
+    def _declare_feedback(self, is_fed_back: bool) -> None:
         """Declares the input port `feedback`, and the dependencies of u besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
         self._law: LawInput | None = None
-        if not wanted:
+        if not is_fed_back:
             return
         if not self._is_controlled or self._exogenous is not None:
             missing = "has exogenous signals" if self._is_controlled else "has no control"
@@ -203,20 +188,6 @@ class DaePlant(ParameterizedSystem, Plant):
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function; see `feedback.motion_under`."""
         return super().motion_under(law) if self._law is None else self._law.motion_under(law)
-
-    def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
-        self.check_context(context)
-        return super().state(context)
-
-    def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,); a run is refused from a state that is not on N*.
-
-        Raises:
-            ModelError: The shape is wrong.
-        """
-        self.check_context(context)
-        super().set_state(context, state)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -250,13 +221,11 @@ class DaePlant(ParameterizedSystem, Plant):
             if self.dynamics.run():
                 derivatives.SetFromVector(self.dynamics.outputs[0])
                 return
-        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
+        derivatives.SetFromVector(self._evaluate(self.dynamics, context))
 
-    def _evaluate(
-        self, function: TracedFunction, context: Context, needs_control: bool
-    ) -> FloatArray:
+    def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
         x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
-        if needs_control:
+        if "control" in function.input_names:
             control = self._control(context)
             if control is None:
                 return function.nowhere()[0]
@@ -267,8 +236,8 @@ class DaePlant(ParameterizedSystem, Plant):
         """u; None if the law at `feedback` has no value at a trial state."""
         feedback = self._feedback(context)
         if feedback is None:
-            given: FloatArray = self._control_port.Eval(context)
-            return given
+            wired: FloatArray = self._control_port.Eval(context)
+            return wired
         time, state = context.get_time(), self.state(context)
         control = feedback.control(time, state)
         if control is None:
@@ -284,15 +253,6 @@ class DaePlant(ParameterizedSystem, Plant):
         """The parameters of the law at `feedback`, as `parameters_along`; None without one."""
         self.check_context(context)
         return self._steps.laws_along(context, vector("times", times, None))
-
-    def _otherwise(
-        self,
-        function: TracedFunction,
-        state: FloatArray,
-        inputs: Sequence[FloatArray],
-        parameters: FloatArray,
-    ) -> tuple[FloatArray, ...] | None:
-        return self._crossing.values(function, state, inputs, parameters)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """The values of a port of `functions` at given times, one row each; nan without a value.
@@ -333,21 +293,15 @@ class DaePlant(ParameterizedSystem, Plant):
         if not (self.dae.frictional_contacts and isinstance(error, SingularityError)):
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
-        given = (control,) if self._force_needs_control else ()
-        force = self._force(error.state, *given, parameters)[0]
+        taken = (control,) if "control" in self._force.input_names else ()
+        force = self._force(error.state, *taken, parameters)[0]
         return jammed_contact(self.structure, error, control, parameters, force) or error
 
     def _formulas(self) -> dict[str, Formula]:
-        dae, residual = self.dae, self.structure.manifold.residual_expression
-        functions = {
-            "derivative": self.dynamics,
-            "state": dae.trace("state", {"value": dae.state}),
-            "constraint_force": self._force,
-            "constraint_residual": dae.trace("residual", {"value": residual}),
-            "controlled_output": self._output,
-        }
+        state = self.dae.trace("state", {"value": self.dae.state})
+        functions = {"derivative": self.dynamics, "state": state, **self.functions}
         return {
-            name: TracedFormula(function, signals=self._signals)
+            name: TracedFormula(function, function.output_names[0], signals=self._signals)
             for name, function in functions.items()
         }
 
@@ -364,18 +318,9 @@ class DaePlant(ParameterizedSystem, Plant):
     def _copy_state(self, context: Context, output: BasicVector) -> None:
         output.SetFrom(context.get_continuous_state_vector())
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))
-
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate(self._output, context, self._output_needs_control))
-
-    def _calc_residual(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(
-            self.structure.manifold.residual(
-                context.get_continuous_state_vector().CopyToVector(), self._values(context)
-            )
-        )
+    def _residual(self, context: Context) -> FloatArray:
+        state = context.get_continuous_state_vector().CopyToVector()
+        return self.structure.manifold.residual(state, self._values(context))
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
@@ -416,13 +361,15 @@ class DaePlant(ParameterizedSystem, Plant):
         else:
             parameters = self._values(context)
         manifold = self.structure.manifold
-        found = manifold.first_steps(x, parameters)
-        if found is None:
+        projected = manifold.first_steps(x, parameters)
+        if projected is None:
             try:
-                found = manifold.searched(x, parameters, lambda near: self._crosses(near, context))
+                projected = manifold.searched(
+                    x, parameters, lambda near: self._crosses(near, context)
+                )
             except InconsistentStateError as error:
                 raise off_manifold(context.get_time(), x.copy(), error) from error
-        if found is x:
+        if projected is x:
             return _UNCHANGED
-        state.get_mutable_continuous_state().SetFromVector(found)
+        state.get_mutable_continuous_state().SetFromVector(projected)
         return _CHANGED

@@ -6,13 +6,7 @@ from weakref import proxy, ref
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    CacheEntry,
-    Context,
-    InputPort,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import CacheEntry, Context, InputPort, LeafSystem, ValueProducer
 
 from drake_dae.arrays import FloatArray
 from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing
@@ -106,10 +100,10 @@ class LawInput:
     def motion(self, context: Context) -> Callable[[float, FloatArray], FloatArray | None] | None:
         """x' as a function of time and state; None without a law."""
         entry = self._entry() or self._plant.get_cache_entry(self._index)
-        found: _FedBack = entry.Eval(context)
-        return found.motion
+        law: _FedBack = entry.Eval(context)
+        return law.motion
 
     def feedback(self, context: Context) -> Feedback | None:
         """The law at `feedback`; None if the control has a wire or a fixed value."""
-        found: _FedBack = self._plant.get_cache_entry(self._index).Eval(context)
-        return found.feedback
+        law: _FedBack = self._plant.get_cache_entry(self._index).Eval(context)
+        return law.feedback

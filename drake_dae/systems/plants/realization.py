@@ -17,8 +17,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
@@ -66,6 +65,7 @@ class StateRealization(ParameterizedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient = "Newton's method finds its state; convert a DaePlant"
 
     def __init__(self, normal_form: NormalForm) -> None:
         structure, dae = normal_form.structure, normal_form.system
@@ -84,9 +84,9 @@ class StateRealization(ParameterizedSystem):
             rate += dae.exogenous.rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
         force = dae.forces(derivatives.expand(derivatives.constraint_input))  # (25)
-        self._force_needs_control = elimination.beta.nnz() > 0
+        needs_control = elimination.beta.nnz() > 0
         self._dynamics = structure.trace("state realization", rates, True)
-        self._force = structure.trace("constraint force", force, self._force_needs_control)
+        self._force = structure.trace("constraint force", force, needs_control)
         direct = highest[layout.direct.tolist(), :]
         self._output = structure.trace("controlled output", direct, True)
 
@@ -107,15 +107,17 @@ class StateRealization(ParameterizedSystem):
             ),
             by_state,
         ).cache_index()
-        self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._copy_state), by_state)
+        self.DeclareVectorOutputPort(
+            "state", dae.num_states, port_value(self._eval_state), by_state
+        )
         self.DeclareVectorOutputPort(
             "coordinates", coordinates.size(), weakly(self._copy_coordinates), state_tickets(self)
         )
         self.DeclareVectorOutputPort(
             "constraint_force",
             len(dae.force_signals),
-            weakly(self._calc_force),
-            by_control if self._force_needs_control else by_state,
+            port_value(self._evaluate, self._force),
+            by_control if needs_control else by_state,
         )
         self.DeclareVectorOutputPort(
             "controlled_output",
@@ -153,7 +155,7 @@ class StateRealization(ParameterizedSystem):
         entry.GetMutableValueOrThrow()[1][:] = x
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        rates = self._evaluate(self._dynamics, context, needs_control=True)
+        rates = self._evaluate(self._dynamics, context)
         coordinates = context.get_continuous_state_vector().CopyToVector()
         value = np.roll(coordinates, -1)
         value[self._layout.ends] = rates[: self._layout.ends.size]
@@ -183,16 +185,16 @@ class StateRealization(ParameterizedSystem):
             self._steps.tolerate(context, error)
             value.set_value((np.full_like(last, np.nan), last))
             return
-        wanted = np.concatenate([self._on_manifold, coordinates])  # (27)
+        target = np.concatenate([self._on_manifold, coordinates])  # (27)
         try:
-            found = self.normal_form.state(wanted, last, p)
-            value.set_value((found, found))
+            x = self.normal_form.state(target, last, p)
+            value.set_value((x, x))
             return
         except InconsistentStateError as error:
             reason = error
         try:
-            found = self.normal_form.state(wanted, None, p)
-            value.set_value((found, found))
+            x = self.normal_form.state(target, None, p)
+            value.set_value((x, x))
         except InconsistentStateError:
             # Also at a trial state: shorter steps would carry the motion over a fold of its
             # coordinates, where the continuation is not unique, to a wrong branch.
@@ -203,32 +205,19 @@ class StateRealization(ParameterizedSystem):
                 last,
             ) from reason
 
-    def _evaluate(
-        self, function: TracedFunction, context: Context, needs_control: bool
-    ) -> FloatArray:
+    def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
         x = self._eval_state(context)
-        inputs = (self._control_port.Eval(context),) if needs_control else ()
+        takes_control = "control" in function.input_names
+        inputs = (self._control_port.Eval(context),) if takes_control else ()
         return self._checked(function, context, x, *inputs)[0]
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.dae.name}: a state realization does not convert to AutoDiffXd, since Newton's "
-            "method finds its state; convert a DaePlant"
-        )
-
-    def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._eval_state(context))
 
     def _copy_coordinates(self, context: Context, output: BasicVector) -> None:
         output.SetFrom(context.get_continuous_state_vector())
-
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         layout, value = self._layout, np.empty(self.dae.num_outputs)
         coordinates = context.get_continuous_state_vector().CopyToVector()
         value[layout.dynamic] = coordinates[layout.heads]
         if layout.direct.size:
-            value[layout.direct] = self._evaluate(self._output, context, needs_control=True)
+            value[layout.direct] = self._evaluate(self._output, context)
         output.SetFromVector(value)

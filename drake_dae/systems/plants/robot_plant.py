@@ -4,10 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
-from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -66,19 +64,16 @@ class RobotPlant(DaePlant):
     ) -> None:
         super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
         self.model: RobotModel = model
-        own = weakly(self._values), weakly(self._shown_force)
-        by_force = self._by_control if self._force_needs_control else self._by_state
-        self._ports = RobotPorts(self, model, model.dae, *own, self._by_state, by_force)
+        values, force = weakly(self._values), weakly(self._evaluate, self._force)
+        by_force = self._tickets(self._force)
+        self._ports = RobotPorts(self, model, values, force, self._by_state, by_force)
         self.wrench_signals = self._ports.wrench_signals
-        if self._ports.loops is not None:
-            self.functions["loop_state"] = self._ports.loops
+        if "loop_state" in self._ports.joints:
+            self.functions["loop_state"] = self._ports.joints["loop_state"]
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         return self._ports.loop_signals
-
-    def _shown_force(self, context: Context) -> FloatArray:
-        return self._evaluate(self._force, context, self._force_needs_control)
 
     def _formulas(self) -> dict[str, Formula]:
         state = self.dae.state
@@ -86,28 +81,30 @@ class RobotPlant(DaePlant):
         ports = self._ports
         derivatives = self.structure.derivatives
         constraint_input = derivatives.expand(derivatives.constraint_input)
-        acting = ca.substitute(ports.wrenches, ports.force, self.dae.forces(constraint_input))
+        wrenches = ca.substitute(ports.wrenches, ports.force, self.dae.forces(constraint_input))
+        takes_control = "control" in self._force.input_names
         formulas["constraint_wrenches"] = TracedFormula(
-            self.structure.trace("constraint wrenches", acting, self._force_needs_control),
+            self.structure.trace("constraint wrenches", wrenches, takes_control),
             signals=self._signals,
         )
         for name, part in ports.parts.items():
             function = TracedFunction(name, {"state": state}, {"value": state[part]})
             formulas[name] = TracedFormula(function)
-        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
-            if known is not None:
-                formulas[name] = TracedFormula(known)
+        formulas |= {name: TracedFormula(function) for name, function in ports.joints.items()}
         return formulas
 
     def traced(self) -> Block:
         block, ports, state = super().traced(), self._ports, self.dae.state
-        found = [
+        computations = [
             Computation(ca.Function("part", [state], [state[part]]), (STATE,), (name,))
             for name, part in ports.parts.items()
         ]
         sources = (STATE, "constraint_force", PARAMETERS)
-        found.append(Computation.of(ports.wrench_function, sources, ("constraint_wrenches",)))
-        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
-            if known is not None:
-                found.append(Computation.of(known, (STATE, PARAMETERS), (name,)))
-        return replace(block, computations=(*block.computations, *found))
+        computations.append(
+            Computation.of(ports.wrench_function, sources, ("constraint_wrenches",))
+        )
+        computations += [
+            Computation.of(function, (STATE, PARAMETERS), (name,))
+            for name, function in ports.joints.items()
+        ]
+        return replace(block, computations=(*block.computations, *computations))

@@ -3,14 +3,13 @@
 from collections.abc import Callable, Sequence
 
 import casadi as ca
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
+from pydrake.systems.framework import Context, DependencyTicket, LeafSystem
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.lifetime import weakly
+from drake_dae.systems.blocks.lifetime import port_value
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
@@ -21,9 +20,8 @@ class RobotPorts:
     Not a base class of the plant, since a Python class can have only one base of Drake.
 
     Args:
-        plant: The plant, with x as its continuous state; gets the ports, and keeps this.
+        plant: The plant, with x as its continuous state, which gets the ports.
         model: The robot.
-        dae: The robot's system.
         values: A function of a context with all parameters; it must not keep the plant alive.
         force: A function of a context with lambda of the port `constraint_force`; likewise.
         by_state: The dependencies of a function of the state.
@@ -35,29 +33,24 @@ class RobotPorts:
         wrenches, force: That port as expressions, and the symbols of lambda in it.
         loop_signals: Names and units of `loop_state` under that name; empty without it.
         wrench_function: The same as a function of state, lambda and parameters.
-        loops, joint_force: The functions of the ports `loop_state` and `joint_torque`; None without
-            them.
+        joints: `loop_state` and `joint_torque` as functions of state and parameters, as far as the
+            robot has them.
     """
 
     def __init__(
         self,
         plant: LeafSystem,
         model: RobotModel,
-        dae: DaeSystem,
         values: Callable[[Context], FloatArray],
         force: Callable[[Context], FloatArray],
         by_state: set[DependencyTicket],
         by_force: set[DependencyTicket],
     ) -> None:
-        self._values, self._force = values, force
+        dae, self._values, self._force = model.dae, values, force
         size = model.links.q.numel() + model.links.v.numel()
-        self.parts, start = {"link_state": slice(0, size)}, size
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                self.parts[name] = slice(start + part.start, start + part.stop)
-            start += stage.state.numel()
+        self.parts = {"link_state": slice(0, size), **stage_ports(model, size)}
         for name, part in self.parts.items():
-            calc = weakly(self._calc_part, part)
+            calc = port_value(self._part, part)
             plant.DeclareVectorOutputPort(name, part.stop - part.start, calc, state_tickets(plant))
 
         bound = ConstraintSet(model.constraints)
@@ -67,30 +60,39 @@ class RobotPorts:
         self.wrench_function = TracedFunction(
             "constraint wrenches", inputs, {"value": self.wrenches}
         )
-        size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
+        size, calc = len(self.wrench_signals), port_value(self._wrenches)
         plant.DeclareVectorOutputPort("constraint_wrenches", size, calc, by_force)
 
-        self.loops = self.joint_force = None
+        self.joints: dict[str, TracedFunction] = {}
         self.loop_signals: dict[str, Sequence[Signal]] = {}
         if model.loop_joints.signals:
             self.loop_signals = {"loop_state": model.loop_joints.signals}
-            self.loops = dae.trace("loop state", {"value": model.loop_joints.state})
-            size, calc = len(model.loop_joints.signals), weakly(self._calc_of, self.loops)
-            plant.DeclareVectorOutputPort("loop_state", size, calc, by_state)
+            self.joints["loop_state"] = dae.trace("loop state", {"value": model.loop_joints.state})
         if model.joint_force is not None:
-            self.joint_force = dae.trace("joint torque", {"value": model.joint_force})
-            size, calc = model.joint_force.numel(), weakly(self._calc_of, self.joint_force)
-            plant.DeclareVectorOutputPort("joint_torque", size, calc, by_state)
+            self.joints["joint_torque"] = dae.trace("joint torque", {"value": model.joint_force})
+        for name, function in self.joints.items():
+            size, calc = function.outputs[0].size, port_value(self._value, function)
+            plant.DeclareVectorOutputPort(name, size, calc, by_state)
 
-    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
+    def _wrenches(self, context: Context) -> FloatArray:
         force, state = self._force(context), _state(context)
-        output.SetFromVector(self.wrench_function.evaluate(state, force, self._values(context))[0])
+        return self.wrench_function.evaluate(state, force, self._values(context))[0]
 
-    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(_state(context)[part])
+    def _part(self, part: slice, context: Context) -> FloatArray:
+        return _state(context)[part]
 
-    def _calc_of(self, function: TracedFunction, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(function(_state(context), self._values(context))[0])
+    def _value(self, function: TracedFunction, context: Context) -> FloatArray:
+        return function(_state(context), self._values(context))[0]
+
+
+def stage_ports(model: RobotModel, start: int = 0) -> dict[str, slice]:
+    """Name of a port of a robot's stages -> its part of (..., s), where s begins at `start`."""
+    parts = {}
+    for stage in model.stages:
+        for name, part in stage.ports.items():
+            parts[name] = slice(start + part.start, start + part.stop)
+        start += stage.state.numel()
+    return parts
 
 
 def _state(context: Context) -> FloatArray:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import casadi as ca
-from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold.manifold import Manifold
@@ -18,10 +17,11 @@ from drake_dae.systems.blocks.traced import (
     Computation,
     Projection,
 )
+from drake_dae.systems.plants.contract import Plant
 
 
 def traced_plant(
-    plant: System,
+    plant: Plant,
     structure: ConstraintStructure,
     projects: bool,
     check_start: Callable[[FloatArray, FloatArray], None],
@@ -45,58 +45,53 @@ def traced_plant(
     control = {"control": derivatives.control}
     regular = structure.elimination.pivot, "A(x) of Assumption (2)"
     by_state, by_control = (STATE, PARAMETERS), (STATE, "control", PARAMETERS)
-    found = []
+    computations = []
     if structure.elimination.beta.nnz():
-        both = dae.trace("plant", {"rate": rate, "force": force}, control, *regular)
-        found.append(Computation.of(both, by_control, (DERIVATIVE, "constraint_input")))
+        together = dae.trace("plant", {"rate": rate, "force": force}, control, *regular)
+        computations.append(Computation.of(together, by_control, (DERIVATIVE, "constraint_input")))
     else:
         motion = dae.trace("plant", {"rate": rate}, control, *regular)
-        held = dae.trace("plant", {"force": force}, {}, *regular)
-        found.append(Computation.of(motion, by_control, (DERIVATIVE,)))
-        found.append(Computation.of(held, by_state, ("constraint_input",)))
+        by_state_alone = dae.trace("plant", {"force": force}, {}, *regular)
+        computations.append(Computation.of(motion, by_control, (DERIVATIVE,)))
+        computations.append(Computation.of(by_state_alone, by_state, ("constraint_input",)))
     acting = ca.SX.sym("v", dae.num_constraints)
     by_force = (STATE, "constraint_input", PARAMETERS)
-    shown = {"force": dae.forces(acting), "output": dae.outputs(acting)}
+    signals_of = {"force": dae.forces(acting), "output": dae.outputs(acting)}
     names = {"force": "constraint_force", "output": "controlled_output"}
     if not structure.elimination.n_star.nnz():
         # m beta u cancels, so the output does not depend on the control.
         alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
         output = dae.trace("controlled output", {"value": dae.outputs(alpha)}, {}, *regular)
-        found.append(Computation.of(output, by_state, ("controlled_output",)))
-        del shown["output"]
-    rest = dae.trace("signals", shown, {"force": acting})
-    found.append(Computation.of(rest, by_force, tuple(names[name] for name in shown)))
+        computations.append(Computation.of(output, by_state, ("controlled_output",)))
+        del signals_of["output"]
+    rest = dae.trace("signals", signals_of, {"force": acting})
+    computations.append(Computation.of(rest, by_force, tuple(names[name] for name in signals_of)))
     manifold = structure.manifold
     residual = dae.trace("residual", {"value": manifold.residual_expression})
-    found.append(Computation.of(residual, by_state, ("constraint_residual",)))
+    computations.append(Computation.of(residual, by_state, ("constraint_residual",)))
     same = ca.Function("state", [dae.state], [dae.state])
-    found.append(Computation(same, (STATE,), ("state",)))
+    computations.append(Computation(same, (STATE,), ("state",)))
     projection = None
     if projects:
         projection = Projection(newton_of(manifold), dae.scale, partial(_project, manifold))
     return Block(
         plant,
-        tuple(found),
+        tuple(computations),
         check_start=check_start,
         projection=projection,
         scale=dae.scale,
         moving=tuple(moving),
         model=dae,
-        ports={
-            "state": tuple(dae.state_signals),
-            "constraint_force": tuple(dae.force_signals),
-            "constraint_residual": tuple(manifold.residual_signals),
-            "controlled_output": tuple(dae.output_signals),
-        },
+        ports=plant.port_signals,
         signals=signals,
     )
 
 
 def newton_of(manifold: Manifold) -> ca.Function:
     """A Newton step to a manifold, as a `Projection` has it, whatever a block holds."""
-    own = manifold.newton_step
-    inputs = [ca.SX.sym(*each) for each in zip(own.input_names, own.sizes, strict=True)]
-    return ca.Function("newton", [*inputs, ca.SX(0, 1)], own.function.call(inputs)[:1])
+    step = manifold.newton_step
+    inputs = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
+    return ca.Function("newton", [*inputs, ca.SX(0, 1)], step.function.call(inputs)[:1])
 
 
 def _project(

@@ -14,7 +14,7 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
 
 _SAME = 1e-9
-"""Times that differ by less than this, in periods, are one."""
+"""Times that differ by less than this, in periods, count as equal."""
 
 
 @checked(ModelError)
@@ -144,12 +144,12 @@ class StateSensor(LeafSystem):
         encoders, period: The arguments.
 
     Raises:
-        ModelError: The encoders have another number of entries, or a size makes no sense.
+        ModelError: The encoders have another number of entries, or a size is not valid.
     """
 
     __slots__ = SHARED_DICTIONARY
     measures = True
-    """It is a part of the machine, also where its controller is exported alone."""
+    """It is part of the machine, not of a controller that is exported alone."""
 
     def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
         super().__init__()
@@ -178,8 +178,8 @@ class StateSensor(LeafSystem):
         output.SetFromVector(state)
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        found = self._measured(context, self._port.Eval(context))
-        state.get_mutable_discrete_state().set_value(self._held, found)
+        sample = self._measured(context, self._port.Eval(context))
+        state.get_mutable_discrete_state().set_value(self._held, sample)
         return EventStatus.Succeeded()
 
     def _measured(self, context: Context, state: FloatArray) -> FloatArray:
@@ -213,33 +213,32 @@ class StateSensor(LeafSystem):
             sources, inputs = [*sources, "noise"], [*inputs, noise]
             q = q + self._position_noise * noise[:count]
             v = v + self._velocity_noise * noise[count:]
-        rounded = np.flatnonzero(self._resolution > 0.0).tolist()
         q = ca.SX(q)
-        for i in rounded:
+        for i in np.flatnonzero(self._resolution > 0.0).tolist():
             q[i] = self._resolution[i] * _rounded(q[i] / self._resolution[i])
-        is_known = ca.fabs(held[0]) < np.inf  # For finite values.
+        has_sample = ca.fabs(held[0]) < np.inf
         if self.encoders.velocity_bandwidth is not None:
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)
             filtered = a * held[1 + count :] + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
-            v = ca.if_else(is_known, filtered, v)
+            v = ca.if_else(has_sample, filtered, v)
         fresh = ca.vertcat(sample, q, v)
-        found = ca.if_else(ca.eq(held[0], sample), held, fresh)
-        shown = ca.vertcat(found[1:], state[2 * count :])
+        current = ca.if_else(ca.eq(held[0], sample), held, fresh)
+        shown = ca.vertcat(current[1:], state[2 * count :])
         first = ca.substitute(fresh, held, ca.SX.nan(1 + 2 * count, 1))
-        begun = [source for source in sources if source != HELD]
-        given = [symbol for symbol in inputs if symbol is not held]
+        first_sources = [source for source in sources if source != HELD]
+        first_inputs = [symbol for symbol in inputs if symbol is not held]
         return Block(
             self,
             (Computation(_function(inputs, shown), tuple(sources), ("estimated_state",)),),
             (
                 Update(
-                    Computation(_function(inputs, found), tuple(sources), (HELD,)),
+                    Computation(_function(inputs, current), tuple(sources), (HELD,)),
                     self.period,
                     0.0,
                     True,
                 ),
             ),
-            initial=Computation(_function(given, first), tuple(begun), (HELD,)),
+            initial=Computation(_function(first_inputs, first), tuple(first_sources), (HELD,)),
         )
 
 
@@ -257,9 +256,9 @@ def _rounded(number: ca.SX) -> ca.SX:
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
     """One number for each position."""
-    found = np.asarray(given, dtype=float)
-    if found.shape not in ((), (count,)):
+    values = np.asarray(given, dtype=float)
+    if values.shape not in ((), (count,)):
         raise ModelError(
-            f"the {name} of encoders has {found.size} entries, the robot has {count} positions"
+            f"the {name} of encoders has {values.size} entries, the robot has {count} positions"
         )
-    return np.broadcast_to(found, (count,))
+    return np.broadcast_to(values, (count,))

@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems.blocks.block import DifferentiableSystem
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
     HELD,
@@ -61,7 +61,7 @@ class ForceSensor(DifferentiableSystem):
 
     __slots__ = SHARED_DICTIONARY
     measures = True
-    """It is a part of the machine, also where its controller is exported alone."""
+    """It is part of the machine, not of a controller that is exported alone."""
 
     def __init__(
         self,
@@ -76,17 +76,15 @@ class ForceSensor(DifferentiableSystem):
         self.time_constant = float(time_constant)
         self.sample_period = float(sample_period)
         try:
-            given = [np.asarray(value, dtype=float) for value in (bias, noise_deviation)]
-            self.bias, self.noise_deviation = (np.broadcast_to(value, (size,)) for value in given)
+            errors = [np.asarray(value, dtype=float) for value in (bias, noise_deviation)]
+            self.bias, self.noise_deviation = (np.broadcast_to(value, (size,)) for value in errors)
         except ValueError:
             raise ModelError(
                 f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
                 f"{bias!r} and {noise_deviation!r}"
             ) from None
         positive = [self.time_constant, self.sample_period, *self.noise_deviation]
-        negative = any(number < 0 for number in positive)
-        numbers = [*positive, *self.bias]
-        if negative or not np.all(np.isfinite(numbers)):
+        if min(positive) < 0 or not np.all(np.isfinite([*positive, *self.bias])):
             raise ModelError(
                 "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
                 f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
@@ -112,7 +110,7 @@ class ForceSensor(DifferentiableSystem):
             sources = state_tickets(self) | {self.all_parameters_ticket()}
             if self._noise_port is not None:
                 sources.add(self.input_port_ticket(self._noise_port.get_index()))
-        self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
+        self.DeclareVectorOutputPort("measured_force", size, port_value(self._output), sources)
 
     def set_errors(self, context: Context, bias: ArrayLike, noise_deviation: ArrayLike) -> None:
         """Sets bias and noise_deviation in a context, numbers or shape (m,).
@@ -151,22 +149,22 @@ class ForceSensor(DifferentiableSystem):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         if self.time_constant:
-            felt = context.get_continuous_state_vector().CopyToVector()
+            y = context.get_continuous_state_vector().CopyToVector()
             force = self._force_port.Eval(context)
             with np.errstate(over="ignore"):
-                rate = (force - felt) / self.time_constant
+                rate = (force - y) / self.time_constant
             if not np.isfinite(rate).all():
                 time = context.get_time()
                 error = NonFiniteError(
                     f"{self.get_name()}: the rate of the measured force is not finite at "
                     f"t = {time:.6g} s; its time_constant is {self.time_constant:g} s",
                     time,
-                    felt,
+                    y,
                 )
                 self._steps.tolerate(context, error)
             derivatives.get_mutable_vector().SetFromVector(rate)
 
-    def _felt(self, context: Context) -> FloatArray:
+    def _measured(self, context: Context) -> FloatArray:
         if self.time_constant:
             value = context.get_continuous_state_vector().CopyToVector()
         else:
@@ -177,36 +175,35 @@ class ForceSensor(DifferentiableSystem):
         return value + bias
 
     def _sample(self, context: Context, state: object) -> None:
-        state.set_value(self._held, self._felt(context))  # type: ignore[attr-defined]
+        state.set_value(self._held, self._measured(context))  # type: ignore[attr-defined]
 
-    def _calc_measured(self, context: Context, output: BasicVector) -> None:
+    def _output(self, context: Context) -> FloatArray:
         if self.sample_period:
-            output.SetFromVector(context.get_discrete_state(self._held).value())
-        else:
-            output.SetFromVector(self._felt(context))
+            return context.get_discrete_state(self._held).value()
+        return self._measured(context)
 
     def traced(self) -> Block:
         size = self._force_port.size()
-        force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "felt", "noise"))
+        force, y, noise = (ca.SX.sym(name, size) for name in ("force", "y", "noise"))
         errors = ca.SX.sym("errors", 2 * size)
-        sources = [("force", STATE)[bool(self.time_constant)], PARAMETERS]
+        sources = [STATE if self.time_constant else "force", PARAMETERS]
         inputs, measured = [force, errors], force
         if self._noise_port is not None:
             sources, inputs = [*sources, "noise"], [*inputs, noise]
             measured = measured + errors[size:] * noise
         measured = measured + errors[:size]
-        feel = ca.Function("measured_force", inputs, [measured])
+        measurement = ca.Function("measured_force", inputs, [measured])
         computations, updates = [], []
         if self.time_constant:
-            rate = ca.Function("rate", [force, felt], [(force - felt) / self.time_constant])
+            rate = ca.Function("rate", [force, y], [(force - y) / self.time_constant])
             computations.append(Computation(rate, ("force", STATE), (DERIVATIVE,)))
         if self.sample_period:
-            computations.append(
-                Computation(ca.Function("held", [felt], [felt]), (HELD,), ("measured_force",))
-            )
-            updates.append(Update(Computation(feel, tuple(sources), (HELD,)), self.sample_period))
+            held = ca.Function("held", [y], [y])
+            computations.append(Computation(held, (HELD,), ("measured_force",)))
+            sampled = Computation(measurement, tuple(sources), (HELD,))
+            updates.append(Update(sampled, self.sample_period))
         else:
-            computations.append(Computation(feel, tuple(sources), ("measured_force",)))
+            computations.append(Computation(measurement, tuple(sources), ("measured_force",)))
         return Block(self, tuple(computations), tuple(updates))
 
     def _formulas(self) -> dict[str, Formula]:
@@ -216,20 +213,17 @@ class ForceSensor(DifferentiableSystem):
                 "no derivative by the time. Give it a time_constant alone"
             )
         size = self._force_port.size()
-        force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
+        force, y, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
         errors = ca.SX.sym("errors", 2 * size)
         rate = TracedFunction(
             "force sensor",
-            {"force": force, "state": felt},
-            {"value": (force - felt) / self.time_constant},
+            {"force": force, "state": y},
+            {"value": (force - y) / self.time_constant},
         )
-        inputs, measured = {"state": felt}, felt
+        inputs, measured = {"state": y}, y
         if self._noise_port is not None:
             inputs["noise"] = noise
             measured = measured + errors[size:] * noise
         inputs["parameters"] = errors
         output = TracedFunction("measured force", inputs, {"value": measured + errors[:size]})
-        return {
-            "derivative": TracedFormula(rate),
-            "measured_force": TracedFormula(output),
-        }
+        return {"derivative": TracedFormula(rate), "measured_force": TracedFormula(output)}

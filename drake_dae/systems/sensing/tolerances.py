@@ -35,7 +35,7 @@ class Tolerances:
         window: The time constant of recent errors, in s.
 
     Raises:
-        ModelError: There are no outputs, or a number makes no sense.
+        ModelError: There are no outputs, or a number is not valid.
     """
 
     outputs: Mapping[str, float]
@@ -90,7 +90,7 @@ class ToleranceWatch(LeafSystem):
 
     __slots__ = SHARED_DICTIONARY
     ends_runs = True
-    """It counts in a compiled diagram, though it leads to no output."""
+    """It is part of a compiled diagram although no output depends on it."""
 
     def __init__(
         self,
@@ -107,43 +107,43 @@ class ToleranceWatch(LeafSystem):
         self._places, self._lowest = tolerances.places(outputs), lowest
         self._largest = np.array(list(tolerances.outputs.values()), dtype=float)
         self._period = period
-        declared = {
+        input_sizes = {
             "controlled_output": len(outputs),
             "reference": sizes[0],
             "constraint_force": len(forces),
             "state": sizes[1],
         }
-        self._ports = [self.DeclareVectorInputPort(*item) for item in declared.items()]
+        self._ports = [self.DeclareVectorInputPort(*item) for item in input_sizes.items()]
         self._recent = self.DeclareDiscreteState(self._places.size)
-        self._function = self._traced(declared)
+        self._function = self._traced(input_sizes)
         # Unrestricted, as the step of a discrete MultibodyPlant, so that all are from the same
         # instant.
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._look))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._check))
 
     def _traced(self, sizes: Mapping[str, int]) -> TracedFunction:
-        """s after a sample; not valid where an error is too large."""
+        """s after a sample; not valid if an error is too large."""
         time, recent = ca.SX.sym("time"), ca.SX.sym("recent", self._places.size)
-        given = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-        wanted = given["reference"][self._lowest.tolist()]
-        error = (given["controlled_output"] - wanted)[self._places.tolist()]
+        inputs = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+        desired = inputs["reference"][self._lowest.tolist()]
+        error = (inputs["controlled_output"] - desired)[self._places.tolist()]
         share = -np.expm1(-self._period / self._tolerances.window)
         after = recent + share * (error**2 - recent)
         beyond = ca.mmax(ca.sqrt(after) / self._largest)
-        # Forces and state stand in messages alone.
+        # Forces and state are only for messages.
         return TracedFunction(
             "the watch of tolerances",
-            {**given, "recent": recent, "time": time},
+            {**inputs, "recent": recent, "time": time},
             {"recent": after},
             doubt=ca.if_else(time >= self._tolerances.after, 1.0 - beyond, 1.0),
             outside="an error is too large",
         )
 
-    def _look(self, context: Context, state: State) -> EventStatus:
-        given = [port.Eval(context) for port in self._ports]
+    def _check(self, context: Context, state: State) -> EventStatus:
+        inputs = [port.Eval(context) for port in self._ports]
         recent, time = context.get_discrete_state(self._recent).value(), context.get_time()
-        after = self._function.evaluate(*given, recent, np.array([time]))[0]
+        after = self._function.evaluate(*inputs, recent, np.array([time]))[0]
         if not self._function.is_valid:
-            raise self._failure(time, [*given, recent])
+            raise self._failure(time, [*inputs, recent])
         state.get_mutable_discrete_state().set_value(self._recent, after)
         return EventStatus.Succeeded()
 
@@ -152,10 +152,10 @@ class ToleranceWatch(LeafSystem):
         update = Update(Computation.of(self._function, sources, (HELD,)), self._period, 0.0, True)
         return Block(self, (), (update,), failure=self._failure)
 
-    def _failure(self, time: float, given: Sequence[FloatArray]) -> SimulationError:
-        force, state = (each + 0.0 for each in given[2:4])  # Without -0.
+    def _failure(self, time: float, arguments: Sequence[FloatArray]) -> SimulationError:
+        force, state = (values + 0.0 for values in arguments[2:4])  # Without -0.
         function = self._function
-        recent = np.sqrt(function.evaluate(*given[:5], np.array([time]))[0])
+        recent = np.sqrt(function.evaluate(*arguments[:5], np.array([time]))[0])
         if function.failure().fault is not FailureKind.OUTSIDE:
             return simulation_error(function.failure(), time, state, {})
         worst = int(np.argmax(recent / self._largest))
@@ -165,9 +165,9 @@ class ToleranceWatch(LeafSystem):
             f"the recent error of {signal.name} is {recent[worst]:.3g}{unit} at t = {time:.6g} s, "
             f"and {self._largest[worst]:.3g}{unit} is tolerated"
         )
-        listed = [
-            f"{one.name} = {value:.3g} {one.unit}"
-            for one, value in zip(self._forces, force, strict=True)
+        forces = [
+            f"{signal.name} = {value:.3g} {signal.unit}"
+            for signal, value in zip(self._forces, force, strict=True)
         ]
-        text += f"; then {', '.join(listed)}" if listed else ""
+        text += f"; then {', '.join(forces)}" if forces else ""
         return SimulationError(text, time, state)

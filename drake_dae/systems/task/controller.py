@@ -1,4 +1,4 @@
-"""A task as a controller: a law for each member, and what leads from one to the other."""
+"""A task as a controller: the law in contact, the law of the free robot, and a supervisor."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -34,68 +34,69 @@ _REFUSED = {
     "exogenous": "nothing may move in a task; leave it out",
     "tolerances": "the phases of a task have their own, and times to end within; leave it out",
 }
-"""What a task cannot be wired with, and why."""
+"""The settings of a loop that a task does not support, each with the reason."""
 
 
 @checked(ModelError)
 class TaskController(Diagram, Controller):
     """A task in phases: approach, touch, press, move, release, retreat.
 
-    In contact the law (28) of the robot with the contact acts, which tracks the contact's force;
-    else that of the robot without it, which tracks the distance in its place. Each phase has goals
-    and a guard that ends it, on what is measured: the force, the distance by the model, the time.
-    A phase takes over without a bump: its references begin with the values of those before and with
-    all derivatives that the law has, and lead to its goals by a polynomial. What has no reference
-    before, as a force when the robot touches, begins with what is measured.
+    In contact, the law (28) of the robot with the contact is active and tracks the contact force;
+    otherwise the law of the robot without it, which tracks the distance in place of the force. Each
+    phase has goals, and ends by the measured force, the distance by the model or the time. The
+    references of a phase start with the values and all derivatives of those before, and go to its
+    goals by a polynomial; a reference that did not exist before, such as the force after a touch,
+    starts at the measured value.
 
-    The control itself may jump where the law changes, since the other law explains the same motion
-    by other forces. Where a robot touches a surface without friction, and the free law presses with
-    lambda, so that phi'' = w = -A lambda is what it wants there, it is
+    The control may jump when the law changes, since both laws explain the same motion by different
+    forces. When a robot touches a frictionless surface and the free law presses with lambda, that
+    is, it commands phi'' = w = -A lambda there, the jump is
 
         B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
 
-    zero where pressing moves none of the other outputs, P M^-1 J^T = 0; P is the Jacobian of these.
-    Where it lets go, lambda is the task's `contact_force` at most, and the jump is J^T lambda. A
-    touch that is slow, and a free law that is soft along the distance, keep the first one small.
+    where P is the Jacobian of the other outputs. It is zero if pressing moves none of them, P M^-1
+    J^T = 0. At a release lambda is at most the task's `contact_force`, and the jump is J^T lambda.
+    A slow touch, and small gains of the free law for the distance, keep the first jump small.
 
-    It needs of a plant the state x and the constraint forces, as measured; no more. If the laws are
-    for a system with a disturbance, one observer feeds both: with the measured force its equation
-    holds for the closed and for the open contact. Guards are found by Drake's Simulator as zeros of
-    a witness function, which needs a context with an accuracy as `simulate` sets it, or are looked
-    at in samples. All that a run has done stands in its context.
+    Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
+    system with a disturbance, one observer serves both, since its equation contains the measured
+    force and so holds for closed and open contacts. Drake's Simulator finds the guards as zeros of
+    a witness function, which needs a context with an accuracy, as `simulate` sets it; or they are
+    evaluated at samples. The whole history of a run is in its context.
 
     Input ports:
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,). The control does not depend on it in the
             same instant, unless a law takes a measured force.
-        exogenous: Of an observer: the disturbance, and coefficients of friction; if the laws have
-            them.
-        hold: Where it is not 0, no integral is updated, shape (1,); may be without a wire.
-        signal_<name>: For which phases wait, shape (1,); it has come where it is above 1/2. May be
-            without a wire.
+        exogenous: The disturbance and the coefficients of friction from an observer, if the laws
+            have them.
+        hold: While it is not 0, no integral is updated, shape (1,); 0 without a wire.
+        signal_<name>: A signal that phases wait for, shape (1,); it is present above 1/2. 0 without
+            a wire.
 
     Output ports:
         control: u, shape (p,).
-        phase: The place of the phase in the task, shape (1,); the number of phases after the last.
-        desired_output: The positions, the force and the distance that are wanted, shape (p + 1,).
-            In contact the distance is zero, and else the force.
-        contact_reference: R of the law in contact while that acts, and else 0: for an observer.
-        tared_force: The measured forces less the bias that was found; with a tare_time.
-        integral, free_integral: The integrals of each law, if it has any. They stand still while
-            the other law acts, and those in contact also while no force is felt, and while the
-            first references after a touch fade in: the force of an impact is no error.
+        phase: The index of the phase in the task, shape (1,); after the last one their number.
+        desired_output: The desired positions, force and distance, shape (p + 1,). In contact the
+            distance is zero, otherwise the force.
+        contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
+        tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
+        integral, free_integral: The integrals of each law, if it has any. They are not updated
+            while the other law is active; those in contact also not while no force is measured, and
+            during the transition after a touch, so that the force of an impact is not integrated.
 
     Args:
         task: The phases.
         law: The law in contact. Its force, "wall.force" for example, is one of its outputs.
-        free_law: The law without: of `open_contact(law.system, "wall.force")`.
-        sample_period: When guards are looked at and errors are summed, in s; 0 for at all times.
+        free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
+        sample_period: The period at which guards are evaluated and errors are integrated, in s; 0
+            for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
         supervisor, controller, free_controller: The blocks in it.
-        place: Which output is the force, or the distance.
-        force: Which of the constraint forces is the contact's.
+        place: The index of the output that is the force or the distance.
+        force: The index of the contact's force among the constraint forces.
         output_signals: Names and units of `desired_output`.
         outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
             derivative of the distance, shape (p + 2,).
@@ -108,12 +109,7 @@ class TaskController(Diagram, Controller):
     takes_over, shown, refused = True, ("desired_output",), _REFUSED
 
     def __init__(
-        self,
-        task: Task,
-        law: TrackingLaw,
-        free_law: TrackingLaw,
-        *,
-        sample_period: float = 0.0,
+        self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 0.0
     ) -> None:
         super().__init__()
         check_sampled(task, sample_period)
@@ -128,34 +124,33 @@ class TaskController(Diagram, Controller):
         self.supervisor = builder.AddSystem(
             TaskSupervisor(task, (free_law, law), self.place, self.force, size, sample_period)
         )
-        builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
-        builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
-        builder.ExportInput(self.supervisor.GetInputPort("hold"), "hold")
+        for name in ("estimated_state", "measured_force", "hold"):
+            builder.ExportInput(self.supervisor.GetInputPort(name), name)
         for port in self.supervisor.signal_ports.values():
             builder.ExportInput(port, port.get_name())
         switch = builder.AddSystem(LawSwitch(law.system.num_controls))
         in_contact = self.supervisor.GetOutputPort("in_contact")
         builder.Connect(in_contact, switch.GetInputPort("in_contact"))
-        added = []
-        for which, name, own in ((FREE, "free", free_law), (CONTACT, "contact", law)):
-            controller = builder.AddSystem(TrackingController(own, sample_period=sample_period))
+        controllers = []
+        for which, name, its_law in ((FREE, "free", free_law), (CONTACT, "contact", law)):
+            controller = builder.AddSystem(TrackingController(its_law, sample_period=sample_period))
             controller.set_name(f"{name}_controller")
             builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
             reference = self.supervisor.GetOutputPort(f"{name}_reference")
             builder.Connect(reference, controller.GetInputPort("reference"))
-            if own.measured_force:
+            if its_law.measured_force:
                 measured = controller.GetInputPort("measured_force")
                 if task.tare_time:
                     builder.Connect(self.supervisor.GetOutputPort("tared_force"), measured)
                 else:
                     builder.ConnectInput("measured_force", measured)
-            if own.exogenous_degrees:
+            if its_law.exogenous_degrees:
                 port = controller.GetInputPort("exogenous")
                 if which == FREE:
                     builder.ExportInput(port, "exogenous")
                 else:
                     builder.ConnectInput("exogenous", port)
-            if count := len(own.integral.outputs):
+            if count := len(its_law.integral.outputs):
                 hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
                 hold.set_name(f"{name}_hold")
                 builder.Connect(
@@ -165,12 +160,12 @@ class TaskController(Diagram, Controller):
                 shown = "integral" if which == CONTACT else "free_integral"
                 builder.ExportOutput(controller.GetOutputPort("integral"), shown)
             builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(name))
-            added.append(controller)
-        self.free_controller, self.controller = added
-        builder.ExportOutput(switch.GetOutputPort("control"), "control")
+            controllers.append(controller)
+        self.free_controller, self.controller = controllers
+        control = switch.GetOutputPort("control")
+        builder.ExportOutput(control, "control")
         if task.watches("control"):
-            watching = self.supervisor.GetInputPort("control")
-            builder.Connect(switch.GetOutputPort("control"), watching)
+            builder.Connect(control, self.supervisor.GetInputPort("control"))
         names = ["phase", "desired_output", "contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
@@ -186,10 +181,11 @@ class TaskController(Diagram, Controller):
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The state at rest, of the free robot, with given outputs.
+        """The state of the free robot at rest with given outputs.
 
         Args:
-            outputs: The outputs of the free law, shape (p,): the distance in place of the force.
+            outputs: The outputs of the free law, shape (p,), with the distance in place of the
+                force.
             guess: x near it, shape (n,).
             parameters: Values of all parameters of the law's system; the defaults if None.
 
@@ -197,33 +193,35 @@ class TaskController(Diagram, Controller):
             InconsistentStateError: None is found near the guess.
         """
         law = self.free_law
-        wanted = vector(f"{self.get_name()}: outputs", outputs, len(law.degrees))
         goal = np.zeros(law.layout.reference_size)
-        goal[law.layout.lowest] = wanted
+        goal[law.layout.lowest] = vector(f"{self.get_name()}: outputs", outputs, len(law.degrees))
         values = law.system.parameter_vector(parameters)
         return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, values)
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """The record of a run: when each phase began, and why; empty before a run.
+        """The start of each phase of a run, with the reason; empty before a run.
 
         Args:
             context: The context of this system.
         """
         return tuple(segment.change for segment in self.segments(context))
 
+    @property
+    def phase_ends(self) -> tuple[str, ...]:
+        return tuple(phase.signal for phase in self.task.plan.phases)
+
     def segments(self, context: Context) -> tuple[ReferenceSegment, ...]:
-        """The references of a run, from one change of phases to the next.
+        """The references of a run, one segment for each phase.
 
         Args:
             context: The context of this system.
         """
-        own = self.GetSubsystemContext(self.supervisor, context)
-        return self.supervisor.progress(own).segments
+        return self.supervisor.progress(self.GetSubsystemContext(self.supervisor, context)).segments
 
     def desired_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """What was wanted at times of a run, in s, shape (k, p + 1), as `desired_output` was.
+        """The values of `desired_output` at times of a run, shape (k, p + 1).
 
-        At the moment of a change it is what was wanted before.
+        At the time of a change it is the value of the phase before.
 
         Args:
             context: The context of this system after the run.
@@ -234,14 +232,14 @@ class TaskController(Diagram, Controller):
             raise ModelError(f"{self.get_name()}: the task has not begun in this context")
         return np.array(
             [
-                self.supervisor.desired(segments[i], time)
+                segments[i].desired(self.place, time)
                 for i, time in zip(places_at(segments, moments), moments, strict=True)
             ]
         ).reshape(moments.size, -1)
 
     @property
     def phase_signals(self) -> tuple[Signal, ...]:
-        """The names of the phases as a record has them: "1 Approach", "2 Press", ..., "end"."""
+        """The names of the phases in a record: "1 Approach", "2 Press", ..., "end"."""
         names = [phase.name for phase in self.task.plan.phases]
         return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal("end"))
 
@@ -271,38 +269,35 @@ class TaskController(Diagram, Controller):
             )
         if not (plant.time_step or plant.is_ideal or self.sample_period):
             raise WiringError(
-                "a contact that gives way may be lost and found at any time, and a task that "
-                "reacts at once may switch without end: make the controller with a sample_period "
-                "(in a scenario: sampling)"
+                "a compliant contact may be lost and regained at any time, and a task that reacts "
+                "at once may switch without end: make the controller with a sample_period (in a "
+                "scenario: sampling)"
             )
         name = system.force_signals[self.force].name
         if plant.contacts and name.split(".")[0] not in plant.contacts:
             raise WiringError(
-                f"the contact with the force '{name}' does not open in this plant; what does is "
-                f"{', '.join(plant.contacts)}"
+                f"the contact with the force '{name}' does not open in this plant; contacts that "
+                f"open: {', '.join(plant.contacts)}"
             )
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
-        """What a record has of a task.
+        """The signals of a task in a record.
 
-        The outputs are the positions, the force and the distance; in contact the distance that is
-        wanted is zero, and else the force. "distance" has the distance and its derivative, "phase"
-        1 for the phase that goes on and 0 for all others, "predicted_error" what theory says, see
+        The outputs are the positions, the force and the distance; in contact the desired distance
+        is zero, otherwise the desired force. "distance" has the distance and its derivative,
+        "phase" is 1 for the current phase and 0 for all others, "predicted_error" is that of
         `predicted_errors`.
         """
         signals = self.output_signals
-        given = {
-            "state": values["state"],
-            "force": values["constraint_force"],
-            "parameters": values["parameters"],
-        }
-        found = function_along(self.outputs, given)
-        outputs = found[:, :-1]
+        values_with_distance = function_along(
+            self.outputs, {**values, "force": values["constraint_force"]}
+        )
+        outputs = values_with_distance[:, :-1]
         desired = np.zeros_like(outputs)
         segments = () if context is None else self.segments(context)
-        if times.size and context is not None:  # Not where a run failed before it began.
+        if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
         places = values["phase"].astype(int)
         predicted = predicted_errors(
@@ -311,7 +306,7 @@ class TaskController(Diagram, Controller):
         names = self.phase_signals
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
-            "distance": (found[:, -2:], (signals[-1], signals[-1].derivative(1))),
+            "distance": (values_with_distance[:, -2:], (signals[-1], signals[-1].derivative(1))),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
@@ -319,11 +314,12 @@ class TaskController(Diagram, Controller):
         }
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
-        own = self.GetSubsystemContext(self.controller, context)
-        parameters = self.controller.current_parameters(own)
-        (found,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
+        parameters = self.controller.current_parameters(
+            self.GetSubsystemContext(self.controller, context)
+        )
+        (outputs,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
         desired = self.GetOutputPort("desired_output").Eval(context)
-        return found[:-1], desired, self.output_signals
+        return outputs[:-1], desired, self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -342,8 +338,9 @@ class TaskController(Diagram, Controller):
             ModelError: No parameter has that name, or the value does not fit.
         """
         for controller in (self.controller, self.free_controller):
-            own = self.GetMutableSubsystemContext(controller, context)
-            controller.set_parameter(own, name, value)
-        known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
-        at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
-        at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
+            controller.set_parameter(
+                self.GetMutableSubsystemContext(controller, context), name, value
+            )
+        values = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
+        supervisor_context = self.GetMutableSubsystemContext(self.supervisor, context)
+        supervisor_context.get_mutable_numeric_parameter(0).SetFromVector(values)

@@ -1,4 +1,4 @@
-"""Polynomials that take over from a reference without a bump, and fade away."""
+"""Polynomials that continue the references of the phase before and decay to zero."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 SMOOTH = 2
-"""So many derivatives of a fade are continuous at least, also where a law asks for fewer."""
+"""The least number of continuous derivatives of a fade, even if a law needs fewer."""
 
 
 def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
@@ -22,7 +22,7 @@ def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
     Args:
         offset: d, output-major as a reference, shape (sum (mu_i + 1),).
         degrees: mu_1, ..., mu_p.
-        over: How long it lasts, in s.
+        over: Its duration, in s.
 
     Returns:
         Factors of 1, x, x^2, ... with x = t / over, one row for each entry of the reference.
@@ -54,9 +54,9 @@ def _basis(n: int) -> FloatArray:
     at_end = np.array(
         [[float(np.prod(powers[p] - np.arange(j))) for p in powers] for j in range(n + 1)]
     )
-    found = np.zeros((n + 1, 2 * n + 2))
+    factors = np.zeros((n + 1, 2 * n + 2))
     for k in range(n + 1):
-        found[k, k] = 1.0 / factorial(k)
-    left = at_end[:, : n + 1] @ found[:, : n + 1].T
-    found[:, n + 1 :] = -np.linalg.solve(at_end[:, n + 1 :], left).T
-    return found
+        factors[k, k] = 1.0 / factorial(k)
+    remaining = at_end[:, : n + 1] @ factors[:, : n + 1].T
+    factors[:, n + 1 :] = -np.linalg.solve(at_end[:, n + 1 :], remaining).T
+    return factors

@@ -1,4 +1,4 @@
-"""The free member of a system with a contact: its distance is an output in place of its force."""
+"""A system with one contact open: its distance is an output in place of its force."""
 
 from dataclasses import replace
 
@@ -19,17 +19,17 @@ def open_contact(system: DaeSystem, force: str) -> DaeSystem:
 
         x' = f + g_o v_o + h u,    0 = k_o(x),    z = (l_o(x) + m_o(x) v_o, k_i(x)),
 
-    where o are all constraints but the one, i, with the named force v_i: it does not hold, and
-    where its force was an output there is its distance k_i(x). State, controls, parameters and the
-    order of the outputs are those of the system, so that a law of one can take over from a law of
-    the other at any moment.
+    where o are all constraints except the one, i, with the named force v_i. This constraint does
+    not hold, and the output that was its force is its distance k_i(x). State, controls, parameters
+    and the order of the outputs do not change, so that the laws of both systems can replace each
+    other at any moment.
 
     Args:
         system: The system with the contact closed, `RobotModel.dae` for example.
         force: The name of the contact's force, "wall.force" for example.
 
     Raises:
-        ModelError: There is no such force; it is not, alone, one of the outputs; or constraints
+        ModelError: There is no such force; it is not one of the outputs by itself; or constraints
             share their forces.
     """
     names = [signal.name for signal in system.constraint_input_signals]
@@ -41,22 +41,22 @@ def open_contact(system: DaeSystem, force: str) -> DaeSystem:
             "leave `compliances` out"
         )
     i, j = names.index(force), output_of_force(system, force)
-    found = with_constraints(system, [row for row in range(len(names)) if row != i])
-    drift, signals = ca.SX(found.l), list(found.output_signals)
+    reduced = with_constraints(system, [row for row in range(len(names)) if row != i])
+    drift, signals = ca.SX(reduced.l), list(reduced.output_signals)
     drift[j], signals[j] = system.k[i], system.constraint_output_signals[i]
     return replace(
-        found,
+        reduced,
         l=drift,
         output_signals=tuple(signals),
-        implicit=found.implicit if found.num_constraints else None,
+        implicit=reduced.implicit if reduced.num_constraints else None,
     )
 
 
 def output_of_force(system: DaeSystem, force: str) -> int:
-    """Which output is a constraint force, of which no other one depends.
+    """The index of the output that is a constraint force, on which no other output depends.
 
     Raises:
-        ModelError: None is, or others depend on it.
+        ModelError: There is none, or others depend on it.
     """
     i = [signal.name for signal in system.constraint_input_signals].index(force)
     depending = [j for j in range(system.num_outputs) if not system.m[j, i].is_zero()]
@@ -77,17 +77,17 @@ def output_of_force(system: DaeSystem, force: str) -> int:
 
 
 def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
-    """Which output is force or distance, and which of the constraint forces is that force.
+    """The index of the output that is force or distance, and that of the constraint force.
 
     Raises:
-        ModelError: The laws are not those of one robot with and without the contact.
+        ModelError: The laws are not for one robot with and without the contact.
     """
-    own, free = law.system, free_law.system
+    closed, free = law.system, free_law.system
     names, others = (
-        [signal.name for signal in system.constraint_input_signals] for system in (own, free)
+        [signal.name for signal in system.constraint_input_signals] for system in (closed, free)
     )
     gone = [name for name in names if name not in others]
-    if len(gone) != 1 or (own.num_states, own.num_controls) != (
+    if len(gone) != 1 or (closed.num_states, closed.num_controls) != (
         free.num_states,
         free.num_controls,
     ):
@@ -96,30 +96,29 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
             f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
             f"{', '.join(others) or 'nothing'}"
         )
-    place, force = output_of_force(own, gone[0]), names.index(gone[0])
-    distance = own.constraint_output_signals[force].name
+    place, force = output_of_force(closed, gone[0]), names.index(gone[0])
+    distance = closed.constraint_output_signals[force].name
     if free.output_signals[place].name != distance:
         raise ModelError(
             f"the free law must have the output '{distance}' where the law has '{gone[0]}'; make "
             "its system by open_contact"
         )
-    moving = [p.name for p in own.exogenous.moving]
+    moving = [p.name for p in closed.exogenous.moving]
     if moving and DISTURBANCE not in moving:
         raise ModelError(
-            f"{own.name}: the laws of a task take no exogenous signals but those of an observer; "
+            f"{closed.name}: the laws of a task take only the exogenous signals of an observer; "
             f"'{moving[0]}' may not move"
         )
     if law.exogenous_degrees != free_law.exogenous_degrees:
         raise ModelError(
-            f"{own.name}: the law in contact needs {law.exogenous_degrees} derivatives of what an "
-            f"observer estimates, and that without {free_law.exogenous_degrees}; leave the "
-            "observer out"
+            f"{closed.name}: the law in contact needs {law.exogenous_degrees} derivatives of an "
+            f"observer's estimates, the free law {free_law.exogenous_degrees}; leave the observer "
+            "out"
         )
-    kept = [i for i in range(own.num_outputs) if i != place]
-    for i in kept:
-        if law.degrees[i] != free_law.degrees[i]:
+    for i in range(closed.num_outputs):
+        if i != place and law.degrees[i] != free_law.degrees[i]:
             raise ModelError(
-                f"'{own.output_signals[i].name}' has degree {law.degrees[i]} in contact and "
+                f"'{closed.output_signals[i].name}' has degree {law.degrees[i]} in contact and "
                 f"{free_law.degrees[i]} without, so that no reference leads from one to the other"
             )
     if free_law.degrees[place] < 2:

@@ -1,4 +1,4 @@
-"""What a phase begins with: references that go on from those before."""
+"""The references of each phase, which continue those of the phase before."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task
 
 FREE, CONTACT = 0, 1
-"""The places of the two laws."""
+"""The indices of the two laws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class PhaseReferences:
     """The references of a phase for its law.
 
     Attributes:
-        function: R in s after its begin, zero for outputs that it does not name.
-        named: Which outputs it names, with references from their origin.
-        references: The same as references of all outputs, in their order.
+        function: R as a function of the time in s since its start; zero for outputs without goals.
+        named: The indices of the outputs with absolute goals.
+        references: The references of all outputs, in their order.
     """
 
     function: Callable[[float], FloatArray]
@@ -37,12 +37,12 @@ class PhaseReferences:
 
 @dataclass(frozen=True, eq=False)
 class ModelMoment:
-    """A moment of a run, as the laws' model sees it.
+    """Time, state and parameters of the laws' model at one moment of a run.
 
     Attributes:
-        time: In s.
+        time: The time, in s.
         state: x, shape (n,).
-        parameters: Of the laws' system.
+        parameters: All parameters of the laws' system.
     """
 
     time: float
@@ -52,13 +52,13 @@ class ModelMoment:
 
 @dataclass(frozen=True)
 class PhaseCause:
-    """Why a phase begins.
+    """The reason for the start of a phase.
 
     Attributes:
-        reason: In words.
-        chosen: What was chosen to follow: the name of a phase, "next", "stop" and so on.
-        failed: Whether the phase before has failed.
-        ends_in_contact: Whether the phase before has ended in contact; None as it was before.
+        reason: The reason in words.
+        chosen: The key word that led here: the name of a phase, "next", "stop" and so on.
+        failed: Whether the phase before failed.
+        ends_in_contact: Whether the phase before ended in contact; None for no change.
     """
 
     reason: str
@@ -75,14 +75,15 @@ class TaskPlanner:
 
     Args:
         task: The phases.
-        laws: The law of the free robot and that in contact.
-        place: Which output is the distance of the first, and the force of the second.
+        laws: The law of the free robot and the law in contact.
+        place: The index of the output that is the distance of the first and the force of the
+            second.
 
     Attributes:
-        goals: What each phase wants.
-        motion_function: (x, parameters) -> the distance and its derivative, by the model, then all
-            outputs in m with the distance, then their derivatives.
-        moved: How many outputs in m there are.
+        goals: The references of each phase.
+        motion_function: (x, parameters) -> the distance and its derivative by the model, then all
+            outputs in m including the distance, then their derivatives.
+        moved: The number of outputs in m.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -97,8 +98,12 @@ class TaskPlanner:
         self._nothing = [_no_goals(law) for law in laws]
         free = laws[FREE]
         chains = free.structure.output_chains
-        moved = [chains[i] for i, one in enumerate(free.system.output_signals) if one.unit == "m"]
-        rows = [*chains[place][:2], *(one[0] for one in moved), *(one[1] for one in moved)]
+        moved = [
+            chain
+            for chain, signal in zip(chains, free.system.output_signals, strict=True)
+            if signal.unit == "m"
+        ]
+        rows = [*chains[place][:2], *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
         self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
         self.moved = len(moved)
 
@@ -109,7 +114,7 @@ class TaskPlanner:
         return float(values[0]), float(values[1]), first, rates
 
     def first(self, now: ModelMoment) -> ReferenceSegment:
-        """The references of the first phase, which begin as the outputs are."""
+        """The references of the first phase, which start at the current outputs."""
         contact = self._task.contacts[0]
         force = self._task.contact_force if contact else 0.0
         moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
@@ -124,16 +129,17 @@ class TaskPlanner:
         place: int | None,
         cause: PhaseCause,
     ) -> ReferenceSegment:
-        """The references from now on, which begin as those before are.
+        """The references of the next phase, which continue those before.
 
         Args:
             now: The moment.
             before: The references before.
-            moment: What is measured.
-            place: The phase that begins, their number after the last one; None to rest for good.
-            cause: Why.
+            moment: The measurements.
+            place: The index of the next phase, the number of phases when the task is done; None if
+                the robot rests for another reason.
+            cause: The reason.
         """
-        was, known = before.change.in_contact, before.reference(now.time)
+        was, present = before.change.in_contact, before.reference(now.time)
         end = len(self._phases)
         name = HELD if place is None else self._name(place)
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
@@ -142,12 +148,12 @@ class TaskPlanner:
         else:
             contact = self._task.contacts[place]
         if contact != was:
-            old, known = known, self._met(now, contact, moment)
+            old, present = present, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):
                 if i != self._place:
                     size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
-                    known[first : first + size] = old[start : start + size]
-        return self._started(now, place, name, contact, cause, moment, known)
+                    present[first : first + size] = old[start : start + size]
+        return self._started(now, place, name, contact, cause, moment, present)
 
     def _started(
         self,
@@ -181,48 +187,48 @@ class TaskPlanner:
         )
 
     def _met(self, now: ModelMoment, contact: bool, moment: Moment) -> FloatArray:
-        """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives.
+        """R of a law from the current outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        A force that a law reaches at once is what is measured.
+        A force of degree 0 is the measured one.
         """
         law = self._laws[contact]
-        found = np.zeros(law.layout.reference_size)
-        coordinates = law.error_coordinates(now.state, found, now.parameters)
-        found[law.layout.chained] = np.delete(coordinates, _integral_places(law))
+        reference = np.zeros(law.layout.reference_size)
+        coordinates = law.error_coordinates(now.state, reference, now.parameters)
+        reference[law.layout.chained] = np.delete(coordinates, _integral_places(law))
         if contact and law.degrees[self._place] == 0:
-            found[law.layout.lowest[self._place]] = moment.force
-        return found
+            reference[law.layout.lowest[self._place]] = moment.force
+        return reference
 
     def _name(self, place: int) -> str:
         return self._phases[place].name if place < len(self._phases) else DONE
 
 
 def _integral_places(law: TrackingLaw) -> list[int]:
-    """Where integrals stand among the error coordinates."""
-    found, place = [], 0
+    """The indices of integrals among the error coordinates."""
+    places, place = [], 0
     for i, degree in enumerate(law.degrees):
         if i in law.integral.outputs:
-            found.append(place)
+            places.append(place)
             place += 1
         place += degree
-    return found
+    return places
 
 
 def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> PhaseReferences:
     """The references of a phase."""
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
-    found, degrees = [], law.degrees
+    assignments, degrees = [], law.degrees
     for name, reference in phase.goals(names[place]).items():
         try:
-            found.append(assigned(name, reference, names, degrees))
+            assignments.append(assigned(name, reference, names, degrees))
         except ReferenceSignalError as error:
             raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
-    named = tuple(i for one in found for i in one.places)
+    named = tuple(i for assignment in assignments for i in assignment.places)
     rest = [name for i, name in enumerate(names) if i not in named]
-    found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
+    assignments += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
-        references = tuple(in_order(found, names))
+        references = tuple(in_order(assignments, names))
         here = () if phase.is_relative else named
         return PhaseReferences(stack_references(references, degrees), here, references)
     except ReferenceSignalError as error:
@@ -230,8 +236,8 @@ def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> PhaseReferen
 
 
 def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
-    """How fast the outputs of a phase go at last, shape (p,)."""
-    signals, found = law.system.output_signals, np.zeros(len(law.degrees))
+    """The final rates of the outputs of a phase, shape (p,)."""
+    signals, rates = law.system.output_signals, np.zeros(len(law.degrees))
     names = [signal.name for signal in signals]
     for name, rate in task.plan.phases[index].rates(names[place]).items():
         if name not in names:
@@ -243,8 +249,8 @@ def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
                 f"{task.plan.where(index)}: direction: '{name}' is in {unit}, and a move goes "
                 "along outputs in m"
             )
-        found[names.index(name)] = rate
-    return found
+        rates[names.index(name)] = rate
+    return rates
 
 
 def _no_goals(law: TrackingLaw) -> PhaseReferences:

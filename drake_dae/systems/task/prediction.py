@@ -20,27 +20,28 @@ def predicted_errors(
 ) -> FloatArray:
     """The error that theory predicts for a run, shape (k, p + 1).
 
-    From each change of phases on it decays by the gains of the law that acts (30), from what it is
-    then. An impact makes errors anew; the change that follows a touch is after it. Of what no law
-    steers, the force while the free law acts, it is what it is. Of a contact that is open where it
-    should hold there is no theory.
+    After each change of phases the error decays from its current value by the gains of the active
+    law (30). An impact causes a new error; the change that follows a touch is after the impact.
+    While the free law is active, no law controls the force, and its predicted error is the force
+    itself. There is no prediction for a contact that is open although it should hold.
 
     Args:
-        laws: The law of the free robot and that in contact.
-        place: Which output is the distance of the first, and the force of the second.
-        force: Which of the constraint forces is that force.
+        laws: The law of the free robot and the law in contact.
+        place: The index of the output that is the distance of the first and the force of the
+            second.
+        force: The index of that force among the constraint forces.
         segments: The references of the run.
-        times: Of the run, in s, shape (k,).
-        values: At these times: "state", "constraint_force", and "integral" and "free_integral"
-            where the laws have any; one row for each.
+        times: The times of the run, in s, shape (k,).
+        values: "state", "constraint_force", and "integral" and "free_integral" if the laws have
+            any, one row for each time.
     """
     places = places_at(segments, times)
-    found = np.zeros((times.size, len(laws[CONTACT].degrees) + 1))
+    predicted = np.zeros((times.size, len(laws[CONTACT].degrees) + 1))
     for which, segment in enumerate(segments):
         rows = np.flatnonzero(places == which)
         if not rows.size:
             continue
-        start = max(rows[0] - 1, 0)  # At a change the state is known, and what was before.
+        start = max(rows[0] - 1, 0)  # The record has the state at the change in the row before.
         is_free = not segment.change.in_contact
         law = laws[FREE if is_free else CONTACT]
         name = "free_integral" if is_free else "integral"
@@ -52,7 +53,7 @@ def predicted_errors(
         )
         columns = np.arange(errors.shape[1])
         if is_free:
-            columns[place] = found.shape[1] - 1
-            found[rows, place] = values["constraint_force"][rows, force]
-        found[rows[:, None], columns] = errors
-    return found
+            columns[place] = predicted.shape[1] - 1
+            predicted[rows, place] = values["constraint_force"][rows, force]
+        predicted[rows[:, None], columns] = errors
+    return predicted

@@ -1,4 +1,4 @@
-"""How far a task is: what a context holds of it, and what is left of it as a record."""
+"""The progress of a task in a context, which is also its record."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,23 +13,23 @@ from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.fade import fade
 
 DONE, HELD = "done", "held"
-"""What the record calls the time after the last phase, and after a reaction that ends the task."""
+"""Names in a record for the time after the last phase, and after a task that ended otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSegment:
-    """The references from one change of phases on:
+    """The references of one phase, from its start t_0 on:
 
         R(t) = goal(t - t_0) + base + rate (t - t_0) + fade(t - t_0).
 
     Attributes:
-        change: What began.
-        layout: How the references of the law are stacked that acts.
-        goal: References of the phase in s after its begin, zero where it names none.
-        base, rate: Where and how fast the others go at last, shape (p,).
-        faded: The factors of the polynomials that take over, see `fade`.
-        over: How long they last, in s.
-        origin: All outputs in m, with the distance, when it began.
+        change: The start of the phase.
+        layout: The layout of the references of the active law.
+        goal: The goals of the phase, zero for outputs without any.
+        base, rate: The final values and rates of the other outputs, shape (p,).
+        faded: The factors of the polynomials of `fade`.
+        over: The duration of the fade, in s.
+        origin: All outputs in m, including the distance, at t_0.
     """
 
     change: PhaseChange
@@ -53,56 +53,64 @@ class ReferenceSegment:
         over: float,
         origin: FloatArray,
     ) -> "ReferenceSegment":
-        """The references that begin with present values and derivatives.
+        """The references that start with the present values and derivatives.
 
         Args:
-            change: What begins.
-            layout: How the references of the law are stacked that acts.
-            goal: References of the phase, in s after its begin.
-            named: Which outputs these are for.
-            rate: How fast the other outputs go at last, shape (p,).
-            present: R at the begin.
-            over: How long it takes, in s.
-            origin: The outputs in m at the begin.
+            change, layout, goal, over, origin: The attributes.
+            named: The indices of the outputs with goals.
+            rate: The final rates of the other outputs, shape (p,).
+            present: R at the start.
         """
         lowest = layout.lowest
         has_rate = np.array(layout.degrees) > 0
         moving = np.where(has_rate, present[np.minimum(lowest + 1, present.size - 1)], 0.0)
-        # With the mean of the two speeds on the way it does not swing over.
+        # With the mean of both rates during the fade, the outputs do not overshoot.
         base = present[lowest] + (moving - rate) * over / 2.0
         base[list(named)] = 0.0
         rate = rate.copy()
         rate[list(named)] = 0.0
-        found = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over, origin)
-        offset = present - found._goal(0.0)
-        return replace(found, faded=fade(offset, layout.degrees, over))
+        segment = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over, origin)
+        offset = present - segment._goal(0.0)
+        return replace(segment, faded=fade(offset, layout.degrees, over))
 
     def reference(self, time: float) -> FloatArray:
         """R at a time in s, shape (sum (mu_i + 1),)."""
         passed = time - self.change.time
-        found = self._goal(passed)
+        reference = self._goal(passed)
         if passed < self.over:
-            found += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
-        return found
+            reference += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
+        return reference
+
+    def desired(self, place: int, time: float) -> FloatArray:
+        """The desired positions, force and distance at a time in s, shape (p + 1,).
+
+        Args:
+            place: The index of the output that is the force in contact, and otherwise the distance.
+            time: The time, in s.
+        """
+        outputs = np.append(self.reference(time)[self.layout.lowest], 0.0)
+        if not self.change.in_contact:
+            outputs[-1], outputs[place] = outputs[place], 0.0
+        return outputs
 
     def _goal(self, passed: float) -> FloatArray:
-        found = self.goal(passed).copy()
-        found[self.layout.lowest] += self.base + self.rate * passed
+        reference = self.goal(passed).copy()
+        reference[self.layout.lowest] += self.base + self.rate * passed
         for i, degree in enumerate(self.layout.degrees):
             if degree:
-                found[self.layout.lowest[i] + 1] += self.rate[i]
-        return found
+                reference[self.layout.lowest[i] + 1] += self.rate[i]
+        return reference
 
 
 @dataclass(frozen=True, eq=False)
 class TaskProgress(Immutable):
-    """What a context holds of a task.
+    """The progress of a task in a context.
 
     Attributes:
-        segments: All that began; none before a run.
-        step: When the step began that is being made, in s.
-        felt: When the contact was felt last, in s.
-        is_felt: Whether it has been felt since then.
+        segments: The references of all phases that began; empty before a run.
+        step: The start time of the current step, in s.
+        felt: The last time at which the contact was felt, in s.
+        is_felt: Whether the contact is felt now.
     """
 
     segments: tuple[ReferenceSegment, ...] = ()
@@ -112,11 +120,11 @@ class TaskProgress(Immutable):
 
     @property
     def changes(self) -> tuple[PhaseChange, ...]:
-        """The record of the task."""
+        """The starts of phases."""
         return tuple(segment.change for segment in self.segments)
 
 
 def places_at(segments: Sequence[ReferenceSegment], times: FloatArray) -> Indices:
-    """Which segment held at each time; at the moment of a change that before."""
+    """The index of the segment at each time; at the time of a change that before."""
     starts = [segment.change.time for segment in segments[1:]]
     return np.searchsorted(starts, times, side="left")

@@ -1,4 +1,4 @@
-"""The law that acts: one of two controls."""
+"""The switch between the controls of two laws."""
 
 import casadi as ca
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -11,11 +11,11 @@ class LawSwitch(LeafSystem):
     """Passes the control of one of two laws; the other one is not evaluated.
 
     Input ports:
-        in_contact: Not 0 where the law in contact acts, shape (1,).
+        in_contact: 1 while the law in contact is active, otherwise 0, shape (1,).
         free, contact: The controls of both laws, shape (p,).
 
     Output port:
-        control: That of the law that acts, shape (p,).
+        control: The control of the active law, shape (p,).
 
     Args:
         size: p.

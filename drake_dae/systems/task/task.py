@@ -1,4 +1,4 @@
-"""A task: phases in an order that makes sense."""
+"""A task: phases in a valid order."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,40 +12,40 @@ from drake_dae.systems.task.phases.guards import Watched
 from drake_dae.systems.task.phases.plan import PhasePlan, check_guards, named
 
 _STEADY = 6.0
-"""`contact_force` is at least so many standard deviations of the filtered noise, so that one sample
-in 1e9 exceeds it."""
+"""The least `contact_force` in standard deviations of the filtered noise: one sample in 1e9 exceeds
+it."""
 
-_SLOWEST = 10.0
-"""The low-pass divides the noise by this at most; its time constant is then 50 samples."""
+_STRONGEST = 10.0
+"""The largest factor by which the low-pass reduces noise; its time constant is then 50 samples."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class Task:
-    """Phases, one after the other or as they choose; after the last one the robot rests.
+    """Phases in order, or in the order that they choose; after the last one the robot rests.
 
     If it rests in contact and the contact is lost, the law of the free robot keeps it at rest.
 
     Attributes:
-        phases: The phases, each with a name of its own. Where the first one begins in contact, it
-            does so with `contact_force`.
-        contact_force: A force that is less than this, in N, is none: with it the robot has
-            touched, and below it it has let go.
-        patience: How long the force of a contact that shall hold may be none before the contact is
-            lost, in s; a contact that gives way may bounce at first.
-        force_noise: The standard deviation of the force sensor's noise, in N. The guards take the
-            force through a low-pass, after which the noise has a standard deviation of at most a
-            sixth of `contact_force`, so that it is not taken for a touch; 0 without noise.
-        tare_time: The time in s at the begin of a task that begins free, in which the mean of the
-            measured force is taken as the sensor's bias. No phase ends before it is over; then the
-            bias is subtracted for guards, laws and observers. 0 for no taring.
+        phases: The phases, with distinct names. If the first one begins in contact, its force
+            starts at `contact_force`.
+        contact_force: Forces below this, in N, count as zero: at this force the robot has touched,
+            and below it the contact is open.
+        patience: How long the force may be below `contact_force` before a contact that a phase
+            holds counts as lost, in s; a compliant contact may bounce at first.
+        force_noise: The standard deviation of the force sensor's noise, in N; 0 without noise. For
+            guards the force passes a low-pass, after which the standard deviation is at most a
+            sixth of `contact_force`, so that noise does not count as a touch.
+        tare_time: The time in s at the start of a task that starts free, over which the mean of the
+            measured force is taken as the sensor's bias. No phase ends before; then the bias is
+            subtracted for guards, laws and observers. 0 for no taring.
         retries: How many times a task may go back by "approach"; then the run ends with an error.
-        plan: What follows what.
+        plan: The order of the phases.
 
     Raises:
-        ModelError: There are no phases; one begins in contact where that before does not end so, or
-            the other way round; what shall follow is no phase, or may go on without an end; a guard
-            trips before its phase can be over; or a number makes no sense.
+        ModelError: There are no phases; one begins in contact although the one before does not end
+            in contact, or the other way round; a successor is not a phase, or the task may not end;
+            a guard trips before its phase can succeed; or a number is not valid.
     """
 
     phases: Sequence[Phase]
@@ -64,7 +64,7 @@ class Task:
                 raise ModelError(f"{name} must be 0 or more, got {getattr(self, name):g}")
         if self.retries < 0:
             raise ModelError(f"retries must be 0 or more, got {self.retries}")
-        least = self.force_noise * _STEADY / _SLOWEST
+        least = self.force_noise * _STEADY / _STRONGEST
         if self.contact_force < least:
             raise ModelError(
                 f"contact_force: noise of {self.force_noise:g} N hides a force of "
@@ -93,44 +93,44 @@ class Task:
         return 2.0 * kept / (1.0 + kept)
 
     def tare_samples(self, sample_period: float) -> int:
-        """Of how many samples the bias of the force is the mean; 0 without a tare_time.
+        """The number of samples in the mean for the bias of the force; 0 without a tare_time.
 
         Args:
-            sample_period: In s.
+            sample_period: The sample period, in s.
 
         Raises:
-            ModelError: The mean is of so few samples that their noise may be taken for a touch.
+            ModelError: There are so few samples that the noise of their mean may count as a touch.
         """
         if not self.tare_time:
             return 0
-        found = ceil(self.tare_time / sample_period - 1e-9)
+        count = ceil(self.tare_time / sample_period - 1e-9)
         needed = ceil((_STEADY * self.force_noise / self.contact_force) ** 2)
-        if found < needed:
+        if count < needed:
             raise ModelError(
                 f"tare_time: a mean over {self.tare_time:g} s keeps too much of the force sensor's "
                 f"noise of {self.force_noise:g} N; it must be {needed * sample_period:g} s or more"
             )
-        return found
+        return count
 
     @property
     def contacts(self) -> tuple[bool, ...]:
-        """Whether each phase begins in contact, and whether the robot rests so at the end."""
+        """Whether each phase begins in contact, and whether the robot rests in contact at last."""
         return self.plan.contacts
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The names of the signals for which it waits."""
+        """The names of the signals that its phases wait for."""
         return tuple(dict.fromkeys(phase.signal for phase in self.phases if phase.signal))
 
     def watches(self, of: Watched) -> bool:
-        """Whether a guard of a phase watches something."""
+        """Whether a guard of a phase watches this quantity."""
         return any(guard.of == of for phase in self.phases for guard in phase.guards)
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
 
     def __str__(self) -> str:
-        """One line for each phase: what ends it."""
+        """One line for each phase, with the condition that ends it."""
         return "\n".join(
             f"{index + 1}. {phase.name}, until {phase.awaited(self.contact_force)}"
             for index, phase in enumerate(self.phases)
@@ -138,28 +138,28 @@ class Task:
 
 
 def check_sampled(task: Task, sample_period: float) -> None:
-    """Refuses what a task without samples cannot do.
+    """Refuses a continuous task that needs samples.
 
     Args:
         task: The task.
-        sample_period: In s; 0 for none.
+        sample_period: The sample period, in s; 0 for none.
 
     Raises:
-        ModelError: The period is none, or there are no samples and the task needs them.
+        ModelError: The period is not valid, or it is 0 and the task needs samples.
     """
     if not 0.0 <= sample_period < inf:
         raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
     if sample_period:
         return
-    found = {
+    needs = {
         "force_noise": (task.force_noise, "noise and bias of a force are found in samples"),
         "tare_time": (task.tare_time, "noise and bias of a force are found in samples"),
     }
     for index, phase in enumerate(task.phases):
         for guard in phase.guards:
             where = f"phase {index + 1} of the task, {phase.name}: guard of the {guard.of}"
-            found[where] = (guard.of == "work" or guard.samples > 1, "it counts in samples")
-    for name, (is_needed, why) in found.items():
+            needs[where] = (guard.of == "work" or guard.samples > 1, "it counts in samples")
+    for name, (is_needed, why) in needs.items():
         if is_needed:
             raise ModelError(
                 f"{name}: {why}, and this task acts continuously; leave it out, or give a "

@@ -1,4 +1,4 @@
-"""What a task computes, as traced functions of the numbers of its present segment."""
+"""The outputs and guards of a task as traced functions of the numbers of its current segment."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,29 +28,39 @@ from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
-SEEN = ("force", "bias", "count")
-"""What a context holds of the force: after its low-pass, its mean before a touch, and of how many
-samples that is."""
+FORCE_FILTER = ("force", "bias", "count")
+"""The state of the force filter: the force after the low-pass, the mean of the samples before the
+first touch, and the number of these samples."""
 
-NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt", "distance", *SEEN)
-"""Which numbers a context holds of a task, before base, rate and fade of its present segment."""
+NAMES = (
+    "place",
+    "contact",
+    "start",
+    "over",
+    "touched",
+    "felt",
+    "is_felt",
+    "distance",
+    *FORCE_FILTER,
+)
+"""The first numbers of a task in a context; base, rate and fade of its current segment follow."""
 
 EARLY = 1e-12
-"""A margin that is less is over: so zeros are alike whose round-off is not."""
+"""A margin below this has ended, so that margins with different round-off end together."""
 
 
 class TracedTask:
-    """The functions of a `TaskSupervisor`, by the numbers of its present segment.
+    """The functions of a `TaskSupervisor` of the numbers of its current segment.
 
     Args:
-        task, laws, place, force: As of the supervisor.
-        plan: What makes its references.
-        num_forces: How many constraint forces are measured.
-        sample_period: When guards are looked at, in s; 0 for at all times.
+        task, laws, place, force: Those of the supervisor.
+        plan: The planner of its references.
+        num_forces: The number of measured constraint forces.
+        sample_period: The period at which guards are evaluated, in s; 0 for continuously.
 
     Attributes:
-        size: How many numbers there are.
-        tally: What is counted for the guards.
+        size: The number of these numbers.
+        tally: The counts for the guards.
     """
 
     def __init__(
@@ -80,90 +90,78 @@ class TracedTask:
         self._faded = ca.reshape(fade, *self._shape)
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
-        self._index = force
-        seen = ca.vertcat(*(self._named[name] for name in SEEN))
-        self._seen = self._after(seen, self._forces[force])
-        self._force, self._bias = self._seen[0], self._seen[1]
-        given = [seen, self._forces[force]]
-        self._seeing = ca.Function("seeing", given, [self._seen])
+        self._force_index = force
+        self._filter_places = [NAMES.index(name) for name in FORCE_FILTER]
+        before = self._held[self._filter_places]
+        self._filtered = self._filter(before, self._forces[force])
+        self._force, self._bias = self._filtered[0], self._filtered[1]
+        measured = [before, self._forces[force]]
+        self._filter_function = ca.Function("filter", measured, [self._filtered])
 
-    def _after(self, seen: ca.SX, measured: ca.SX) -> ca.SX:
-        """What is seen of the force with one more sample."""
-        force, bias, count = ca.vertsplit(seen)
+    def _filter(self, before: ca.SX, measured: ca.SX) -> ca.SX:
+        """The state of the force filter after one more sample."""
+        force, bias, count = ca.vertsplit(before)
         if self._tares:
             waits = count < self._tares - 0.5
             count = ca.if_else(waits, count + 1, count)
             bias = ca.if_else(waits, bias + (measured - bias) / count, bias)
-            known = ca.if_else(waits, 0, measured - bias)
+            unbiased = ca.if_else(waits, 0, measured - bias)
         else:
-            known = measured
-        return ca.vertcat(force + self._task.force_gain * (known - force), bias, count)
+            unbiased = measured
+        return ca.vertcat(force + self._task.force_gain * (unbiased - force), bias, count)
 
-    def seen(self, held: FloatArray, measured: float) -> FloatArray:
-        """What is held of the force after a sample: see `SEEN`.
+    def filtered(self, held: FloatArray, measured: float) -> FloatArray:
+        """The state of the force filter after a sample; see `FORCE_FILTER`.
 
         Args:
-            held: What was held, shape (size,).
+            held: The numbers before it, shape (size,).
             measured: The force of the contact, in N.
         """
-        return np.array(self._seeing(held[self._places], measured)).ravel()
+        return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
 
     def tares(self, held: FloatArray) -> bool:
-        """Whether the bias of the force is still being found."""
+        """Whether the bias of the force is still being estimated."""
         return bool(held[NAMES.index("count")] < self._tares - 0.5)
 
     def tally_of(self, held: FloatArray) -> FloatArray:
-        """What has been counted for the guards; see `GuardMemory`."""
+        """The counts for the guards; see `GuardMemory`."""
         return held[self._tallied]
 
     def work_of(self, held: FloatArray) -> float:
-        """The work of the contact force since the phase began, in J; 0 where no guard needs it."""
+        """The work of the contact force since the phase began, in J; 0 if no guard needs it."""
         return float(self.tally.work(self.tally_of(held)))
 
-    @property
-    def _places(self) -> list[int]:
-        return [NAMES.index(name) for name in SEEN]
+    def numbers(self, progress: TaskProgress, force: FloatArray, tally: FloatArray) -> FloatArray:
+        """The numbers of a task from its progress, the force filter and the counts of its guards.
 
-    def numbers(self, progress: TaskProgress, seen: FloatArray, tally: FloatArray) -> FloatArray:
-        """The numbers of a task that is so far, with what is seen of the force and counted."""
-        found = np.zeros(self.size)
+        Shape (size,); zero before a run.
+        """
         if not progress.segments:
-            return found
+            return np.zeros(self.size)
         segment = progress.segments[-1]
         change, touched = segment.change, self.touched(progress.segments)
         felt = progress.felt if np.isfinite(progress.felt) else change.time
         flags = [change.place, change.in_contact, change.time, segment.over, touched, felt]
         faded = np.zeros(self._shape)
         faded[: segment.faded.shape[0], : segment.faded.shape[1]] = segment.faded
-        parts = [
-            *flags,
-            progress.is_felt,
-            change.distance,
-            *seen,
-            *segment.base,
-            *segment.rate,
-            *faded.ravel(order="F"),
-            *segment.origin,
-            *tally,
-        ]
-        found[:] = parts
-        return found
+        sums = segment.base, segment.rate, faded.ravel(order="F"), segment.origin
+        return np.hstack([flags, progress.is_felt, change.distance, force, *sums, tally])
 
     @staticmethod
     def touched(segments: Sequence[ReferenceSegment]) -> bool:
-        """Whether the present segment began where the robot had been free."""
+        """Whether the robot was free before the current segment."""
         return len(segments) > 1 and not segments[-2].change.in_contact
 
     def _in_phase(self, values: Callable[[int], ca.SX], otherwise: ca.SX) -> ca.SX:
-        """What a function of the phase gives in that which goes on; else after the last."""
+        """A function of the phase at the current phase; `otherwise` after the last one."""
         place, count = self._named["place"], len(self._phases)
-        found = ca.if_else(place > count - 0.5, otherwise, 0)
+        value = ca.if_else(place > count - 0.5, otherwise, 0)
         for i in range(count):
-            found += ca.if_else(ca.fabs(place - i) < 0.5, values(i), 0)
-        return found
+            value += ca.if_else(ca.fabs(place - i) < 0.5, values(i), 0)
+        return value
 
     def _reference(self, which: int) -> ca.SX:
-        """R of a law, zero where the other one acts; see `ReferenceSegment`."""
+        """R of a law, zero while the other one is active; see `ReferenceSegment`."""
         law, passed = self._laws[which], self._time - self._named["start"]
         size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
 
@@ -175,60 +173,59 @@ class TracedTask:
             rows = traced_references(references, law.degrees, time)
             return ca.substitute(rows, time, passed)
 
-        found = self._in_phase(goals, ca.SX.zeros(size))
-        found[lowest] += self._base + self._rate * passed
+        reference = self._in_phase(goals, ca.SX.zeros(size))
+        reference[lowest] += self._base + self._rate * passed
         for i, degree in enumerate(law.degrees):
             if degree:
-                found[lowest[i] + 1] += self._rate[i]
+                reference[lowest[i] + 1] += self._rate[i]
         share, powers = passed / self._named["over"], [ca.SX(1)]
         for _ in range(self._shape[1] - 1):
             powers.append(powers[-1] * share)
         fading = ca.mtimes(self._faded[:size, :], ca.vertcat(*powers))
-        found += ca.if_else(passed < self._named["over"], fading, 0)
+        reference += ca.if_else(passed < self._named["over"], fading, 0)
         acts = self._named["contact"] > 0.5
-        return ca.if_else(acts if which else ca.logic_not(acts), found, 0)
+        return ca.if_else(acts if which else ca.logic_not(acts), reference, 0)
 
     def computations(self) -> tuple[Computation, ...]:
-        """All output ports with vectors."""
-        found = []
-        wanted = ca.SX.zeros(len(self._laws[FREE].degrees) + 1)
+        """The computations of all vector output ports."""
+        computations = []
+        desired = ca.SX.zeros(len(self._laws[FREE].degrees) + 1)
         for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
             row = self._reference(which)
-            inputs = {"time": self._time, "held": self._held}
-            function = TracedFunction(name, inputs, {"R": row})
-            found.append(Computation.of(function, (TIME, HELD), (name,)))
+            function = TracedFunction(name, {"time": self._time, "held": self._held}, {"R": row})
+            computations.append(Computation.of(function, (TIME, HELD), (name,)))
             values = ca.vertcat(row[self._laws[which].layout.lowest.tolist()], 0)
             if which == FREE:
                 values[-1], values[self._place] = values[self._place], 0
-            wanted += values
+            desired += values
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
         is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
-        given, hold = [self._time, self._held], ca.SX.sym("hold")
-        shown = ca.Function("shown", given, [wanted, self._named["place"], contact])
+        inputs, hold = [self._time, self._held], ca.SX.sym("hold")
+        shown = ca.Function("shown", inputs, [desired, self._named["place"], contact])
         outputs = ("desired_output", "phase", "in_contact")
-        found.append(Computation(shown, (TIME, HELD), outputs))
+        computations.append(Computation(shown, (TIME, HELD), outputs))
         waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(contact > 0.5, hold)])
-        found.append(Computation(waits, (HELD, "hold"), ("free_hold",)))
+        computations.append(Computation(waits, (HELD, "hold"), ("free_hold",)))
         stands = ca.logic_or(ca.logic_or(is_open, settles), hold)
-        holds = ca.Function("hold", [*given, self._forces, hold], [stands])
+        holds = ca.Function("hold", [*inputs, self._forces, hold], [stands])
         sources = (TIME, HELD, "measured_force", "hold")
-        found.append(Computation(holds, sources, ("contact_hold",)))
+        computations.append(Computation(holds, sources, ("contact_hold",)))
         if self._tares:
             tared = ca.SX(self._forces)
-            tared[self._index] -= self._bias
+            tared[self._force_index] -= self._bias
             function = ca.Function("tared", [self._held, self._forces], [tared])
-            found.append(Computation(function, (HELD, "measured_force"), ("tared_force",)))
-        return tuple(found)
+            computations.append(Computation(function, (HELD, "measured_force"), ("tared_force",)))
+        return tuple(computations)
 
     def unchanged(self) -> Computation:
-        """What is held after a sample at which nothing changes."""
+        """The numbers after a sample at which the phase goes on."""
         held = ca.SX(self._held)
-        held[self._places] = self._seen
+        held[self._filter_places] = self._filtered
         if not self.tally.size:
             function = ca.Function("held", [self._held, self._forces], [held])
             return Computation(function, (HELD, "measured_force"), (HELD,))
-        moment, inputs, sources = self._sight()
+        moment, inputs, sources = self._moment()
         counts = self._counted()
 
         def after(index: int) -> ca.SX:
@@ -240,8 +237,8 @@ class TracedTask:
     def _counted(self) -> list[ca.SX]:
         return [self._counts[i] for i in range(self.tally.size)]
 
-    def _sight(self) -> tuple[Moment, list[ca.SX], tuple[str, ...]]:
-        """What guards see, without a signal, and what that is computed from."""
+    def _moment(self) -> tuple[Moment, list[ca.SX], tuple[str, ...]]:
+        """The measurements without a signal, and the symbols and sources of their inputs."""
         named, law, moved = self._named, self._laws[FREE], self._plan.moved
         x, parameters = law.system.state, law.system.parameter_symbol
         motion = self._plan.motion_function.function.call([x, parameters])[0]
@@ -270,13 +267,13 @@ class TracedTask:
         return moment, inputs, tuple(sources)
 
     def guard(self) -> Computation:
-        """The margins of a phase, as those of the supervisor.
+        """The margins of a phase, the same as those of the supervisor.
 
         Raises:
-            ModelError: A phase computes its margin from numbers alone.
+            ModelError: The margin of a phase cannot be traced.
         """
         named, task = self._named, self._task
-        moment, inputs, sources = self._sight()
+        moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
         counts, tares = self._counted(), named["count"] < self._tares - 0.5
         excess = self._force - task.contact_force
@@ -289,21 +286,21 @@ class TracedTask:
             phase = self._phases[index]
             now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
             end, late = self._ends(phase, now)
-            guards = [ca.fmin(one, 1e9) for one in self.tally.margins(phase, counts, now)]
+            guards = [ca.fmin(margin, 1e9) for margin in self.tally.margins(phase, counts, now)]
             if self._tares:
                 end = ca.if_else(tares, 1, end)
             trips = ca.mmin(ca.vertcat(1e9, *guards))
             return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)
 
-        found = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
+        all_margins = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
         none = ca.SX(0, 1)
         inputs = [*inputs, *signals.values()]
         sources = (*sources, *(SIGNAL + name for name in signals))
-        function = ca.Function("guard", inputs, [ca.densify(found - EARLY), none, none])
+        function = ca.Function("guard", inputs, [ca.densify(all_margins - EARLY), none, none])
         return Computation(function, sources, (MARGINS, GAPS, RATES))
 
     def _ends(self, phase: Phase, now: Moment) -> tuple[ca.SX, ca.SX]:
-        """The margins of a phase to its end and to being late."""
+        """The margins of a phase until it succeeds and until it is late."""
         try:
             end = ca.SX(phase.margin(now, self._task.contact_force))
             return end, ca.fmin(ca.SX(phase.remaining(now)), 1e9)

@@ -54,13 +54,13 @@ def test_errors_and_roughness_are_those_of_the_gains(numbers):
     own, fast = found.gains, found.state_rate
     free = DirectionGains(tuple(own.position_gains(3)), 0.0, own.observer_rate, fast)
     direction = Direction(T, given.delay)
-    error, _ = sampled_loop(direction, free, given.seen(0.7)).deviations()
-    _, jump = sampled_loop(direction, free, given.seen(1.0)).deviations()
+    error, _ = sampled_loop(direction, free, given.noise_of(0.7)).deviations()
+    _, jump = sampled_loop(direction, free, given.noise_of(1.0)).deviations()
     contact = DirectionGains(
         (0.0, 0.0, own.constraint_damping), own.force_gain, own.observer_force_rate, fast
     )
     pressing = Direction(T, given.delay, given.mobility, given.stiffness)
-    force, push = sampled_loop(pressing, contact, given.seen(0.7)).deviations()
+    force, push = sampled_loop(pressing, contact, given.noise_of(0.7)).deviations()
     assert found.noise_error == pytest.approx(error)
     assert found.noise_force == pytest.approx(force)
     parts = (5.0 * jump) ** 2 + (0.7 / given.mobility * push) ** 2

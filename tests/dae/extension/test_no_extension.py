@@ -87,7 +87,7 @@ def test_an_output_that_repeats_the_constraint():
 
     error = violation(crane(l=lambda x: [x[2], x[2] + rope(x)]))
     assert error.assumption == 5
-    assert "the outputs X, Y and their derivatives depend on each other or on the" in str(error)
+    assert "outputs X, Y and their derivatives depend on each other" in str(error)
     error = violation(crane(l=lambda x: [x[2], rope(x)]))
     assert error.assumption == 5
     assert "the control never acts on output 'Y'" in str(error)
@@ -104,7 +104,7 @@ def test_isolated_singularities_are_not_mended():
     )
     error = violation(system)
     assert error.assumption == 4
-    assert "singular at isolated states, which more integrators do not mend" in str(error)
+    assert "singular at isolated states" in str(error)
     np.testing.assert_array_equal(error.state, np.zeros(4))
     assert dynamic_extension(changed(system, nominal_state=[1, 0, 0, 1])).integrators == {}
 

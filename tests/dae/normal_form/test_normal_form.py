@@ -257,7 +257,7 @@ def test_a_given_completion():
 @pytest.mark.parametrize(
     ("completion", "message"),
     [
-        (lambda x: x[:1], r"column of 2 expressions, n - sum r_i - sum mu_i; got shape \(1, 1\)"),
+        (lambda x: x[:1], r"column of 2 expressions.*got shape \(1, 1\)"),
         (lambda x: x[:2].T, r"got shape \(1, 2\)"),
         (lambda x: [x[0], x[1]], "completion must be a CasADi SX expression"),
         (lambda x: ca.vertcat(x[0], ca.SX.sym("w")), "depends on w, which is neither"),

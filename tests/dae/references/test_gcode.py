@@ -103,7 +103,7 @@ def test_inches_and_increments():
         ("G1 X1 F0", "F must be positive, got 0"),
         ("G1 X1 I3 F9", "I, J and R are those of arcs"),
         ("G2 X1 F9", "an arc needs its center by I and J, or its radius R"),
-        ("G2 X10 I3 F9", "the arc begins 0.003 m from its center and ends 0.007 m from it"),
+        ("G2 X10 I3 F9", "begins 0.003 m from its center and ends 0.007 m"),
         ("G2 X10 R3 F9", "no arc of radius 0.003 m joins two points 0.01 m apart"),
         ("G2 X10 R9 I3 F9", "either R, or I and J"),
         ("G1 X1e9 F9", "'E9' is not understood|E is not followed"),

@@ -136,7 +136,7 @@ def test_turns_of_a_spiral_are_a_pitch_apart(name):
         (lambda: CircleReference([0, 0], 1.0, 2.0).travel, "periodic"),
         (
             lambda: LineReference([1.0], [2.0], LIMITS, order=3).derivatives([4]),
-            "LineReference has 3 continuous derivatives, the law needs 4: pass order=4",
+            "LineReference has 3 continuous.*pass order=4",
         ),
     ],
 )

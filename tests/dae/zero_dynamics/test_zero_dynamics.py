@@ -121,9 +121,8 @@ def test_pendulum_on_a_cart_is_not_minimum_phase():
     # Rod and cart in Cartesian coordinates, ten operations.
     np.testing.assert_allclose(upright.eigenvalues, [rate, -rate], rtol=1e-10)
     assert upright.verdict is Verdict.UNSTABLE
-    assert (
-        "non-minimum phase: the largest real part of an eigenvalue is 3.744 1/s" in upright.reason
-    )
+    assert upright.reason.startswith("non-minimum phase")
+    assert "3.744 1/s" in upright.reason
     assert "at the equilibrium with the outputs s = 0.3" in upright.reason
 
     hanging = zero_dynamics(cart_pendulum(angle=np.pi)).stability()

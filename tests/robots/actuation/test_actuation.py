@@ -197,8 +197,8 @@ SHAFT = {"stiffness": 8e3, "inertia": 1.0}
             [ElectrohydraulicServos(**SERVO | {"geometry": np.eye(3)})],
             r"geometry must be .* \(2,\)",
         ),
-        ([DcMotors(**MOTOR), FlexibleJoints(**SHAFT)], "FlexibleJoints cannot stand behind"),
-        ([ElectrohydraulicServos(**SERVO), DcMotors(**MOTOR)], "DcMotors cannot stand behind"),
+        ([DcMotors(**MOTOR), FlexibleJoints(**SHAFT)], "FlexibleJoints cannot drive"),
+        ([ElectrohydraulicServos(**SERVO), DcMotors(**MOTOR)], "DcMotors cannot drive"),
     ],
 )
 def test_refusals(actuation, message):

@@ -83,9 +83,7 @@ def test_it_can_be_attached_again(stage):
 def test_only_a_shaft_can_be_driven_by_a_stage(stage):
     behind = [stage, MEMBERS["motors"]]
     if stage.attach(links()).shaft is None:
-        with pytest.raises(
-            ModelError, match=f"DcMotors cannot stand behind {type(stage).__name__}"
-        ):
+        with pytest.raises(ModelError, match=f"DcMotors cannot drive {type(stage).__name__}"):
             chain(behind, links())
     else:
         assert len(chain(behind, links()).stages) == 2

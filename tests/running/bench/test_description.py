@@ -16,8 +16,9 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.running.bench.controls import Inputs, controls_of, prediction
+from drake_dae.running.bench.controls import controls_of, prediction
 from drake_dae.running.bench.description import as_script, bench_of, shown_function
+from drake_dae.running.bench.inputs import Inputs
 from drake_dae.scenario.commanded import build_commanded
 
 
@@ -71,9 +72,9 @@ def test_bodies_forces_and_surfaces_are_where_drake_has_them(moving):
     np.testing.assert_allclose(rest[:3], wrench.points[0], atol=1e-12)
     np.testing.assert_allclose(rest[3:6], wrench.forces[0], atol=1e-11)
     own = np.concatenate(
-        [values[dae.parameter_slice(p.name)] for p in scene.surfaces[0].parameters]
+        [values[dae.parameter_slice(p.name)] for p in scene.robots[0].surfaces[0].parameters]
     )
-    stands = scene.surfaces[0].placement(own)
+    stands = scene.robots[0].surfaces[0].placement(own)
     wanted = np.append(stands.rotation().matrix().flatten("F"), stands.translation())
     np.testing.assert_allclose(rest[9:21], wanted, atol=1e-12)
     assert len(rest) == 21 + bench.data["prediction"]["size"]

@@ -28,7 +28,7 @@ from drake_dae.scenario.completion.tool_axis import tool_axis
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts.parts import Start
-from drake_dae.scenario.parts.written import TiltFromNormal
+from drake_dae.scenario.parts.written import TiltFromNormalForm
 
 # tool.z = 0.35 m on the wall at 1.2 m, by the law of cosines with two links of 1 m.
 REACH = np.hypot(1.2, 0.35)
@@ -68,7 +68,7 @@ def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_
     completed = complete_scenario(open_)
     assert completed.scenario.outputs == [
         PointCoordinates("tool", "yz"),
-        TiltFromNormal("wall", "z", "xy"),
+        TiltFromNormalForm("wall", "z", "xy"),
         JointPositions(["joint3", "joint7"]),
     ]
     found = completed.scenario.start.positions

@@ -486,5 +486,5 @@ def test_what_does_not_convert_says_why():
             super().__init__(system)
             self.DeclareVectorOutputPort("energy", 1, lambda context, output: None)
 
-    with pytest.raises(ModelError, match=r"its output port 'energy'; add it to _formulas"):
+    with pytest.raises(ModelError, match=r"'energy' has no formula; add it to _formulas"):
         Watched(hanging_pendulum()).ToAutoDiffXd()

@@ -79,22 +79,21 @@ PRESS = Press(20.0)
         ([Approach(name="a"), Press(2.0, name="a")], "more than one phase has the name 'a'"),
         (
             [Approach(on_failure="Press"), PRESS],
-            "phase 2 of the task, Press, after Approach by on_failure: it begins in contact, where "
+            "phase 2 of the task, Press, after Approach by on_failure: it begins in contact, but "
             "the robot is free; an Approach must lead there",
         ),
         (
             [Approach(), Press(20.0, on_success="away"), Release(), AWAY],
             "phase 4 of the task, away, after Press by on_success: it begins with a free robot, "
-            "which is in contact; a Release must lead there",
+            "but it is in contact; a Release must lead there",
         ),
         (
             [Approach(), PRESS, Dwell(1.0, on_failure="Press")],
-            "Press, after Dwell by on_failure: it begins in contact, which is lost there; choose "
-            "another one by if_lost",
+            "Press, after Dwell by on_failure: it begins in contact, but the contact is lost",
         ),
         (
             [Approach(), Press(20.0, on_failure="Press", if_lost="hold")],
-            "the task may not end: Press leads back to itself, as often as it comes; give Press a "
+            "the task may not end: Press leads back to itself, any number of times; give Press a "
             "count of retries",
         ),
         (
@@ -136,7 +135,7 @@ def test_plans_that_make_no_sense_are_refused(phases, message):
         (lambda: Approach(on_failure="approach"), "on_failure: 'approach' would go on as before"),
         (lambda: GuardedMove(0.0), "GuardedMove: distance must be positive"),
         (lambda: GuardedMove(0.1, direction={"a": 0.0}), "all of its components are 0"),
-        (lambda: Wait(), "Wait: give the signal for which it waits"),
+        (lambda: Wait(), "Wait: give the signal that it waits for"),
         (
             lambda: TaskController(Task([GuardedMove(0.1, direction={"wall": 1.0})]), *laws()),
             "phase 1 of the task, GuardedMove: direction: no output 'wall'",

@@ -36,10 +36,11 @@ SHARE = 0.5
 """The share of the acceleration that is for speeding up and for arcs; the rest is for corners."""
 
 NODES = 4000
-"""So many places of the path its speed and its distance from the spline are determined at."""
+"""The number of points of a path at which its speed and its distance from the spline are
+computed."""
 
 _SAMPLES = 8
-"""So many chords of a span its distance from the path is measured to."""
+"""The number of chords that replace a span of the spline when its distance is measured."""
 
 
 @checked(ReferenceSignalError)
@@ -52,7 +53,7 @@ class GCodeReference(SplineReference):
     uniform B-spline over points that this motion passes a step h apart. A corner at which the
     velocity changes by dv is then rounded by g h dv with the acceleration b dv / h, where b and g
     belong to the order; the step makes dv as large as tolerance and acceleration allow. `remark`
-    tells the rounding and the duration. With `press` there is a third output, a force that is
+    reports the rounding and the duration. With `press` there is a third output, a force that is
     smaller in G0 moves.
 
     A .csv has the points of a path without times in place of a program: x and y in mm, and the
@@ -99,7 +100,7 @@ class GCodeReference(SplineReference):
 
     @cached_property
     def program(self) -> GCodeProgram:
-        """The moves of the file."""
+        """The moves that the file contains."""
         if Path(self.file).suffix.lower() == ".csv":
             return read_points(self.file)
         try:
@@ -148,7 +149,7 @@ class GCodeReference(SplineReference):
             step = sqrt(allowed * peak / (reach * at_corners))
             change = sqrt(allowed * at_corners / (reach * peak))
             bend = sqrt(24.0 * allowed / (self.order + 2)) / step
-            path = _Path(self.program.moves, [self._speed(one) for one in self.program.moves])
+            path = _Path(self.program.moves, [self._speed(move) for move in self.program.moves])
             times = path.times(change, bend, SHARE * acceleration)
             if times[-1] / step > MOST_POINTS:
                 raise ReferenceSignalError(
@@ -197,15 +198,15 @@ class _Path:
 
     def at(self, along: FloatArray) -> FloatArray:
         """The points at distances along the path, shape (n, 2)."""
-        found, which = np.empty((along.size, 2)), self.moves_at(along)
+        points, which = np.empty((along.size, 2)), self.moves_at(along)
         for number in np.unique(which).tolist():
             chosen, move = which == number, self.moves[number]
             shares = (along[chosen] - self.ends[number]) / move.length
-            found[chosen] = move.at(np.clip(shares, 0.0, 1.0))
-        return found
+            points[chosen] = move.at(np.clip(shares, 0.0, 1.0))
+        return points
 
     def times(self, change: float, bend: float, acceleration: float) -> FloatArray:
-        """When the motion passes the nodes, in s.
+        """Returns the times in s at which the motion passes the nodes.
 
         Args:
             change: The largest change of the velocity at a corner, at the start and at the end.

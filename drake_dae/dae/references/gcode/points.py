@@ -14,10 +14,10 @@ SPEEDS = {"speed": MILLIMETRE, "feed": MILLIMETRE / MINUTE}
 
 
 def read_points(file: str) -> GCodeProgram:
-    """The straight moves between the points of a table.
+    """Reads the straight moves between the points of a table.
 
-    Its columns are x and y in mm, and if wanted speed in mm/s or feed in mm/min: that of the move
-    which ends at the point, infinite without such a column. A point that repeats is no move.
+    Its columns are x and y in mm, and optionally speed in mm/s or feed in mm/min of the move which
+    ends at the point, infinite without such a column. A point that repeats is no move.
 
     Args:
         file: A CSV file with a row of names; comma, semicolon or tab between.

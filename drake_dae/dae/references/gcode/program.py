@@ -12,8 +12,8 @@ from drake_dae.errors import ReferenceSignalError
 INCH, MILLIMETRE, MINUTE = 0.0254, 1e-3, 60.0
 
 WITHOUT_EFFECT = frozenset({17.0, 40.0, 49.0, 54.0, 80.0, 91.1, 94.0})
-"""The G codes that say what holds anyway: the plane XY, no compensation, centers from the start of
-an arc, feeds per minute."""
+"""The G codes that select what is the default here: the plane XY, no compensation, centers from the
+start of an arc, feeds per minute."""
 
 NOT_FOLLOWED = frozenset({3.0, 4.0, 5.0, 7.0, 8.0, 9.0})
 """The M codes that move nothing: spindle and coolant."""
@@ -22,7 +22,7 @@ ENDS = frozenset({2.0, 30.0})
 """The M codes that end a program."""
 
 RADII = 2e-3
-"""By so much the radii at both ends of an arc may differ, relative to them: programs round."""
+"""The allowed relative difference of the radii at both ends of an arc, since programs round."""
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 
@@ -46,7 +46,7 @@ class GCodeMove:
 
     @property
     def length(self) -> float:
-        """The length; of an arc with its mean radius."""
+        """The length of the move in m; that of an arc is computed with its mean radius."""
         if self.center is None:
             return float(np.linalg.norm(self.end - self.start))
         return abs(self.sweep) * self.radius
@@ -58,11 +58,11 @@ class GCodeMove:
 
     @property
     def radius(self) -> float:
-        """The mean radius of an arc; infinite for a straight move."""
+        """The mean radius of an arc in m; infinite for a straight move."""
         return inf if self.center is None else float(np.mean(self._radii))
 
     def direction(self, share: float) -> FloatArray:
-        """The direction of the motion at a share of its length, as a unit vector, shape (2,)."""
+        """Returns the unit tangent at a fraction of the length of the move, shape (2,)."""
         along = self.end - self.start
         if self.center is not None:
             x, y = (self.at(np.array([share])) - self.center)[0] * np.sign(self.sweep)
@@ -70,7 +70,7 @@ class GCodeMove:
         return np.asarray(along / np.linalg.norm(along))
 
     def at(self, shares: FloatArray) -> FloatArray:
-        """The points at shares of its length, shape (n, 2)."""
+        """Returns the points at fractions of the length of the move, shape (n, 2)."""
         if self.center is None:
             return self.start + shares[:, None] * (self.end - self.start)
         first = self.start - self.center
@@ -83,11 +83,11 @@ class GCodeMove:
 
 @dataclass(frozen=True, eq=False)
 class GCodeProgram:
-    """What a program moves.
+    """The moves of a program.
 
     Attributes:
         moves: The moves that have a length, each from where the one before ends.
-        ignored: What it says that no move follows, such as "M3" and "Z", in order.
+        ignored: The words without a move, such as "M3" and "Z", in order.
     """
 
     moves: tuple[GCodeMove, ...]
@@ -108,7 +108,7 @@ class _Machine:
 
 
 def read_program(text: str, name: str) -> GCodeProgram:
-    """The moves of a program.
+    """Reads the moves of a program.
 
     It follows G0, G1, G2 and G3 with X and Y, with I and J or R, F per minute, G20 and G21, G90 and
     G91, and ends at M2, M30 or the end of the text. Comments stand in parentheses or after a
@@ -116,7 +116,7 @@ def read_program(text: str, name: str) -> GCodeProgram:
 
     Args:
         text: The program.
-        name: What messages call it.
+        name: The name of the program in messages.
 
     Raises:
         ReferenceSignalError: A line is not understood, or would not be followed, or nothing moves.
@@ -135,7 +135,7 @@ def read_program(text: str, name: str) -> GCodeProgram:
 
 
 def _follow(machine: _Machine, line: str, moves: list[GCodeMove]) -> bool:
-    """Follows a line; whether the program goes on after it."""
+    """Follows a line, and returns whether the program continues after it."""
     codes, values = _words(line)
     ends = False
     for letter, code in codes:
@@ -196,8 +196,8 @@ def _move(machine: _Machine, values: dict[str, float], moves: list[GCodeMove]) -
     start, end = machine.place, machine.place.copy()
     for axis, letter in enumerate("XY"):
         if letter in values:
-            given = values[letter] * machine.unit
-            end[axis] = given if machine.is_absolute else start[axis] + given
+            length = values[letter] * machine.unit
+            end[axis] = length if machine.is_absolute else start[axis] + length
     is_arc, is_first = machine.mode in (2.0, 3.0), not machine.has_moved
     machine.place, machine.has_moved = end, True
     if machine.mode == 0.0 and is_first:

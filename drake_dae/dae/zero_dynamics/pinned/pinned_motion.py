@@ -7,7 +7,7 @@ from drake_dae.arrays import FloatArray
 
 
 class EndCause(Enum):
-    """The cause for the end of a motion with pinned outputs; the value describes it."""
+    """The causes for the end of a motion with pinned outputs; the enum value is a description."""
 
     NO_START = "no state has the outputs that the reference begins with"
     SINGULAR_START = "A(x) or B(x) is singular at the start, or the domain of the system ends"
@@ -24,7 +24,7 @@ class EndCause(Enum):
 
 @dataclass(frozen=True, eq=False)
 class MotionEnd:
-    """The end of a motion with pinned outputs, and its cause.
+    """The end of a motion with pinned outputs: its cause, time and state.
 
     Attributes:
         cause: Why the motion ends.
@@ -46,10 +46,10 @@ class MotionEnd:
 
 @dataclass(frozen=True, eq=False)
 class PinnedMotion:
-    """The motion with the outputs on a reference, as far as there is one.
+    """The motion with the outputs on a reference, until the last time or until it ends.
 
     Attributes:
-        times: The wanted times that were reached, in s, shape (k,).
+        times: The requested times that were reached, in s, shape (k,).
         states: x at these times, shape (k, n).
         controls: u at these times, shape (k, p).
         constraint_inputs: v at these times, shape (k, m).

@@ -29,7 +29,7 @@ number."""
 
 
 class PinnedOutputs:
-    """Z(R) and the motion on it; all arguments are arrays of the right sizes.
+    """Z(R) and the motion on it. The arguments of all methods are arrays of the right sizes.
 
     Args:
         structure: The structure of the system.
@@ -85,16 +85,16 @@ class PinnedOutputs:
         )
 
     def state(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """A state on Z(R), to round-off.
+        """Returns a state on Z(R), to round-off.
 
         Raises:
             InconsistentStateError: None is found near the guess.
         """
         name, outputs = self.system.name, self.describe(reference)
-        found, converged = self.project(guess, reference, parameters)
+        state, converged = self.project(guess, reference, parameters)
         if converged:
-            return found
-        residual = self.residual(found, reference, parameters)
+            return state
+        residual = self.residual(state, reference, parameters)
         if not np.all(np.isfinite(residual)):
             raise InconsistentStateError(
                 f"{name}: {outputs} have no value near the given state; start inside the domain "
@@ -102,12 +102,12 @@ class PinnedOutputs:
                 residual,
             )
         # The remaining distances, if these are small.
-        length = np.linalg.norm(self.gradients(found, parameters) * self.system.scale, axis=1)
+        length = np.linalg.norm(self.gradients(state, parameters) * self.system.scale, axis=1)
         missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
         worst = int(np.argmax(missed))
         if missed[worst] <= CONSISTENT:
             raise InconsistentStateError(
-                f"{name}: {outputs} lead to x = {show(found)}, where A(x) or B(x) is singular",
+                f"{name}: {outputs} lead to x = {show(state)}, where A(x) or B(x) is singular",
                 residual,
             )
         raise InconsistentStateError(
@@ -120,7 +120,7 @@ class PinnedOutputs:
     def project(
         self, start: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """The state on Z(R) next to a start, and whether Newton's method converged."""
+        """Returns the state on Z(R) closest to a start, and whether Newton's method converged."""
         scale = self.system.scale
 
         def residual(z: FloatArray) -> FloatArray:
@@ -129,37 +129,37 @@ class PinnedOutputs:
         def linearize(z: FloatArray) -> NewtonModel | None:
             return shortest_steps(self.gradients(scale * z, parameters) * scale, residual)
 
-        found, converged = newton(start / scale, linearize)
-        return scale * found, converged
+        z, converged = newton(start / scale, linearize)
+        return scale * z, converged
 
     def describe(self, reference: FloatArray) -> str:
-        """The outputs of a reference, for a message."""
+        """Returns the outputs of a reference vector as text."""
         values = zip(self.system.output_signals, self.layout.values(reference), strict=True)
         return "the outputs " + ", ".join(f"{signal.name} = {v:.6g}" for signal, v in values)
 
     def residual(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """The residual of Z(R), named by `residual_signals`, shape (k,)."""
+        """Returns the residual of Z(R), named by `residual_signals`, shape (k,)."""
         return self._residual.evaluate(state, reference, parameters)[0].copy()
 
     def gradients(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """C, the gradients of the residual, shape (k, n)."""
+        """Returns the gradients C of the residual, shape (k, n)."""
         gradients = self._gradient.evaluate(state, parameters)[0]
         return gradients.reshape(-1, self.system.num_states)
 
     def tangent(self, state: FloatArray, parameters: FloatArray, scale: FloatArray) -> FloatArray:
-        """A basis of the tangent space of Z(R), orthonormal relative to a scale, shape (n, d)."""
+        """Returns a basis of the tangent space of Z(R), orthonormal in scaled states, (n, d)."""
         return tangent(self.gradients(state, parameters), scale)
 
     def coordinates(
         self, state: FloatArray, parameters: FloatArray, scale: FloatArray
     ) -> tuple[Indices, FloatArray]:
-        """Coordinate states of Z(R), and the derivatives of all by them, (d,) and (n, d)."""
+        """Returns states that are coordinates of Z(R), and the derivatives of all by them."""
         return coordinates(self.gradients(state, parameters), scale)
 
     def rate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> FloatArray:
-        """x' = f* + h* u, shape (n,)."""
+        """Returns x' = f* + h* u, shape (n,)."""
         return self._motion.evaluate(state, reference, parameters)[0].copy()
 
     @cached_property
@@ -180,7 +180,7 @@ class PinnedOutputs:
     def slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """dx'/dx, shape (n, n), and dx'/dr_i for the outputs of degree 0."""
+        """Returns dx'/dx, shape (n, n), and dx'/dr_i for the outputs of degree 0."""
         n, directions = state.size, np.eye(state.size + self.layout.reference_size)
         direct = self.layout.lowest[self.layout.direct]
         chosen = directions[[*range(n), *(n + direct)]]
@@ -194,7 +194,7 @@ class PinnedOutputs:
         parameters: FloatArray,
         directions: FloatArray,
     ) -> FloatArray:
-        """The derivatives of x' along directions of (x, R), or of x alone, one in each column."""
+        """Returns the derivatives of x' along directions of (x, R), or only of x, as columns."""
         n, still = state.size, np.zeros(self.layout.reference_size)
         columns = [
             self._slope.evaluate(
@@ -207,11 +207,11 @@ class PinnedOutputs:
     def sizes_of_slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """The sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
+        """Returns the sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
         point = self.point(state, reference, parameters)
-        given = (point.rate, point.control, point.constraint_input, parameters)
+        values = (point.rate, point.control, point.constraint_input, parameters)
         n, inputs = state.size, point.constraint_input.size + point.control.size
-        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *given))
+        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *values))
         moved = [
             self._input_slope.evaluate(state, reference, dx, parameters)[0].reshape(inputs).copy()
             for dx in np.eye(n)
@@ -249,12 +249,12 @@ class PinnedOutputs:
     def point(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> PinnedPoint:
-        """A state on Z(R) with its rate, inputs and matrices."""
+        """Evaluates rate, inputs and matrices at a state on Z(R)."""
         values = self._motion.evaluate(state, reference, parameters)
         return PinnedPoint(state, *(value.copy() for value in values))
 
     def regularity(self, point: PinnedPoint) -> Regularity:
-        """Whether the motion is determined at a point."""
+        """Determines whether the motion is determined at a point."""
         if not (np.all(np.isfinite(point.A)) and np.all(np.isfinite(point.B))):
             return Regularity.MATRIX_NOT_FINITE
         pairs = zip(point.margins, self._usual_margins, strict=True)

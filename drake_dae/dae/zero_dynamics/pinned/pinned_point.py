@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray
 
 
 class Regularity(Enum):
-    """Whether the motion is determined at a point; the value describes the problem."""
+    """Whether the motion is determined at a point; the enum value describes the problem."""
 
     REGULAR = ""
     MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
@@ -50,8 +50,7 @@ class PinnedPoint:
     def signs(self) -> tuple[float, ...]:
         """The signs of det A and det B; a matrix that is not square has none."""
         matrices = (_matrix(value) for value in (self.A, self.B))
-        square = (matrix for matrix in matrices if matrix.shape[0] == matrix.shape[1])
-        return tuple(float(np.linalg.slogdet(matrix)[0]) for matrix in square)
+        return tuple(float(np.linalg.slogdet(m)[0]) for m in matrices if len(m) == m.shape[1])
 
 
 def _matrix(value: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ const prediction = data.prediction && new Prediction(data.prediction, (input) =>
 const plots = { signal: new Plot(element("signal-plot")), error: new Plot(element("error-plot")) };
 const bench = (window.bench = {
   data, engine, panel, view, samples: [], isRunning: true, rate: 3, restarts: true, off: 0, speed: 1, failure: "",
-  pulled: [],
+  pulled: [], gone: null, ended: null, said: "",
 });
 
 /* What follows from a sample: error, and the predicted one. */
@@ -66,9 +66,23 @@ function follow_push() {
   view.push.setLength((FULL * data.size * size) / data.pushes[bench.push.name].most, 0.05 * data.size, 0.03 * data.size);
 }
 
-/* Pulls each tool off its surface for a moment, harder than it presses. */
-const PULL = 0.15;
+/* Loses each contact: a surface of compliant contact goes away, and comes back slowly when its
+   phase has ended; else the tool is pulled off for a moment, harder than it presses. */
+const PULL = 0.15, GONE = 0.6, AWAY = 0.15; /* s, s, m */
 function lose() {
+  const { time, place } = bench.samples.at(-1);
+  const ways = data.surfaces.filter(({ direction, controls }) => direction && controls.some(is_slow));
+  for (const { direction, controls } of ways) {
+    controls.forEach((control, axis) => {
+      const [input] = data.controls[control].inputs;
+      panel.give(input, panel.present[input] - AWAY * direction[axis], "surface");
+    });
+  }
+  if (ways.length) bench.gone = { until: time + GONE, place };
+  else pull();
+}
+const is_slow = (control) => control !== null && data.controls[control].rate > 0;
+function pull() {
   const { scene, time } = bench.samples.at(-1), at = View.places();
   data.constraints.forEach(({ link }, k) => {
     const force = vector(scene, at.forces + 3 * k), size = force.length();
@@ -86,11 +100,38 @@ function let_go() {
   bench.pulled = bench.pulled.filter((one) => !isOver(one));
 }
 
+/* Ends the phase of a task. What was given is taken back when the next phase has begun. */
+function next() {
+  const { place } = bench.samples.at(-1), input = data.phases[place];
+  bench.said = "";
+  if (place >= data.phases.length) bench.said = "the task is over";
+  else if (input === null) bench.said = "this phase makes or breaks the contact, and ends by itself";
+  else {
+    panel.give(input, 1, "signal");
+    bench.ended = { input, place };
+  }
+  bench.fresh = true;
+}
+function take_back() {
+  if (bench.samples.at(-1).place === bench.ended.place) return;
+  panel.give(bench.ended.input, 0, "signal");
+  bench.ended = null;
+}
+
 /* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
   if (bench.failure) return;
   if (bench.push) follow_push();
   if (bench.pulled.length) let_go();
+  if (bench.ended) take_back();
+  const now = bench.samples.at(-1);
+  if (bench.gone && (now.time >= bench.gone.until || now.place !== bench.gone.place)) bench.gone = null;
+  /* What moves at a limited speed has a new place at each tick. */
+  for (; !bench.gone && panel.moves(data.tick) && ticks > 1; ticks--) await one(1);
+  await one(ticks);
+}
+async function one(ticks) {
+  if (bench.failure) return;
   try {
     (await engine.advance(ticks)).forEach(taken);
   } catch (error) {
@@ -103,25 +144,32 @@ function draw() {
   const last = bench.samples.at(-1);
   view.show(last);
   const chosen = Number(element("signal").value);
+  const desired = { value: ({ r }) => r[chosen], color: DESIRED, dashed: true };
   plots.signal.draw(bench.samples, [
-    { value: ({ z }) => z[chosen], color: COLORS[1] },
-    { value: ({ r }) => r[chosen], color: DESIRED, dashed: true },
-  ], [["actual", COLORS[1], false], ["desired", DESIRED, true]]);
+    { value: ({ z }) => z[chosen], color: COLORS[1] }, ...(data.compares ? [desired] : []),
+  ], data.compares ? [["actual", COLORS[1], false], ["desired", DESIRED, true]] : []);
   const errors = element("error").value.split(",").map(Number);
-  const legend = [["error", COLORS[0], false]];
-  if (prediction) legend.push(["predicted", PREDICTED, true]);
-  plots.error.draw(bench.samples, errors.flatMap((i, k) => [
-    { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
-    ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
-  ]), legend);
+  if (data.compares) draw_errors(errors);
+  else plots.error.draw(bench.samples, errors.map((i) => ({ value: ({ z }) => z[i], color: COLORS[0] })), []);
   const slow = bench.isRunning && bench.speed < 0.95 ? `, runs at ${bench.speed.toFixed(2)} of that` : "";
   const rate = RATES[bench.rate] === 1 ? "real time" : `${RATES[bench.rate]} x real time`;
   element("clock").textContent = `t = ${last.time.toFixed(2)} s, ${rate}${slow}` +
     (last.phase ? `, ${last.phase}` : "") +
     (prediction ? `; error off prediction by ${bench.off.toExponential(1)}` : "");
-  element("state").textContent = bench.failure;
+  element("state").textContent = bench.failure || bench.said;
   element("state").className = bench.failure ? "wrong" : "";
   element("run").textContent = bench.isRunning ? "pause" : "run";
+}
+
+/* Errors over the predicted ones; they are round-off beside the outputs themselves. */
+function draw_errors(chosen) {
+  const legend = [["error", COLORS[0], false]];
+  if (prediction) legend.push(["predicted", PREDICTED, true]);
+  const sizes = bench.samples.flatMap(({ z, r }) => chosen.flatMap((i) => [z[i], r[i]]));
+  plots.error.draw(bench.samples, chosen.flatMap((i, k) => [
+    { value: ({ error }) => error[i], color: COLORS[k % COLORS.length] },
+    ...(prediction ? [{ value: ({ predicted }) => predicted[i], color: PREDICTED, dashed: true }] : []),
+  ]), legend, sizes.reduce((most, size) => Math.max(most, Math.abs(size ?? 0)), 0));
 }
 
 /* Sticks of a gamepad move the target along its axes; the last axis changes the first force. */
@@ -172,7 +220,7 @@ async function picture(now) {
 async function restart() {
   panel.reset();
   pushed(null);
-  Object.assign(bench, { pulled: [], samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
+  Object.assign(bench, { pulled: [], gone: null, ended: null, said: "", samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
   taken(await engine.start());
 }
 const change_rate = (by) => {
@@ -184,6 +232,7 @@ const act = {
   step: () => (bench.isRunning = false, bench.failure || advance(1)),
   slower: () => change_rate(-1),
   faster: () => change_rate(1),
+  next,
   lose,
   restart,
   async save() {
@@ -193,16 +242,25 @@ const act = {
 for (const [name, action] of Object.entries(act)) element(name).addEventListener("click", action);
 
 element("lose").hidden = !data.opens;
+element("next").hidden = !data.phases.length;
 element("title").textContent = data.title;
 data.outputs.forEach(({ name, unit }, i) => element("signal").append(new Option(unit ? `${name} [${unit}]` : name, i)));
-const units = [...new Set(data.outputs.map(({ unit }) => unit))];
+const units = data.compares ? [...new Set(data.outputs.map(({ unit }) => unit))] : [];
 for (const unit of units) {
   const own = data.outputs.flatMap((output, i) => (output.unit === unit ? [i] : []));
   element("error").append(new Option(`errors${unit ? ` [${unit}]` : " without unit"}`, own.join()));
 }
-data.outputs.forEach(({ name }, i) => element("error").append(new Option(`error of ${name}`, i)));
+data.outputs.forEach(({ name, unit }, i) => {
+  const text = data.compares ? `error of ${name}` : unit ? `${name} [${unit}]` : name;
+  element("error").append(new Option(text, i));
+});
 const force = data.outputs.findIndex(({ unit }) => unit === "N");
 element("signal").value = Math.max(force, 0);
+if (!data.compares) {
+  element("error").value = data.outputs.length > 1 ? (force === 1 ? 0 : 1) : 0;
+  element("error").setAttribute("aria-label", "second output to plot");
+}
+document.body.classList.toggle("bench-without-view", !data.bodies.length && !data.constraints.length);
 for (const name of ["signal", "error"]) element(name).addEventListener("change", () => (bench.fresh = true));
 viewer.gui.domElement.style.display = "none";
 new Drag(view, panel, pushed);

@@ -5,12 +5,12 @@ async function makeEngine() {
   let tick = 0, log = [];
 
   function sample() {
-    const { controlled_output: z, reference } = loop.outputs;
+    const { reference } = loop.outputs;
     const shown = Array.from(loop.view("shown", 0, sizes.scene + sizes.coordinates));
     return {
       time: loop.time,
-      z: Array.from(z),
-      r: data.outputs.map(({ lowest }) => reference[lowest]),
+      z: data.plotted.flatMap((name) => Array.from(loop.outputs[name])),
+      r: data.outputs.map(({ lowest }) => (data.compares ? reference[lowest] : null)),
       scene: shown.slice(0, sizes.scene),
       coordinates: shown.slice(sizes.scene),
     };
@@ -23,7 +23,7 @@ async function makeEngine() {
       return sample();
     },
     set(input, value) {
-      loop.view("parameters", data.places[input], 1)[0] = value;
+      for (const place of data.places[input]) loop.view("parameters", place, 1)[0] = value;
       log.push([tick, data.inputs[input].name, value]);
     },
     /* Samples after each of some ticks. */

@@ -3,6 +3,8 @@ const GROUPS = [
   ["reference", "References", true],
   ["surface", "Surfaces", false],
   ["signal", "Signals that the task waits for", true],
+  ["input", "Inputs", true],
+  ["parameter", "Parameters", true],
   ["plant", "Plant", true],
   ["pole", "Law", true],
 ];
@@ -15,8 +17,12 @@ class Panel {
     for (const [kind, title, isOpen] of GROUPS) this.group(kind, title, isOpen);
     this.rest();
     for (const note of data.notes) this.note(note);
-    this.note("Drag the green ball (target) or the orange one (surface); pull a link to push it; " +
-      "drag elsewhere to turn the view.");
+    const balls = [data.targets.some(({ axes }) => axes.length) && "the green ball (target)",
+      data.surfaces.length && "the orange one (surface)"].filter(Boolean);
+    const says = [balls.length && `drag ${balls.join(" or ")}`,
+      data.bodies.some(({ name }) => name in data.pushes) && "pull a link to push it", data.bodies.length && "drag elsewhere to turn the view"];
+    const said = says.filter(Boolean).join("; ");
+    if (said) this.note(`${said[0].toUpperCase()}${said.slice(1)}.`);
   }
   group(kind, title, isOpen) {
     const chosen = data.controls.map((control, i) => [control, i])
@@ -92,6 +98,22 @@ class Panel {
     const control = data.controls[i], row = this.rows[i];
     row.value = Math.min(Math.max(wanted, control.low), control.high);
     this.show(i);
+    if (!control.rate) this.pass(i);
+  }
+  /* Moves what has a limited speed for a time in s; whether there was any. */
+  moves(seconds) {
+    let found = false;
+    data.controls.forEach(({ rate, inputs: [input] }, i) => {
+      const off = rate ? this.rows[i].value - this.present[input] : 0;
+      if (!off) return;
+      const step = Math.sign(off) * Math.min(Math.abs(off), rate * seconds);
+      this.give(input, step === off ? this.rows[i].value : this.present[input] + step, "surface");
+      found = true;
+    });
+    return found;
+  }
+  pass(i) {
+    const control = data.controls[i], row = this.rows[i];
     control.inputs.forEach((input, k) => {
       const { factors, powers } = control;
       const value = factors.length ? factors[k] * Math.abs(row.value) ** powers[k] : row.value;

@@ -1,13 +1,14 @@
 /* Curves over the last seconds on a canvas. */
 const SECONDS = 8;
+const ROUND_OFF = 1e-12; /* Less than this part of what is compared is no error of a loop. */
 const COLORS = ["#1a5fb4", "#c01c28", "#8833bb", "#9c6a00", "#0a7d6c", "#555"];
 
 class Plot {
   constructor(canvas) {
     this.canvas = canvas;
   }
-  /* curves: [{ value: sample -> number, color, dashed }]. */
-  draw(samples, curves, legend) {
+  /* curves: [{ value: sample -> number, color, dashed }]; size: of what rounds their values. */
+  draw(samples, curves, legend, size = 0) {
     const { canvas } = this;
     const ratio = window.devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -27,7 +28,9 @@ class Plot {
     }
     if (low > high) return;
     const least = Math.max(1e-12, 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
+    const rounds = ROUND_OFF * size, is_round_off = Math.max(Math.abs(low), Math.abs(high)) <= rounds;
     if (high - low < least) [low, high] = [low - least, high + least];
+    if (is_round_off) [low, high] = [-rounds, rounds];
     const [left, right, top, bottom] = [58, width - 8, 30, height - 18];
     const last = samples.at(-1).time, first = Math.max(samples[0].time, last - SECONDS);
     const span = Math.max(last - first, 1e-3);
@@ -39,12 +42,13 @@ class Plot {
     pen.lineWidth = 1;
     pen.textAlign = "right";
     for (const part of [0, 0.5, 1]) {
-      const value = low + part * (high - low);
+      const between = low + part * (high - low);
+      const value = Math.abs(between) < 1e-3 * (high - low) ? 0 : between;
       pen.beginPath();
       pen.moveTo(left, y(value));
       pen.lineTo(right, y(value));
       pen.stroke();
-      pen.fillText(short(value), left - 4, y(value) + 4);
+      pen.fillText(tick(value, high - low), left - 4, y(value) + 4);
     }
     pen.textAlign = "center";
     for (let t = Math.ceil(first); t <= last; t++) pen.fillText(`${t} s`, x(t), height - 5);
@@ -72,7 +76,19 @@ class Plot {
       pen.stroke();
     });
     pen.setLineDash([]);
+    if (is_round_off) {
+      pen.fillStyle = "#667";
+      pen.fillText(`round-off: below ${ROUND_OFF} of the outputs`, left + 4, bottom - 4);
+    }
   }
+}
+
+/* A number at an axis of some length: with digits that tell it from its neighbours. */
+function tick(value, length) {
+  const size = Math.abs(value);
+  if (!size || size < 1e-3 || size >= 1e4) return short(value);
+  const digits = Math.min(Math.max(3, 2 + Math.ceil(Math.log10(size / length))), 9);
+  return String(Number(value.toPrecision(digits)));
 }
 
 /* A number with three digits. */

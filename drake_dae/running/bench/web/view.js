@@ -17,6 +17,10 @@ class View {
     viewer.scene.add(this.push);
     new ResizeObserver(() => {
       viewer.set_3d_pane_size();
+      /* The camera stands for a pane of 4 to 3; one that is narrower shows as much of the robot. */
+      const { camera, dom_element: pane } = viewer;
+      camera.zoom = Math.min(1, (0.7 * pane.clientWidth) / Math.max(pane.clientHeight, 1));
+      camera.updateProjectionMatrix();
       viewer.set_dirty();
     }).observe(viewer.dom_element);
   }
@@ -110,10 +114,13 @@ class View {
       const foot = this.on_screen(vector(scene, at.points + 3 * k)) ?? place;
       let left = place[0] < foot[0] ? place[0] - label.offsetWidth - 12 : place[0] + 12;
       let top = place[1] + (place[1] < foot[1] ? -30 : 10);
-      while (taken.some(([x, y]) => Math.abs(x - left) < 120 && Math.abs(y - top) < 18)) top += 18;
-      taken.push([left, top]);
+      const lowest = box.bottom - label.offsetHeight;
       left = Math.min(Math.max(left, box.left), box.right - label.offsetWidth - 2);
-      top = Math.min(Math.max(top, box.top), box.bottom - label.offsetHeight);
+      top = Math.min(Math.max(top, box.top), lowest);
+      const covers = ([x, y]) => Math.abs(x - left) < 120 && Math.abs(y - top) < 18;
+      const step = top + 18 * data.constraints.length > lowest ? -18 : 18;
+      while (taken.some(covers)) top += step;
+      taken.push([left, top]);
       label.style.left = `${left}px`;
       label.style.top = `${top}px`;
     });

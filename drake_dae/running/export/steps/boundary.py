@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from drake_dae.compiler.compile import compile_diagram, compile_part
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -136,6 +136,24 @@ def loop_part(
         compiled, signals = program.compiled, program.signals
     _check_time(compiled, "the loop")
     return _part(compiled, {name: tuple(each) for name, each in signals.items()})
+
+
+def diagram_part(
+    diagram: Diagram, context: Context, outputs: Mapping[str, OutputPort]
+) -> ExportedPart:
+    """All that leads to some output ports in a diagram, which may be those of its blocks.
+
+    Args:
+        diagram: The diagram.
+        context: Its context, in which inputs without a wire have values.
+        outputs: Name -> an output port in it.
+
+    Raises:
+        ModelError: A block cannot be traced, or it changes as no function of the time does: why.
+    """
+    compiled = compile_part(diagram, {}, outputs, context)
+    _check_time(compiled, "the diagram")
+    return _part(compiled, {})
 
 
 def _part(

@@ -91,7 +91,7 @@ class GeneratedFunctions:
         cls, compiled: CompiledDiagram, keys: Sequence[str], held: FloatArray, prefix: str
     ) -> Self:
         """Chooses functions by their keys, all updates, and "begin" if the part has it."""
-        functions, begin = compiled.staged, compiled.begin(held)
+        functions, begin = compiled.staged, compiled.initialization(held)
         chosen = {key: functions[key] for key in keys}
         chosen |= {key: f for key, f in functions.items() if key.startswith("update")}
         return cls(prefix, chosen if begin is None else chosen | {"begin": begin})
@@ -190,7 +190,7 @@ def parameter_signals(compiled: CompiledDiagram) -> list[Signal]:
         signals[part] = parameters_of_block(system, part.stop - part.start)
     for system, name, part in compiled.fixed:
         count = part.stop - part.start
-        signals[part] = [Signal(f"{system.get_name()}.{name}[{i}]") for i in range(count)]
+        signals[part] = [Signal(f"{block_name(system)}.{name}[{i}]") for i in range(count)]
     return distinct(signals)
 
 
@@ -200,9 +200,17 @@ def parameters_of_block(system: System, count: int) -> list[Signal]:
     own = list(getattr(system, "commands", ()))
     if dae is not None:
         own = parameter_names(dae, law)
+        further = dict(getattr(system, "further_parameters", {}).values())
+        places = {place: signal for signal, place in further.items()}
+        own += [places.get(i, Signal(f"parameter[{i}]")) for i in range(len(own), count)]
     if len(own) != count:
         own = [Signal(f"parameter[{i}]") for i in range(count)]
-    return [Signal(f"{system.get_name()}.{s.name}", s.unit) for s in own]
+    return [Signal(f"{block_name(system)}.{s.name}", s.unit) for s in own]
+
+
+def block_name(system: System) -> str:
+    """The name of a block, the same in every process: of one without a name its class."""
+    return system.get_name().partition("@")[0].rpartition("/")[2]
 
 
 def distinct(signals: Sequence[Signal]) -> list[Signal]:

@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.running.export.pieces import in_pieces
 from drake_dae.running.export.steps.controller import write_controller
 from drake_dae.running.export.steps.integrated import write_integrated
 from drake_dae.running.export.steps.parts import (
@@ -128,6 +129,9 @@ def write_module(
     (module,) = written(TEMPLATES, folder, {"module.mjs": f"{file}.mjs"}, words)
     target = module.with_suffix(".wasm")
     target.unlink(missing_ok=True)
+    for path in sources:
+        text = path.read_text(encoding="utf-8")
+        path.write_text(in_pieces(text), encoding="utf-8")
     compile_webassembly([source, *sources], target)
     return [target, module, source]
 

@@ -12,7 +12,7 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
 from drake_dae.running.rollout.stepping.fused import DiagramFunctions, GuardInputs
 from drake_dae.running.rollout.stepping.many import BLOCK, VectorizedFunction
-from drake_dae.systems.blocks.trials import SLOWEST, STEPS
+from drake_dae.systems.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 
 REACHED = 1e-11
 """A Newton step longer than this, the second, says that N* was not reached in two."""
@@ -220,9 +220,9 @@ class RunStepper:
         self.time, self.state = time, state
         self.steps += 1
         self.trial_time = np.inf
-        if self.steps % STEPS == 0:
+        if self.steps % PACE_STEPS == 0:
             self.before, self.mark = self.mark, time
-            if time - self.before < SLOWEST * (time - self.problem.times[0]):
+            if time - self.before < LEAST_PROGRESS * (time - self.problem.times[0]):
                 raise RunEnded(RunEnding.SLOW)
 
     def write(self, time: float, state: FloatArray) -> None:

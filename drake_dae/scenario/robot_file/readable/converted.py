@@ -1,7 +1,8 @@
-"""Meshes that Drake neither reads nor draws everywhere, converted by the optional package trimesh.
+"""Converts meshes that Drake cannot read, or not draw everywhere, by the optional package trimesh.
 
-Drake's films draw .obj and .gltf, and its Meshcat .dae as well. So a .dae becomes a .gltf, with the
-colors and textures of its vendor, and others an .obj, which has the color of the robot's file.
+Drake's renderer draws .obj and .gltf; its Meshcat draws .dae as well. So a .dae is converted to a
+.gltf, with its own colors and textures, and any other mesh to an .obj, which gets the color that
+the robot's file states.
 """
 
 import re
@@ -21,13 +22,13 @@ ORIGINALS: dict[Path, Path] = {}
 """A converted mesh -> its original."""
 
 _UPWARD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From z upward to y upward, as a .gltf has it."""
+"""The transformation from z upward to y upward, the convention of .gltf."""
 
 _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([-+.0-9eE]+)")
 
 
 def as_obj(mesh: Path) -> Path | None:
-    """The mesh as an .obj in the same unit, in a file that lasts as long as this process.
+    """Converts a mesh to an .obj in the same unit, in a file that is removed when Python exits.
 
     Returns:
         The file; None if the mesh cannot be read, or trimesh is not installed.
@@ -36,9 +37,9 @@ def as_obj(mesh: Path) -> Path | None:
 
 
 def as_gltf(mesh: Path) -> Path | None:
-    """A .dae as a .gltf in m with its colors, in a file that lasts as long as this process.
+    """Converts a .dae to a .gltf in m with its colors, in a file that is removed at exit.
 
-    As in ROS, its unit counts, and the axis that it calls upward does not.
+    As in ROS, the unit in the file is used, and the upward axis in the file is ignored.
 
     Returns:
         The file; None if the mesh cannot be read, or trimesh or pycollada is not installed.
@@ -48,10 +49,10 @@ def as_gltf(mesh: Path) -> Path | None:
 
 def _copy(mesh: Path, kind: str) -> Path | None:
     try:
-        found = mesh.resolve().stat()
+        status = mesh.resolve().stat()
     except (OSError, ValueError):
         return None
-    return _converted(mesh.resolve(), kind, found.st_mtime_ns, found.st_size)
+    return _converted(mesh.resolve(), kind, status.st_mtime_ns, status.st_size)
 
 
 @cache
@@ -68,7 +69,7 @@ def _converted(mesh: Path, kind: str, changed: int, size: int) -> Path | None:
 
 
 def _obj(mesh: Path) -> bytes:
-    """A mesh with a normal for each triangle, since Drake's films need some."""
+    """The text of an .obj, with the normal of each triangle, which Drake's renderer needs."""
     vertices, triangles = read_mesh(mesh)
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

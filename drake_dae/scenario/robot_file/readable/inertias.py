@@ -6,7 +6,7 @@ in the Frobenius norm has the same axes, and the s >= 0 for which d is nearest.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,18 +16,19 @@ from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.markup import blank, parsed
 
 _INERTIAL = re.compile(r"<inertial\b[^>]*?(?:/>|>.*?</inertial\s*>)", re.DOTALL)
 _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 _LEAST = 1e-9
-"""The least second moment relative to their sum, so that none is negative by round-off."""
+"""The least second moment relative to the sum of all, so that none is negative by round-off."""
 
 
 @dataclass(frozen=True)
 class RepairedInertia:
-    """A physically impossible inertia.
+    """A physically impossible inertia and the nearest possible one.
 
     Attributes:
         owner: The file with the line, and the link or body.
@@ -63,66 +64,47 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
 
 
 def possible_inertias(text: str, file: Path) -> tuple[str, list[RepairedInertia]]:
-    """A file's text with possible inertias, line by line as before, and the changed inertias.
+    """Replaces impossible inertias in a text by the nearest possible ones; lines stay the same.
 
     Args:
-        text: A URDF, SDFormat or MJCF file without comments.
-        file: Its suffix determines which.
+        text: The text of a URDF, SDFormat or MJCF file without comments.
+        file: The file; its suffix determines the format.
+
+    Returns:
+        The text, and the replaced inertias.
 
     Raises:
-        ModelError: A mass is negative, or there is no possible inertia near one.
+        ModelError: A mass is negative, or no possible inertia is near one.
     """
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return text, []  # The error is left to Drake.
-    form = _FORMS[file.suffix]
-    found = list(_inertials(root))
+    root, form = parsed(text), _FORMS[file.suffix]
+    inertials = root.iter("inertial")
+    parents = {child: parent for parent in root.iter() for child in parent.iterfind("inertial")}
     repaired: list[RepairedInertia] = []
 
-    def kept(block: re.Match[str]) -> str:
-        owner, element = next(places, ("", None))
-        read = None if element is None else form.read(element)
-        if read is None:
+    def possible(block: re.Match[str]) -> str:
+        element = next(inertials, None)
+        mass_and_inertia = None if element is None else form.read(element)
+        if element is None or mass_and_inertia is None:
             return block[0]
-        mass, inertia = read
-        if not np.all(np.isfinite([mass, *inertia.flat])):
-            return block[0]  # The error is left to Drake.
-        line = text.count("\n", 0, block.start()) + 1
-        place = f"{file}:{line}"
+        mass, inertia = mass_and_inertia
+        parent, line = parents[element], text.count("\n", 0, block.start()) + 1
+        owner = f"{file}:{line}: {parent.tag} '{parent.get('name', '')}'"
         if mass < 0.0:
-            raise ModelError(f"{place}: {owner}: a mass is positive, got {mass:g} kg")
+            raise ModelError(f"{owner}: a mass is positive, got {mass:g} kg")
         if _is_possible(mass, inertia):
             return block[0]
         nearest = nearest_inertia(inertia) if mass > 0.0 else np.zeros((3, 3))
+        before, after = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
         if mass > 0.0 and not np.trace(nearest) > 0.0:
             raise ModelError(
-                f"{place}: {owner}: the moments of inertia are "
-                f"{np.linalg.eigvalsh(inertia)} kg m^2, and near these is none that a body of "
-                f"{mass:g} kg can have; mend them"
+                f"{owner}: the moments of inertia are {before} kg m^2, and near these is none that "
+                f"a body of {mass:g} kg can have; mend them"
             )
-        repaired.append(_repaired(f"{place}: {owner}", inertia, nearest))
+        change = float(np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia))
+        repaired.append(RepairedInertia(owner, tuple(before), tuple(after), change))
         return form.write(block[0], nearest)
 
-    places = iter(found)
-    return _INERTIAL.sub(kept, text), repaired
-
-
-def _inertials(root: ElementTree.Element) -> Iterator[tuple[str, ElementTree.Element]]:
-    """Each inertial with its owner, in the order of the file."""
-    owners = {
-        inertial: f"{parent.tag} '{parent.get('name', '')}'"
-        for parent in root.iter()
-        for inertial in parent.iterfind("inertial")
-    }
-    for inertial in root.iter("inertial"):
-        yield owners[inertial], inertial
-
-
-def _repaired(owner: str, inertia: FloatArray, nearest: FloatArray) -> RepairedInertia:
-    was, now = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
-    change = np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia)
-    return RepairedInertia(owner, tuple(was), tuple(now), float(change))
+    return _INERTIAL.sub(possible, text), repaired
 
 
 def _is_possible(mass: float, inertia: FloatArray) -> bool:
@@ -130,27 +112,19 @@ def _is_possible(mass: float, inertia: FloatArray) -> bool:
     if mass == 0.0:
         return not np.any(inertia)
     try:
-        entries = [float(inertia[place]) for place in _PLACES]
+        entries = [float(inertia[i, j]) for i, j in _PLACES]
         return bool(RotationalInertia(*entries).CouldBePhysicallyValid())
     except RuntimeError:
         return False
 
 
-def _matrix(entries: Sequence[float]) -> FloatArray:
-    """The matrix of (xx, yy, zz, xy, xz, yz)."""
-    matrix = np.zeros((3, 3))
-    for (i, j), entry in zip(_PLACES, entries, strict=True):
-        matrix[i, j] = matrix[j, i] = entry
-    return matrix
-
-
 _Read = tuple[float, FloatArray] | None
-"""Mass in kg and inertia in kg m^2 about the centre of mass; None if missing."""
+"""Mass in kg and inertia in kg m^2 about the centre of mass; None if missing or malformed."""
 
 
 @dataclass(frozen=True)
 class _InertiaForm:
-    """The way in which a kind of file writes an inertia."""
+    """How a format writes an inertia: functions that read and that replace it."""
 
     read: Callable[[ElementTree.Element], _Read]
     write: Callable[[str, FloatArray], str]
@@ -172,8 +146,7 @@ def _read_sdf(inertial: ElementTree.Element) -> _Read:
     inertia = inertial.find("inertia")
     if inertia is None:
         return None
-    defaults = (*("1",) * 3, *("0",) * 3)
-    entries = [inertia.findtext(key, one) for key, one in zip(_ENTRIES, defaults, strict=True)]
+    entries = [inertia.findtext(key, "10"[i > 2]) for i, key in enumerate(_ENTRIES)]
     return _numbers(inertial.findtext("mass", "1"), entries)
 
 
@@ -197,10 +170,15 @@ def _write_mjcf(block: str, inertia: FloatArray) -> str:
 
 
 def _numbers(mass: str, entries: Sequence[str]) -> _Read:
+    """The numbers of these texts; None if some are no finite numbers, which Drake reports."""
     try:
-        return float(mass), _matrix([float(entry) for entry in entries])
+        numbers = [float(mass), *map(float, entries)]
     except ValueError:
-        return None  # The error is left to Drake.
+        return None
+    inertia = np.zeros((3, 3))
+    for (i, j), entry in zip(_PLACES, numbers[1:], strict=True):
+        inertia[i, j] = inertia[j, i] = entry
+    return (numbers[0], inertia) if np.all(np.isfinite(numbers)) else None
 
 
 def _entries(inertia: FloatArray) -> Mapping[str, str]:
@@ -209,7 +187,7 @@ def _entries(inertia: FloatArray) -> Mapping[str, str]:
 
 def _replaced(block: str, pattern: str, text: str) -> str:
     """A block with the matches of a pattern replaced, with the same number of lines."""
-    return re.sub(pattern, lambda found: text + "\n" * found[0].count("\n"), block, flags=re.DOTALL)
+    return re.sub(pattern, lambda match: text + blank(match), block, flags=re.DOTALL)
 
 
 _FORMS = {

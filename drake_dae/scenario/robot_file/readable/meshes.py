@@ -1,8 +1,7 @@
-"""A robot's files made readable for Drake: without some meshes, with possible inertias.
+"""Copies of a robot's files that Drake can read: without some meshes, with possible inertias.
 
-Vendors use .stl or .dae for collision geometry, which a MultibodyPlant with a SceneGraph refuses,
-and MJCF uses .stl for all meshes. The equations need no meshes: the readable ones are read and
-drawn.
+Vendors use .stl or .dae for collision geometry, which a MultibodyPlant with a SceneGraph rejects,
+and MJCF uses .stl for all meshes. The equations need no meshes, so unreadable meshes are left out.
 """
 
 import re
@@ -22,6 +21,7 @@ from pydrake.multibody.parsing import (
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file.readable.converted import as_gltf, as_obj
 from drake_dae.scenario.robot_file.readable.inertias import RepairedInertia, possible_inertias
+from drake_dae.scenario.robot_file.readable.markup import blank, without_comments
 from drake_dae.scenario.robot_file.readable.mjcf import without_assets
 from drake_dae.scenario.robot_file.readable.placing import (
     FloatingJoint,
@@ -29,37 +29,36 @@ from drake_dae.scenario.robot_file.readable.placing import (
     released,
     world_links,
 )
-from drake_dae.scenario.robot_file.readable.urdf import as_meant, blank
+from drake_dae.scenario.robot_file.readable.urdf import as_meant
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
 _FILE = {
     ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
 }
-"""Per kind of file: the text before a mesh's name, the name, and the text after it."""
+"""Suffix of a file -> pattern of the text before a file's name, the name, and the text after it."""
 
 _MESH = {
     ".urdf": re.compile(r"(<mesh\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<mesh\b[^>]*>(?:(?!</mesh).)*?<uri>\s*)([^<]*?)(\s*</uri>)", re.DOTALL),
 }
-"""The same, for meshes only."""
+"""Suffix of a file -> the same pattern, for meshes only."""
 
 DRAWN = (".obj", ".gltf", ".dae")
-"""The kinds of mesh that Drake's Meshcat draws; its films draw the first two."""
+"""The kinds of mesh that Drake's Meshcat draws; its renderer draws the first two."""
 
 
 @dataclass(frozen=True)
 class ReadableCopies:
-    """Copies of the user's files that Drake reads instead.
+    """Copies of the user's files, which Drake reads instead of these.
 
     Attributes:
         leave_out: The key `leave_out` of the scenario.
         placed: The links that the scenario welds or makes free, "base" or "left::base".
         originals: A copy -> its original, with the same lines.
         left_out: The omitted meshes.
-        repaired: The impossible inertias.
-        floating: Model instance, or "", -> the floating joints of its file.
+        repaired: The replaced inertias.
+        floating: Model instance, or "" for a single file -> its floating joints.
     """
 
     leave_out: Collection[str]
@@ -70,7 +69,7 @@ class ReadableCopies:
     floating: dict[str, list[FloatingJoint]] = field(default_factory=dict)
 
     def named(self, text: str) -> str:
-        """A message of Drake's parser, with the names of the user's files."""
+        """Replaces the names of copies in a message of Drake's parser by those of the originals."""
         for copy, original in self.originals.items():
             text = text.replace(str(copy), str(original))
         return text
@@ -83,20 +82,20 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: ReadableCopies)
         file: A file that Drake's Parser reads.
         parser: A parser with the packages, for the plant.
         folder: An empty folder for the copies.
-        copies: An empty one; the copies are added, also if the files are refused afterwards.
+        copies: The record of copies, empty; it is filled, also if Drake rejects the files.
 
     Returns:
-        The file of each model instance of the directives, or the file itself under "".
+        Model instance of the directives -> its file, or "" -> the file itself.
 
     Raises:
-        ModelError: A body has its mass from a mesh that Drake cannot read.
-        RuntimeError: Drake refuses the files; the message names copies.
+        ModelError: The mass of a body is computed from a mesh that Drake cannot read.
+        RuntimeError: Drake rejects the files; the message names copies.
     """
     packages = parser.package_map()
     has_geometry = parser.plant().geometry_source_is_registered()
     if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
-        own, _ = _readable(file, packages, folder, copies, has_geometry, "", copies.placed)
-        parser.AddModels(str(own))
+        copy, _ = _readable(file, packages, folder, copies, has_geometry, "", copies.placed)
+        parser.AddModels(str(copy))
         return {"": file}
     directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
     welds = (directive.add_weld for directive in directives.directives)
@@ -108,17 +107,18 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: ReadableCopies)
             name = directive.add_model.name
             models[name] = model = Path(packages.ResolveUrl(directive.add_model.file))
             links = [link.removeprefix(f"{name}::") for link in placed]
-            own, held = _readable(model, packages, folder, copies, has_geometry, name, links)
-            if own != model:
-                directive.add_model.file = own.as_uri()
-            if held and model in standing:
+            copy, fixed = _readable(model, packages, folder, copies, has_geometry, name, links)
+            if copy != model:
+                directive.add_model.file = copy.as_uri()
+            if fixed and model in standing:
                 raise ModelError(
                     f"models '{standing[model]}' and '{name}' stand in one place: '{model.name}' "
-                    f"fixes its link '{held[0]}' to the world. Say where another one stands by "
-                    f"add_weld: {{parent: world, child: {name}::{held[0]}, X_PC: ...}}, in the "
+                    f"fixes its link '{fixed[0]}' to the world. Say where another one stands by "
+                    f"add_weld: {{parent: world, child: {name}::{fixed[0]}, X_PC: ...}}, in the "
                     "place of the joint in the file"
                 )
-            standing.update({model: name} if held else {})
+            if fixed:
+                standing[model] = name
     if copies.originals:
         ProcessModelDirectives(directives, parser)
     else:
@@ -135,12 +135,12 @@ def _readable(
     instance: str,
     placed: Collection[str],
 ) -> tuple[Path, list[str]]:
-    """The file or a readable copy, and the links that it fixes to the world."""
+    """The file or its readable copy, and the links that it fixes to the world."""
     if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
         return file, []
-    plain = _COMMENT.sub(blank, file.read_text("utf-8", errors="replace"))
+    plain = without_comments(file.read_text("utf-8", errors="replace"))
     text = released(plain, file, placed)
-    held = world_links(text, file)
+    fixed = world_links(text, file)
     text, floating = floating_joints(text, file)
     copies.floating[instance] = [joint for joint in floating if joint.child not in placed]
     if file.suffix == ".urdf":
@@ -154,7 +154,7 @@ def _readable(
         text, left_out = _without_collisions(text, file, packages)
         text = _with_visuals(text, file, packages)
     if text == plain:
-        return file, held
+        return file, fixed
     if not _is_mjcf(file):
         text = _with_absolute_names(text, file)
     copies.left_out.extend(left_out)
@@ -162,7 +162,7 @@ def _readable(
     copy.parent.mkdir()
     copy.write_text(text, "utf-8")
     copies.originals[copy] = file
-    return copy, held
+    return copy, fixed
 
 
 def _is_mjcf(file: Path) -> bool:
@@ -173,24 +173,24 @@ def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[st
     """A URDF or SDFormat file without its unreadable collision meshes, and these meshes."""
     name, left_out = _FILE[file.suffix], []
 
-    def kept(collision: re.Match[str]) -> str:
-        meshes = [_resolved(found[2], file, packages) for found in name.finditer(collision[0])]
+    def without_refused(collision: re.Match[str]) -> str:
+        meshes = [_resolved(match[2], file, packages) for match in name.finditer(collision[0])]
         refused = [mesh for mesh in meshes if mesh is not None and _is_refused(mesh)]
         left_out.extend(refused)
         return blank(collision) if refused else collision[0]
 
-    return _COLLISION.sub(kept, text), left_out
+    return _COLLISION.sub(without_refused, text), left_out
 
 
 def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
     """Replaces meshes that cannot be drawn everywhere by drawable copies, if there are any."""
 
-    def drawn(found: re.Match[str]) -> str:
-        mesh = _resolved(found[2], file, packages)
+    def drawn(match: re.Match[str]) -> str:
+        mesh = _resolved(match[2], file, packages)
         if mesh is None or mesh.suffix.lower() in DRAWN[:2]:
-            return found[0]
+            return match[0]
         copy = as_gltf(mesh) if mesh.suffix.lower() == ".dae" else as_obj(mesh)
-        return found[0] if copy is None else f"{found[1]}{copy}{found[3]}"
+        return match[0] if copy is None else f"{match[1]}{copy}{match[3]}"
 
     return _MESH[file.suffix].sub(drawn, text)
 
@@ -198,7 +198,7 @@ def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
 def _with_absolute_names(text: str, file: Path) -> str:
     """Makes names absolute, since the copy is in another folder."""
     name = _FILE[file.suffix]
-    return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text)
+    return name.sub(lambda match: match[1] + _absolute(match[2], file) + match[3], text)
 
 
 def _absolute(name: str, file: Path) -> str:
@@ -206,7 +206,7 @@ def _absolute(name: str, file: Path) -> str:
 
 
 def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
-    """The path of a mesh; None if there is none, for which Drake's message is better."""
+    """The path of a mesh; None if its package is unknown, which Drake reports."""
     name = _absolute(name, file)
     try:
         return Path(packages.ResolveUrl(name) if "://" in name else name)

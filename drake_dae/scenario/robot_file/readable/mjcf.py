@@ -1,4 +1,4 @@
-"""An MJCF file made readable for Drake: meshes as .obj, and bodies of mass 0."""
+"""Changes an MJCF file so that Drake can read it: meshes as .obj, and bodies of mass 0."""
 
 import re
 from collections.abc import Iterator
@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file.readable.converted import as_obj
+from drake_dae.scenario.robot_file.readable.markup import blank, parsed
 
 _MESH = re.compile(r"<mesh\b([^>]*?)(?:/>|>\s*</mesh\s*>)")
 _GEOM = re.compile(r"<geom\b([^>]*?)(?:/>|>\s*</geom\s*>|>)")
@@ -15,10 +16,10 @@ _READ = ".obj"
 
 
 def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
-    """A file with meshes as .obj only, without the other meshes and their geometry.
+    """Converts meshes to .obj, and removes unreadable meshes with their geometry.
 
-    A body whose <inertial> has mass 0 loses it, and its geometry gets no mass: MuJoCo accepts such
-    bodies if they do not move, or move with others.
+    MuJoCo accepts bodies of mass 0 that do not move, or move with others. The <inertial> of such a
+    body is removed, and its geometry gets mass 0.
 
     Args:
         text: The text of the file, without comments.
@@ -28,12 +29,9 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         The text, with the same lines and absolute names of meshes; and the omitted meshes.
 
     Raises:
-        ModelError: A body that can move has its mass from such a mesh.
+        ModelError: The mass of a movable body is computed from an omitted mesh.
     """
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return text, []  # The error is left to Drake.
+    root = parsed(text)
     whole, text = text, _without_mass(text, root)
     folder = file.resolve().parent
     for compiler in root.iter("compiler"):
@@ -49,18 +47,15 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         return text, []
     _check_masses(root, refused)
 
-    def asset(found: re.Match[str]) -> str:
-        name = _attribute(found[1], "file")
+    def asset(match: re.Match[str]) -> str:
+        name = _attribute(match[1], "file")
         if name is None:
-            return found[0]
-        place = copies.get(folder / name, folder / name)
-        if place is None:
-            return "\n" * found[0].count("\n")
-        return found[0].replace(name, str(place))
+            return match[0]
+        mesh = copies.get(folder / name, folder / name)
+        return blank(match) if mesh is None else match[0].replace(name, str(mesh))
 
-    def geometry(found: re.Match[str]) -> str:
-        is_gone = _attribute(found[1], "mesh") in refused
-        return "\n" * found[0].count("\n") if is_gone else found[0]
+    def geometry(match: re.Match[str]) -> str:
+        return blank(match) if _attribute(match[1], "mesh") in refused else match[0]
 
     return _GEOM.sub(geometry, _MESH.sub(asset, text)), list(refused.values())
 
@@ -78,13 +73,13 @@ def _without_mass(text: str, root: ElementTree.Element) -> str:
     }
     inertials, geoms = root.iter("inertial"), root.iter("geom")
 
-    def inertial(found: re.Match[str]) -> str:
-        return "\n" * found[0].count("\n") if next(inertials) in empty else found[0]
+    def inertial(match: re.Match[str]) -> str:
+        return blank(match) if next(inertials) in empty else match[0]
 
-    def geom(found: re.Match[str]) -> str:
+    def geom(match: re.Match[str]) -> str:
         if next(geoms) not in empty:
-            return found[0]
-        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", found[0]).replace(
+            return match[0]
+        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", match[0]).replace(
             "<geom", '<geom mass="0"', 1
         )
 
@@ -93,7 +88,7 @@ def _without_mass(text: str, root: ElementTree.Element) -> str:
 
 def _takes_geometry(root: ElementTree.Element) -> bool:
     """Whether masses are computed from the geometry even if there is an <inertial>."""
-    return any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
+    return any(element.get("inertiafromgeom") == "true" for element in root.iter("compiler"))
 
 
 def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
@@ -104,16 +99,16 @@ def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
 
 
 def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
-    """The bodies in an element that are moved by joints."""
+    """The bodies in an element that joints can move."""
     for child in body.iterfind("body"):
-        own = moves or child.find("joint") is not None or child.find("freejoint") is not None
-        if own:
+        has_joint = child.find("joint") is not None or child.find("freejoint") is not None
+        if moves or has_joint:
             yield child
-        yield from _moving(child, own)
+        yield from _moving(child, moves or has_joint)
 
 
 def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
-    """Refuses a moving body whose mass is computed from its omitted meshes."""
+    """Checks that no mass of a movable body is computed from omitted meshes."""
     always = _takes_geometry(root)
     for body in (body for world in root.iter("worldbody") for body in _moving(world)):
         if body.find("inertial") is not None and not always:
@@ -130,5 +125,5 @@ def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
 
 
 def _attribute(attributes: str, name: str) -> str | None:
-    found = re.search(rf"\b{name}\s*=\s*[\"']([^\"']*)", attributes)
-    return found and found[1]
+    match = re.search(rf"\b{name}\s*=\s*[\"']([^\"']*)", attributes)
+    return match and match[1]

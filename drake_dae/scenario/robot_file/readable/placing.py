@@ -1,8 +1,8 @@
-"""Links that a robot's file fixes to the world, or lets float.
+"""Links that a robot's file fixes to the world, and floating links.
 
-Fixed links are released if the scenario places them. Floating links have no joint in Drake, which
-makes them free bodies with a quaternion, whose length 1 is an equation that no constraint force
-enforces. They get a joint in roll, pitch and yaw.
+A fixed link is released if the scenario places it. A floating link is a free body with a quaternion
+in Drake; no constraint force keeps the length of the quaternion at 1. So it gets a joint in roll,
+pitch and yaw.
 """
 
 import re
@@ -10,18 +10,17 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RpyFloatingJoint
 
 from drake_dae.errors import ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file.readable.urdf import blank
+from drake_dae.scenario.robot_file.readable.markup import blank, parsed
 
 _JOINT = re.compile(r"<joint\b[^>]*(?<!/)>.*?</joint\s*>", re.DOTALL)
 _BODY = re.compile(r"<body\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*(?<!/)>")
-_HOLDING = ("fixed", "floating")
+_RELEASABLE = ("fixed", "floating")
 """Kinds of joints to the world that can be replaced."""
 
 
@@ -29,31 +28,31 @@ def world_links(text: str, file: Path) -> list[str]:
     """The names of the links that a file fixes to the world.
 
     Args:
-        text: A URDF, SDFormat or MJCF file without comments.
-        file: Its suffix determines which.
+        text: The text of a URDF, SDFormat or MJCF file without comments.
+        file: The file; its suffix determines the format.
     """
     if file.suffix == ".xml":
-        return [body.get("name", "") for body in _fixed_bodies(text)]
-    held = (_held(joint[0]) for joint in _JOINT.finditer(text))
-    return [link for kind, link in held if kind == "fixed"]
+        return _fixed_bodies(text)
+    world_joints = (_world_joint(joint[0]) for joint in _JOINT.finditer(text))
+    return [link for kind, link in world_joints if kind == "fixed"]
 
 
 def released(text: str, file: Path, links: Collection[str]) -> str:
-    """A file's text without the joints from the world to some links, with the same lines.
+    """Removes the joints from the world to some links; lines stay the same.
 
     The arguments are those of `world_links`, and the names of the links to release.
     """
     if not links:
         return text
     if file.suffix == ".xml":
-        fixed = {body.get("name", "") for body in _fixed_bodies(text)} & set(links)
+        fixed = set(_fixed_bodies(text)) & set(links)
         return _BODY.sub(lambda b: b[0] + "<freejoint/>" * (b[1] in fixed), text)
 
-    def kept(joint: re.Match[str]) -> str:
-        kind, link = _held(joint[0])
-        return blank(joint) if kind in _HOLDING and link in links else joint[0]
+    def without_released(joint: re.Match[str]) -> str:
+        kind, link = _world_joint(joint[0])
+        return blank(joint) if kind in _RELEASABLE and link in links else joint[0]
 
-    return _JOINT.sub(kept, text)
+    return _JOINT.sub(without_released, text)
 
 
 @dataclass(frozen=True)
@@ -74,28 +73,28 @@ class FloatingJoint:
 
 
 def floating_joints(text: str, file: Path) -> tuple[str, list[FloatingJoint]]:
-    """The text of a file without its floating joints, with the same lines, and these.
+    """Removes floating joints from a text with the same lines; returns it and the joints.
 
-    Drake reads those of MJCF as free bodies; they remain in the text.
+    Those of MJCF remain in the text: Drake reads them as free bodies.
 
     Raises:
         ModelError: The origin of one is not six numbers.
     """
     if file.suffix == ".xml":
         return text, list(_free_joints(text))
-    found: list[FloatingJoint] = []
+    floating: list[FloatingJoint] = []
 
-    def kept(joint: re.Match[str]) -> str:
+    def without_floating(joint: re.Match[str]) -> str:
         kind, child, parent, name = _ends(joint[0])
         if kind != "floating":
             return joint[0]
-        origin = ElementTree.fromstring(joint[0]).find("origin")
-        given = {} if origin is None else origin.attrib
-        pose = _triple(given.get("xyz", ""), name), _triple(given.get("rpy", ""), name)
-        found.append(FloatingJoint(name, parent, child, pose))
+        origin = parsed(joint[0]).find("origin")
+        attributes = {} if origin is None else origin.attrib
+        pose = _triple(attributes.get("xyz", ""), name), _triple(attributes.get("rpy", ""), name)
+        floating.append(FloatingJoint(name, parent, child, pose))
         return blank(joint)
 
-    return _JOINT.sub(kept, text), found
+    return _JOINT.sub(without_floating, text), floating
 
 
 def _triple(text: str, name: str) -> tuple[float, ...]:
@@ -109,11 +108,7 @@ def _triple(text: str, name: str) -> tuple[float, ...]:
 
 
 def _free_joints(text: str) -> Iterator[FloatingJoint]:
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return  # The error is left to Drake.
-    for body in root.iterfind("worldbody/body"):
+    for body in parsed(text).iterfind("worldbody/body"):
         joints = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
         for joint in joints[:1]:
             child = body.get("name", "")
@@ -129,7 +124,7 @@ def add_floating_joints(
     Args:
         plant: The robot, not finalized; changed.
         instance: The model instance of the file; "" if it is the only one.
-        joints: Its floating joints, of links that no other joint holds.
+        joints: Its floating joints.
     """
     models = [plant.GetModelInstanceByName(instance)] if instance else []
     for joint in joints:
@@ -155,18 +150,15 @@ def add_floating_joints(
         )
 
 
-def _held(joint: str) -> tuple[str, str]:
-    """The kind of a joint from the world and the link that it fixes; empty for other joints."""
+def _world_joint(joint: str) -> tuple[str, str]:
+    """The kind and the child of a joint whose parent is the world; empty for other joints."""
     kind, child, parent, _ = _ends(joint)
     return (kind, child) if parent == "world" else ("", "")
 
 
 def _ends(joint: str) -> tuple[str, str, str, str]:
     """The kind of a joint, its child, its parent and its name; empty if it cannot be read."""
-    try:
-        element = ElementTree.fromstring(joint)
-    except ElementTree.ParseError:
-        return "", "", "", ""
+    element = parsed(joint)
     parent, child = (
         "" if end is None else end.get("link", (end.text or "").strip())
         for end in (element.find("parent"), element.find("child"))
@@ -174,12 +166,10 @@ def _ends(joint: str) -> tuple[str, str, str, str]:
     return element.get("type", ""), child, parent, element.get("name", "")
 
 
-def _fixed_bodies(text: str) -> Iterator[ElementTree.Element]:
-    """The bodies in the world of an MJCF file without a joint."""
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return  # The error is left to Drake.
-    for body in root.iterfind("worldbody/body"):
-        if body.find("joint") is None and body.find("freejoint") is None:
-            yield body
+def _fixed_bodies(text: str) -> list[str]:
+    """The names of the bodies in the world of an MJCF file that have no joint."""
+    return [
+        body.get("name", "")
+        for body in parsed(text).iterfind("worldbody/body")
+        if body.find("joint") is None and body.find("freejoint") is None
+    ]

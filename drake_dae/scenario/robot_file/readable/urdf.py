@@ -1,8 +1,8 @@
-"""URDF constructs of vendors that Drake refuses or reads differently, rewritten.
+"""Rewrites URDF of vendors that Drake rejects or reads differently than other parsers.
 
-Position limits of a continuous joint are ignored, and <mimic> of a fixed one. A material without a
-colour gets the first colour of its name, or none. Two actuators of one name get different names.
-Transmissions to joints that do not exist are removed. "package:///" is "package://".
+Position limits of continuous joints and <mimic> of fixed joints are removed. A material without a
+colour gets the first colour of that name, or none. Actuators of equal names get different names.
+Transmissions to joints that do not exist are removed. "package:///" becomes "package://".
 """
 
 import re
@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.markup import blank
 
 _JOINT = re.compile(
     r"<joint\b(?=[^>]*\bname\s*=\s*[\"']([^\"']*))(?=[^>]*\btype\s*=\s*[\"']([^\"']*))[^>]*"
@@ -28,15 +29,15 @@ _ACTUATOR = re.compile(r"(<actuator\b[^>]*?\bname\s*=\s*[\"'])([^\"']*)")
 
 
 def as_meant(text: str, without_limits: bool) -> str:
-    """The text of a URDF without comments, rewritten as described above, with the same lines.
+    """Rewrites the text of a URDF without comments; lines stay the same.
 
     Args:
         text: The text.
         without_limits: Whether empty intervals of limits are removed.
 
     Raises:
-        ModelError: The lower limit of a joint is above the upper one, and this does not mean "no
-            limits".
+        ModelError: The lower limit of a joint is above the upper one, and `without_limits` is
+            false.
     """
     text = _JOINT.sub(lambda joint: _joint(joint, without_limits), text)
     text = _with_first_materials(text)
@@ -72,10 +73,10 @@ def _bounds(joint: str) -> Iterator[tuple[str, float]]:
 
 
 def _with_first_materials(text: str) -> str:
-    """Gives materials the first colour of their name, if there is one.
+    """Writes the first colour of each name of a material into all materials of that name.
 
-    Vendors give a name several colours, of which other parsers use one and Drake none; or use a
-    name before its colour is defined, or never define it.
+    Some vendors define several colours for a name, of which other parsers use one and Drake none,
+    or use a name before they define its colour, or never define it.
     """
     colours: dict[str, str] = {}
     is_plain = True
@@ -96,18 +97,18 @@ def _with_first_materials(text: str) -> str:
 
 
 def _without_idle_transmissions(text: str) -> str:
-    """A text without transmissions to joints that do not exist."""
+    """Removes transmissions to joints that do not exist."""
     joints = {joint[1] for joint in _JOINT.finditer(text)}
 
-    def kept(transmission: re.Match[str]) -> str:
+    def without_idle(transmission: re.Match[str]) -> str:
         driven = set(_DRIVEN.findall(transmission[0]))
         return blank(transmission) if driven and not driven & joints else transmission[0]
 
-    return _TRANSMISSION.sub(kept, text)
+    return _TRANSMISSION.sub(without_idle, text)
 
 
 def _with_names_of_their_own(text: str) -> str:
-    """Makes names of actuators unique, by a number."""
+    """Appends numbers to equal names of actuators."""
     taken = Counter(name for _, name in _ACTUATOR.findall(text))
     seen: Counter[str] = Counter()
 
@@ -123,8 +124,3 @@ def _with_names_of_their_own(text: str) -> str:
         return f"{head}{name}_{number}"
 
     return _ACTUATOR.sub(named, text)
-
-
-def blank(found: re.Match[str]) -> str:
-    """The line breaks of a text, so that line numbers in messages remain right."""
-    return "\n" * found[0].count("\n")

@@ -1,6 +1,7 @@
 """The equations of a robot in compliant point contact, as traced functions."""
 
 from collections.abc import Mapping
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -9,29 +10,22 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.contact.contact_laws import (
-    Compliance,
-    contact_force,
-    contact_step,
-)
+from drake_dae.systems.plants.contact.contact_laws import Compliance, contact_force, contact_step
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
-from drake_dae.systems.plants.contact.point_contact import (
-    ball_normals,
-    point_contacts,
-    touching,
-)
-from drake_dae.systems.plants.contact.stepped_stages import stages_after
+from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts, touching
+from drake_dae.systems.plants.contact.stepped_stages import stage_rates, stages_after
+from drake_dae.systems.plants.robot_ports import stage_ports
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 FITS = 1e-3
-"""The allowed gap or depth of a ball where it shall touch, relative to its radius."""
+"""The allowed gap or depth of a ball at its contact point, relative to its radius."""
 
 OUTSIDE = (
     "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
     "not found; `plant: !MultibodyPlant` has stops"
 )
-"""Why a `CompliantPlant` does not go on."""
+"""The reason why a `CompliantPlant` cannot continue."""
 
 
 class CompliantEquations:
@@ -47,15 +41,12 @@ class CompliantEquations:
 
     Attributes:
         advanced: x', or (x, F) after a step, as a function of state, control and parameters.
-        shown: Name of an output port -> its function of state and parameters.
+        outputs: Name of an output port -> its function of state and parameters.
         expressions: All of these as expressions.
     """
 
     def __init__(
-        self,
-        model: RobotModel,
-        structure: ConstraintStructure,
-        material: PointMaterial,
+        self, model: RobotModel, structure: ConstraintStructure, material: PointMaterial
     ) -> None:
         dae, self._model, self._h = model.dae, model, material.time_step
         self._structure = structure
@@ -66,8 +57,7 @@ class CompliantEquations:
         self._contacts = point_contacts(model, normals, numbers[3], friction)
         control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._contacts))
         advanced, slack = (self._step if self._h else self._rate)(control)
-        now = force if self._h else self._forces()
-        outputs = self._outputs(structure, now)
+        outputs = self._outputs(structure, force if self._h else self._forces())
         self.expressions = [advanced, slack, *outputs.values()]
         state = ca.vertcat(dae.state, force) if self._h else dae.state
         parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
@@ -80,12 +70,12 @@ class CompliantEquations:
             compiled=dae.compiled,
         )
         inputs = {"state": state, "parameters": parameters}
-        self.shown: Mapping[str, TracedFunction] = {
+        self.outputs: Mapping[str, TracedFunction] = {
             name: TracedFunction(name, inputs, {"value": value}, compiled=dae.compiled)
             for name, value in outputs.items()
         }
         self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
-        depths = ca.vertcat(*(one.depth for one in self._contacts))
+        depths = ca.vertcat(*(contact.depth for contact in self._contacts))
         self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
 
     def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
@@ -96,15 +86,15 @@ class CompliantEquations:
             material: The contact material.
 
         Raises:
-            ModelError: A ball has no place there.
+            ModelError: A ball does not fit there.
         """
         dae, manifold = self._model.dae, self._structure.manifold
         state = manifold.project(dae.nominal_state, values)
         normals = self._normals(state, values)[0]
-        found = np.concatenate([values, material.values, normals])
-        held = np.zeros(self._depths.sizes[0])
-        held[: state.size] = state
-        depths = self._depths(held, found)[0]
+        parameters = np.concatenate([values, material.values, normals])
+        with_forces = np.zeros(self._depths.sizes[0])
+        with_forces[: state.size] = state
+        depths = self._depths(with_forces, parameters)[0]
         for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
             if not abs(depth) <= FITS * material.radius:
                 raise ModelError(
@@ -112,7 +102,7 @@ class CompliantEquations:
                     f"'{constraint.name}' where it shall touch, since the surface bends toward it "
                     "more than the ball does: take a smaller radius"
                 )
-        return found
+        return parameters
 
     def _balance(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
         """M and tau - H without contact, with torques within the limits of the actuators."""
@@ -133,60 +123,56 @@ class CompliantEquations:
         torque = control if model.joint_force is None else model.joint_force
         within = ca.fmin(ca.fmax(torque, -limits), limits)
         if model.joint_force is not None:
-            within -= model.joint_force  # Which is in f, too.
+            within -= model.joint_force  # It is also part of f.
         drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
         return dae.mass_matrix[part, part], forces + drive
 
     def _forces(self) -> ca.SX:
         """The contact forces of a continuous plant."""
         v = self._model.links.v
-        return ca.vertcat(*(contact_force(one, v, self._compliance) for one in self._contacts))
+        return ca.vertcat(
+            *(contact_force(contact, v, self._compliance) for contact in self._contacts)
+        )
 
     def _rate(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """x' of a continuous plant, and what is negative where it has none."""
+        """x' of a continuous plant, and a number that is negative where it is not valid."""
         model, links = self._model, self._model.links
         mass, forces = self._balance(control)
-        jacobian = ca.vertcat(*(one.jacobian for one in self._contacts))
+        jacobian = ca.vertcat(*(contact.jacobian for contact in self._contacts))
         forces += ca.mtimes(jacobian.T, self._forces())
         change = PositiveDefiniteFactorization(mass).solve(forces)
-        size = links.q.numel() + links.v.numel()
-        dae = model.dae
-        driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
-        rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
         velocity = ca.mtimes(links.velocity_map, links.v)
-        return ca.vertcat(velocity, change, rate), self._within_limits(links.q)
+        rate = ca.vertcat(velocity, change, stage_rates(model, control))
+        return rate, self._within_limits(links.q)
 
     def _step(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """(x, F) after a step, and what is negative where there is none."""
+        """(x, F) after a step, and a number that is negative where they are not valid."""
         model, links, h = self._model, self._model.links, self._h
         mass, forces = self._balance(control)
         mass += h * ca.diag(ca.DM(_damping(model)))
         free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
-        found = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
-        velocity = ca.mtimes(links.velocity_map, found.velocities)
-        # Drake's stops push from where the next step but one would pass the limit.
+        step = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
+        velocity = ca.mtimes(links.velocity_map, step.velocities)
+        # Drake's stops push if a joint would pass its limit within two steps.
         ahead = self._within_limits(links.q + 2.0 * h * velocity)
         stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
-        after = ca.vertcat(links.q + h * velocity, found.velocities, stages, found.forces)
-        return after, ca.fmin(found.slack, ahead)
+        after = ca.vertcat(links.q + h * velocity, step.velocities, stages, step.forces)
+        return after, ca.fmin(step.slack, ahead)
 
     def _within_limits(self, q: ca.SX) -> ca.SX:
         """The least distance of joints from their limits; negative beyond one."""
         low, high = self._model.links.position_limits
         gaps = [q[i] - low[i] for i in np.flatnonzero(np.isfinite(low)).tolist()]
         gaps += [high[i] - q[i] for i in np.flatnonzero(np.isfinite(high)).tolist()]
-        least = ca.SX(1)
-        for gap in gaps:
-            least = ca.fmin(least, gap)
-        return least
+        return reduce(ca.fmin, gaps, ca.SX(1))
 
     def _outputs(self, structure: ConstraintStructure, contact: ca.SX) -> dict[str, ca.SX]:
-        """The output ports as expressions of the state and of the contact forces."""
+        """The output ports as expressions of the state and the contact forces."""
         model, dae = self._model, self._model.dae
         normals = ca.horzcat(*(touch.normal for _, touch in touching(model)))
         force = ca.sum1(normals * ca.reshape(contact, 3, -1)).T
         size = model.links.q.numel() + model.links.v.numel()
-        found = {
+        outputs = {
             "state": dae.state,
             "link_state": dae.state[:size],
             "contact_force": contact,
@@ -195,20 +181,18 @@ class CompliantEquations:
             "controlled_output": dae.outputs(force),
         }
         if model.joint_force is not None:
-            found["joint_torque"] = model.joint_force
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                found[name] = dae.state[size + part.start : size + part.stop]
-            size += stage.state.numel()
-        return found
+            outputs["joint_torque"] = model.joint_force
+        for name, part in stage_ports(model, size).items():
+            outputs[name] = dae.state[part]
+        return outputs
 
 
 def _damping(model: RobotModel) -> FloatArray:
     """The damping of the joints, which Drake takes implicitly, shape (nv,)."""
-    found, plant = np.zeros(model.links.v.numel()), model.links.plant
+    damping, plant = np.zeros(model.links.v.numel()), model.links.plant
     if plant is not None:
         for index in plant.GetJointIndices():
             joint = plant.get_joint(index)
             first = joint.velocity_start()
-            found[first : first + joint.num_velocities()] = joint.default_damping_vector()
-    return found
+            damping[first : first + joint.num_velocities()] = joint.default_damping_vector()
+    return damping

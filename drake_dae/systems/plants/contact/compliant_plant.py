@@ -1,7 +1,6 @@
 """A robot in compliant point contact, as Drake computes it, as traced functions."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +22,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
     HELD,
@@ -36,18 +35,20 @@ from drake_dae.systems.blocks.traced import (
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contact.compliance import CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
+from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.plants.contact.stepped_stages import check_step
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
 class CompliantPlant(ParameterizedSystem, Plant):
     """A robot whose contacts are compliant, by Drake's equations of point contact.
 
-    It is what a `ContactPlant` is, without a MultibodyPlant: its equations are traced, so that
-    rollouts, exports and linear models know it, surfaces may have any shape and move, and studies
-    change its parameters in a context. Each `PointOnSurface` touches with a ball; nothing else of
+    It is like a `ContactPlant` without a MultibodyPlant: its equations are traced, so that it works
+    in rollouts, exports and linear models, surfaces may have any shape and move, and studies change
+    its parameters in a context. Each `PointOnSurface` touches with a ball; nothing else of
     the robot collides.
 
     With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,
@@ -116,29 +117,25 @@ class CompliantPlant(ParameterizedSystem, Plant):
         self.time_step, self._stepped = material.time_step, np.zeros(0)
         self._check_step(values)
         equations = CompliantEquations(model, structure, material)
-        forces = tuple(
-            Signal(f"{constraint.name}.contact_f{axis}", "N")
-            for constraint in model.constraints
-            for axis in "xyz"
-        )
+        forces = contact_force_signals(model)
         state = dae.state_signals + forces if material.time_step else dae.state_signals
         signals = {"state": state, "control": dae.control_signals}
-        own = equations.own_parameters(values, material)
-        super().__init__(dae, own, signals, sees_steps=not material.time_step)
+        defaults = equations.own_parameters(values, material)
+        super().__init__(dae, defaults, signals, sees_steps=not material.time_step)
         self.structure, self.material = structure, material
         self.set_name(dae.name)
         self.contact_force_signals = forces
         self._place = equations.own_parameters
-        self._shown, self._advanced = equations.shown, equations.advanced
+        self._outputs, self._advanced = equations.outputs, equations.advanced
         degrees = dae.exogenous.degrees(*equations.expressions)
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
         tickets = self._declare_exogenous(degrees) | self._declare_state()
-        for name, function in self._shown.items():
-            size, calc = function.outputs[0].size, weakly(self._calc, name)
-            self.DeclareVectorOutputPort(name, size, calc, tickets)
+        for name, function in self._outputs.items():
+            size, value = function.outputs[0].size, port_value(self._output, function)
+            self.DeclareVectorOutputPort(name, size, value, tickets)
 
     def _declare_state(self) -> set[DependencyTicket]:
-        """Declares state and steps; what outputs depend on."""
+        """Declares state and steps; returns the dependencies of outputs on the state."""
         start = BasicVector(self.structure.manifold.project(self.dae.nominal_state))
         if not self.time_step:
             self.DeclareContinuousState(start)
@@ -174,9 +171,9 @@ class CompliantPlant(ParameterizedSystem, Plant):
         return along[:, : self.dae.parameter_symbol.numel()]
 
     def state(self, context: Context) -> FloatArray:
-        self.check_context(context)
         if not self.time_step:
             return super().state(context)
+        self.check_context(context)
         return context.get_discrete_state(0).CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -185,10 +182,10 @@ class CompliantPlant(ParameterizedSystem, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        self.check_context(context)
         if not self.time_step:
             super().set_state(context, state)
             return
+        self.check_context(context)
         context.SetDiscreteState(0, self.dae.state_vector(state))
         context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
 
@@ -200,7 +197,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
         Raises:
             InconsistentStateError: None is found near the guess.
         """
-        self.check_context(context)
         return super().set_consistent_state(context, guess)
 
     def set_contact(self, context: Context, material: PointMaterial) -> None:
@@ -218,12 +214,14 @@ class CompliantPlant(ParameterizedSystem, Plant):
             ModelError: The material does not fit the plant, a ball its surface, or the step the
                 stages with the parameters of the context.
         """
-        own = self.material
-        kept = material.time_step, material.stiction_tolerance, material.friction is None
-        if kept != (own.time_step, own.stiction_tolerance, own.friction is None):
+        fixed, others = (
+            (given.time_step, given.stiction_tolerance, given.friction is None)
+            for given in (self.material, material)
+        )
+        if fixed != others:
             raise ModelError(
-                f"{self.dae.name}: the plant was made with {own}; only its stiffness, dissipation, "
-                f"radius and a number of its friction may change, got {material}"
+                f"{self.dae.name}: the plant was made with {self.material}; only its stiffness, "
+                f"dissipation, radius and a number of its friction may change, got {material}"
             )
         values = context.get_numeric_parameter(0).CopyToVector()
         values = values[: self.dae.parameter_symbol.numel()]
@@ -238,7 +236,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
             self._stepped = values.copy()
 
     def _held(self, context: Context) -> FloatArray:
-        """What functions take as the state: x, and of a discrete plant the contact forces."""
+        """The state of functions: x, and for a discrete plant (x, F)."""
         if not self.time_step:
             return context.get_continuous_state_vector().value()
         return np.concatenate([context.get_discrete_state(i).value() for i in range(2)])
@@ -247,23 +245,23 @@ class CompliantPlant(ParameterizedSystem, Plant):
         if self.time_step:
             return
         control = self._control_port.Eval(context)
-        found = self._checked(self._advanced, context, self._held(context), control)
-        derivatives.SetFromVector(found[0])
+        rate = self._checked(self._advanced, context, self._held(context), control)[0]
+        derivatives.SetFromVector(rate)
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         control, held = self._control_port.Eval(context), self._held(context)
         function = self._advanced
-        found = function.evaluate(held, control, self._values(context))[0]
+        after = function.evaluate(held, control, self._values(context))[0]
         if not function.is_valid:
             x = held[: self.dae.num_states].copy()
             raise simulation_error(function.failure(), context.get_time(), x, self._signals)
         values = state.get_mutable_discrete_state()
-        values.set_value(0, found[: self.dae.num_states])
-        values.set_value(1, found[self.dae.num_states :])
+        values.set_value(0, after[: self.dae.num_states])
+        values.set_value(1, after[self.dae.num_states :])
         return EventStatus.Succeeded()
 
-    def _calc(self, name: str, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._checked(self._shown[name], context, self._held(context))[0])
+    def _output(self, function: TracedFunction, context: Context) -> FloatArray:
+        return self._checked(function, context, self._held(context))[0]
 
     def _formulas(self) -> dict[str, Formula]:
         if self.time_step:
@@ -271,34 +269,28 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 f"{self.dae.name}: a discrete CompliantPlant does not convert to AutoDiffXd; take "
                 "a time_step of 0"
             )
-        found: dict[str, Any] = {"derivative": self._advanced, **self._shown}
-        return {n: TracedFormula(each, signals=self._signals) for n, each in found.items()}
+        functions = {"derivative": self._advanced, **self._outputs}
+        return {
+            name: TracedFormula(function, signals=self._signals)
+            for name, function in functions.items()
+        }
 
     def traced(self) -> Block:
         is_discrete = bool(self.time_step)
-        source = HELD if is_discrete else STATE
+        source, result = (HELD, HELD) if is_discrete else (STATE, DERIVATIVE)
         computations = [
             Computation.of(function, (source, PARAMETERS), (name,))
-            for name, function in self._shown.items()
+            for name, function in self._outputs.items()
         ]
-        into = (HELD,) if is_discrete else (DERIVATIVE,)
-        advanced = Computation.of(self._advanced, (source, "control", PARAMETERS), into)
+        advanced = Computation.of(self._advanced, (source, "control", PARAMETERS), (result,))
         updates = [Update(advanced, self.time_step, 0.0, True)] if is_discrete else []
         computations += [] if is_discrete else [advanced]
-        dae = self.dae
-        ports = {
-            "state": tuple(dae.state_signals),
-            "contact_force": self.contact_force_signals,
-            "constraint_force": tuple(dae.force_signals),
-            "constraint_residual": tuple(self.structure.manifold.residual_signals),
-            "controlled_output": tuple(dae.output_signals),
-        }
         return Block(
             self,
             tuple(computations),
             tuple(updates),
-            scale=None if is_discrete else dae.scale,
+            scale=None if is_discrete else self.dae.scale,
             moving=tuple(self.exogenous_places),
             signals=self._signals,
-            ports=ports,
+            ports={**self.port_signals, "contact_force": self.contact_force_signals},
         )

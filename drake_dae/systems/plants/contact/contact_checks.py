@@ -46,10 +46,12 @@ def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -
         ModelError: There is no such parameter, or a value does not fit.
     """
     values = model.dae.parameter_values
-    own = [parameter for constraint in model.constraints for parameter in constraint.parameters]
-    own += model.links.parameters
-    own += [parameter for stage in model.stages for parameter in stage.parameters]
-    known = {parameter.name: parameter for parameter in own}
+    changeable = [p for constraint in model.constraints for p in constraint.parameters]
+    changeable += [
+        *model.links.parameters,
+        *(p for stage in model.stages for p in stage.parameters),
+    ]
+    known = {parameter.name: parameter for parameter in changeable}
     for name, value in parameters.items():
         if name not in known:
             raise ModelError(
@@ -72,14 +74,14 @@ def check_same(plant: MultibodyPlant, model: RobotModel) -> None:
     Raises:
         ModelError: It is another robot.
     """
-    drawn = model.links.plant
-    assert drawn is not None  # check_model.
-    own, other = (
-        (one.GetPositionNames(), one.GetVelocityNames(), one.GetActuatorNames())
-        for one in (plant, drawn)
+    model_plant = model.links.plant
+    assert model_plant is not None  # check_model.
+    names, model_names = (
+        (robot.GetPositionNames(), robot.GetVelocityNames(), robot.GetActuatorNames())
+        for robot in (plant, model_plant)
     )
-    if own != other:
+    if names != model_names:
         raise ModelError(
-            f"add_robot must add the robot of the model, with positions {', '.join(other[0])}; it "
-            f"has {', '.join(own[0]) or 'none'}"
+            f"add_robot must add the robot of the model, with positions "
+            f"{', '.join(model_names[0])}; it has {', '.join(names[0]) or 'none'}"
         )

@@ -7,14 +7,14 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import GeometryId
 from pydrake.multibody.plant import ContactResults
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
 
 
 class ContactForces(LeafSystem):
@@ -59,11 +59,7 @@ class ContactForces(LeafSystem):
         self.set_name("contact_forces")
         dae = model.dae
         self._pairs = [tuple(pair) for pair in pairs]
-        self.contact_force_signals = tuple(
-            Signal(f"{constraint.name}.contact_f{axis}", "N")
-            for constraint in model.constraints
-            for axis in "xyz"
-        )
+        self.contact_force_signals = contact_force_signals(model)
         self._manifold, self._parameters = structure.manifold, parameters
         self._normals = contact_normals(model)
         force = ca.SX.sym("force", dae.num_constraints)
@@ -72,22 +68,17 @@ class ContactForces(LeafSystem):
         self._state = self.DeclareVectorInputPort("state", dae.num_states)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # The part that other ports use is computed once.
-        contact = self.DeclareVectorOutputPort(
-            "contact_force", 3 * len(self._pairs), weakly(self._calc_contact)
+        self._contact = self.DeclareVectorOutputPort(
+            "contact_force", 3 * len(self._pairs), port_value(self._contact_force)
         )
-        self._contact = contact
-        sizes = {
-            "constraint_force": (dae.num_constraints, self._calc_force),
-            "constraint_residual": (
-                len(structure.manifold.residual_signals),
-                self._calc_residual,
-            ),
-            "controlled_output": (dae.num_outputs, self._calc_output),
-        }
-        for name, (size, calc) in sizes.items():
-            self.DeclareVectorOutputPort(name, size, weakly(calc))
+        for name, size, value in (
+            ("constraint_force", dae.num_constraints, self._force),
+            ("constraint_residual", len(structure.manifold.residual_signals), self._residual),
+            ("controlled_output", dae.num_outputs, self._outputs),
+        ):
+            self.DeclareVectorOutputPort(name, size, port_value(value))
 
-    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+    def _contact_force(self, context: Context) -> FloatArray:
         results: ContactResults = self._results.Eval(context)
         total = np.zeros((len(self._pairs), 3))
         for i in range(results.num_point_pair_contacts()):
@@ -100,7 +91,7 @@ class ContactForces(LeafSystem):
             surface = patch.contact_surface()
             # The force is that on the body of M.
             self._add(total, surface.id_M(), surface.id_N(), patch.F_Ac_W().translational())
-        output.SetFromVector(total.ravel())
+        return total.ravel()
 
     def _add(
         self, total: FloatArray, felt_by: GeometryId, other: GeometryId, force: FloatArray
@@ -113,16 +104,21 @@ class ContactForces(LeafSystem):
     def _force(self, context: Context) -> FloatArray:
         contact = self._contact.Eval(context).reshape(-1, 3)
         state = self._state.Eval(context)
-        found = self._normals(state, self._parameters)[0].reshape(-1, 3)
-        return np.asarray(np.sum(found * contact, axis=1))
+        normals = self._normals(state, self._parameters)[0].reshape(-1, 3)
+        return np.asarray(np.sum(normals * contact, axis=1))
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._force(context))
+    def _residual(self, context: Context) -> FloatArray:
+        return self._manifold.residual(self._state.Eval(context), self._parameters)
 
-    def _calc_residual(self, context: Context, output: BasicVector) -> None:
-        state = self._state.Eval(context)
-        output.SetFromVector(self._manifold.residual(state, self._parameters))
-
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
+    def _outputs(self, context: Context) -> FloatArray:
         state, force = self._state.Eval(context), self._force(context)
-        output.SetFromVector(self._output(state, force, self._parameters)[0])
+        return self._output(state, force, self._parameters)[0]
+
+
+def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:
+    """Names and units of the contact forces F of a robot, shape (3 m,)."""
+    return tuple(
+        Signal(f"{constraint.name}.contact_f{axis}", "N")
+        for constraint in model.constraints
+        for axis in "xyz"
+    )

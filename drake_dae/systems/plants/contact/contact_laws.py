@@ -10,9 +10,9 @@ from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactori
 from drake_dae.trace.smoothness import as_constant
 
 ITERATIONS = 10
-"""The number of Newton steps for the velocities of contacts. Of random problems far beyond those
-of robots (W over 2.5 decades, impulses over 6, sliding from 0.1 to 1000 v_s), one contact of 1,000
-and one pair of 200 needs more; a robot in contact needs 3 to 5."""
+"""The number of Newton steps for the velocities of contacts. A robot in contact needs 3 to 5. Among
+random problems far beyond those of robots (W over 2.5 decades, impulses over 6, sliding from 0.1 to
+1000 v_s), one contact in 1,000 and one pair in 200 need more."""
 
 SOLVED = 1e-9
 """The allowed residual of these velocities, relative to the velocities themselves."""
@@ -21,12 +21,12 @@ AT_REST = 1e-6
 """Velocities below this, in m/s, count as this large there."""
 
 SOFT = 1e-3
-"""Drake's `sigma`: impulses soften friction by this share of the speed that they change."""
+"""Drake's `sigma`: the speed scale of friction relative to the change of speed by an impulse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """What all contacts of a plant have in common.
+    """The contact parameters that all contacts of a plant share.
 
     Attributes:
         stiffness: k in N/m.
@@ -96,11 +96,11 @@ def contact_step(
     with |v_t|_s = sqrt(|v_t|^2 + e^2), e = max(v_s, sigma mu w gamma_0), and gamma_0 = h k x (1 - d
     v_n0)_+ and x of the state before the step, for contacts with x > 0 there (Castro et al. 2024,
     "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
-    solves for v_c to round-off, by a primal-dual Newton's method: with p = v_t / |v_t|_s as
-    unknowns of their own it also converges where the sliding direction turns (Chan, Golub and Mulet
-    1999). Its last step alone has derivatives, with the velocity before it and the matrix taken for
-    constants: those of first order are then the ones of the solution, by the theorem of the
-    implicit function, with a third of the operations that those of all steps take.
+    solves for v_c to round-off by a primal-dual Newton's method: since p = v_t / |v_t|_s are
+    separate unknowns, it also converges if the sliding direction turns (Chan, Golub and Mulet
+    1999). Only the last step is differentiated, with the velocity before it and the matrix as
+    constants: by the implicit function theorem, first derivatives are then those of the solution,
+    at a third of the operations.
 
     Args:
         contacts: The contacts.
@@ -112,37 +112,37 @@ def contact_step(
     """
     h, count = time_step, len(contacts)
     factored = PositiveDefiniteFactorization(mass)
-    jacobian = ca.vertcat(*(one.jacobian for one in contacts))
+    jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
     response = factored.solve(jacobian.T)
     delassus = ca.mtimes(jacobian, response)
-    surface = ca.vertcat(*(one.velocity for one in contacts))
+    surface = ca.vertcat(*(contact.velocity for contact in contacts))
     before = ca.mtimes(jacobian, v) - surface
-    wanted = ca.mtimes(jacobian, free) - surface
+    target = ca.mtimes(jacobian, free) - surface
     parts = [slice(3 * i, 3 * i + 3) for i in range(count)]
     laws = [
-        (p, _Lagged.of(one, before[p], mass, h, compliance))
-        for p, one in zip(parts, contacts, strict=True)
+        (p, _Lagged.of(contact, before[p], mass, h, compliance))
+        for p, contact in zip(parts, contacts, strict=True)
     ]
 
     def impulses(velocity: ca.SX) -> ca.SX:
         return ca.vertcat(*(law.impulse(velocity[p]) for p, law in laws))
 
     def residual(velocity: ca.SX) -> ca.SX:
-        return velocity - wanted - ca.mtimes(delassus, impulses(velocity))
+        return velocity - target - ca.mtimes(delassus, impulses(velocity))
 
     velocity = before
     shares = ca.vertcat(*(law.share(before[p]) for p, law in laws))
-    for left in reversed(range(ITERATIONS)):
+    for remaining in reversed(range(ITERATIONS)):
         slope = ca.diagcat(*(law.slope(velocity[p], shares[p]) for p, law in laws))
         matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
-        if not left:
+        if not remaining:
             velocity, matrix = as_constant(velocity), as_constant(matrix)
         change = -Factorization(matrix).solve(residual(velocity))
         moved = [law.next_share(velocity[p], shares[p], change[p]) for p, law in laws]
         velocity, shares = velocity + change, ca.vertcat(*moved)
-    slack = SOLVED * ca.fmax(ca.norm_2(wanted), AT_REST) - ca.norm_2(residual(velocity))
-    found = impulses(velocity)
-    return ContactStep(free + ca.mtimes(response, found), found / h, slack)
+    slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))
+    impulse = impulses(velocity)
+    return ContactStep(free + ca.mtimes(response, impulse), impulse / h, slack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +160,13 @@ class _Lagged:
     def of(
         cls, contact: PointContact, before: ca.SX, mass: ca.SX, h: float, compliance: Compliance
     ) -> "_Lagged":
-        """The impulse with what is taken from the state before the step."""
+        """The impulse, with constants from the state before the step."""
         elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
         damping = ca.fmax(0, 1 - compliance.dissipation * ca.dot(contact.normal, before))
         lagged = contact.friction * h * elastic * damping
         J = contact.jacobian
-        own = ca.mtimes(J / ca.repmat(ca.diag(mass).T, 3, 1), J.T)
-        softness = ca.fmax(compliance.stiction_tolerance, SOFT * ca.norm_fro(own) / 3 * lagged)
+        response = ca.mtimes(J / ca.repmat(ca.diag(mass).T, 3, 1), J.T)
+        softness = ca.fmax(compliance.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
         return cls(contact, elastic, lagged, softness, h, compliance)
 
     def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -180,11 +180,11 @@ class _Lagged:
         return sliding / size
 
     def next_share(self, velocity: ca.SX, share: ca.SX, change: ca.SX) -> ca.SX:
-        """p after a Newton step, no longer than 1."""
+        """p after a Newton step, with a length of at most 1."""
         sliding, size = self._size(velocity)
         moved = self.contact.along(change)
-        found = (sliding + moved - share * ca.dot(sliding / size, moved)) / size
-        return found / ca.fmax(1, ca.norm_2(found))
+        share_after = (sliding + moved - share * ca.dot(sliding / size, moved)) / size
+        return share_after / ca.fmax(1, ca.norm_2(share_after))
 
     def impulse(self, velocity: ca.SX) -> ca.SX:
         """gamma in N s, shape (3, 1)."""

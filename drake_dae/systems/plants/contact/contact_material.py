@@ -43,7 +43,7 @@ class PointMaterial:
             radius.
 
     Raises:
-        ModelError: A number makes no sense.
+        ModelError: A number is not valid.
     """
 
     time_step: float = 1e-3
@@ -96,7 +96,7 @@ class ContactMaterial(PointMaterial):
         thickness: The thickness of the compliant layer, m; hydroelastic contact only.
 
     Raises:
-        ModelError: A number makes no sense.
+        ModelError: A number is not valid.
     """
 
     contact_model: Literal["point", "hydroelastic"] = "point"

@@ -19,11 +19,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
-from pydrake.multibody.plant import (
-    AddMultibodyPlant,
-    MultibodyPlant,
-    MultibodyPlantConfig,
-)
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
@@ -253,9 +249,9 @@ class ContactPlant(Diagram, Plant):
         loads = ConstraintWrenches(model, values)
         # A unit force without sliding gives the normal.
         state[model.links.q.numel() :] = 0.0
-        found = loads(state, np.ones(self.dae.num_constraints))
+        wrenches = loads(state, np.ones(self.dae.num_constraints))
         balls = []
-        for name, point, normal in zip(loads.frames, found.points, found.forces, strict=True):
+        for name, point, normal in zip(loads.frames, wrenches.points, wrenches.forces, strict=True):
             pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
             center = pose.inverse() @ (point + radius * normal)
             balls.append((GetScopedFrameByName(plant, name), center))
@@ -266,13 +262,13 @@ class ContactPlant(Diagram, Plant):
         drawn = self.model.links.plant
         assert drawn is not None  # check_model.
         bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
-        found = []
+        changed = []
         with_mass = (body for body in bodies if body.default_mass() > 0.0)
         for body, parameter in zip(with_mass, self.model.links.parameters, strict=True):
             value = self._values[self.dae.parameter_slice(parameter.name)].item()
             if value != body.default_mass():
-                found.append((self.multibody.get_body(body.index()), value))
-        return found
+                changed.append((self.multibody.get_body(body.index()), value))
+        return changed
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
@@ -294,8 +290,8 @@ class ContactPlant(Diagram, Plant):
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
-        own = self.GetSubsystemContext(self.multibody, context)
-        links = np.array(self.multibody.GetPositionsAndVelocities(own))
+        multibody_context = self.GetSubsystemContext(self.multibody, context)
+        links = np.array(self.multibody.GetPositionsAndVelocities(multibody_context))
         if self._stages is None:
             return links
         stages = self._stages.state(self.GetSubsystemContext(self._stages, context))
@@ -317,10 +313,10 @@ class ContactPlant(Diagram, Plant):
 
     def _set_links(self, context: Context, links: FloatArray) -> None:
         """Sets (q, v) and changed masses in a context of the scene."""
-        own = self._scene.GetMutableSubsystemContext(self.multibody, context)
-        self.multibody.SetPositionsAndVelocities(own, links)
+        multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
+        self.multibody.SetPositionsAndVelocities(multibody_context, links)
         for body, mass in self._masses:
-            body.SetMass(own, mass)
+            body.SetMass(multibody_context, mass)
 
     def traced(self) -> Block:
         count = self.multibody.num_multibody_states()

@@ -38,7 +38,7 @@ class DisturbanceForce:
         point: The point in the frame, m, shape (3,).
 
     Raises:
-        ModelError: It ends before it begins, or a number makes no sense.
+        ModelError: It ends before it begins, or a number is not valid.
     """
 
     frame: str
@@ -163,11 +163,11 @@ class LinkPushes(LeafSystem):
         self.DeclareAbstractOutputPort("all_spatial_forces", forces, weakly(self._calc))
 
     def _calc(self, context: Context, output: Value) -> None:
-        found = list(self._others.Eval(context)) if self._others.HasValue(context) else []
+        forces = list(self._others.Eval(context)) if self._others.HasValue(context) else []
         rows = context.get_numeric_parameter(0).value().reshape(-1, 6)
         for link, row in zip(self._links, rows, strict=True):
             applied = ExternallyAppliedSpatialForce()
             applied.body_index = link
             applied.F_Bq_W = SpatialForce(row[3:], row[:3])
-            found.append(applied)
-        output.set_value(found)
+            forces.append(applied)
+        output.set_value(forces)

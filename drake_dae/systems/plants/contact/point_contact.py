@@ -10,8 +10,8 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.trace.smoothness import length_of
 
 TURNS = 4
-"""So often the deepest point of a ball is sought, where a distance is exact on the surface alone:
-its direction is then wrong by (radius / radius of curvature)^4 of what it was at first."""
+"""The number of iterations for the deepest point of a ball, if a distance is exact only on the
+surface: they reduce the error of its direction by (radius / radius of curvature)^4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
     """
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
-    found = []
+    contacts = []
     for constraint in model.constraints:
         touch = constraint.touch(model.links)
         if touch is None:
@@ -55,18 +55,18 @@ def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
                 f"'{constraint.name}' is no contact of a point with a surface, so it cannot be "
                 "compliant: take an ideal plant, or a PointOnSurface"
             )
-        found.append((constraint, touch))
-    return found
+        contacts.append((constraint, touch))
+    return contacts
 
 
 def ball_normals(model: RobotModel) -> ca.SX:
-    """The normals of the surfaces in the frames of their constraints, below each other, (3 k, 1).
+    """The normals of the surfaces in the frames of their constraints, stacked, shape (3 k, 1).
 
-    Those of the nominal configuration say where the balls are: there a ball touches at the point of
-    its constraint, so that its center is that point plus the radius times the normal.
+    Those of the nominal configuration determine the balls: there a ball touches at the point of its
+    constraint, so that its center is that point plus the radius times the normal.
     """
-    both = touching(model)
-    return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for _, t in both))
+    touches = [touch for _, touch in touching(model)]
+    return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for t in touches))
 
 
 def point_contacts(
@@ -81,7 +81,7 @@ def point_contacts(
         friction: The coefficient of all contacts; None for those of the constraints.
     """
     kinematics, links = model.links.kinematics(), model.links
-    found = []
+    contacts = []
     for i, (constraint, touch) in enumerate(touching(model)):
         point = ca.SX.sym("point", 3)
         arm = radius * ca.mtimes(links.rotation(touch.frame), normals[3 * i : 3 * i + 3])
@@ -94,27 +94,29 @@ def point_contacts(
         jacobian = ca.jacobian(kinematics.value(moving), links.v)
         velocity = kinematics.value(touch.velocity(point))
         jacobian, velocity = ca.substitute([jacobian, velocity], [point], [contact])
-        own = {p.name.removeprefix(f"{constraint.name}."): p.symbol for p in constraint.parameters}
-        coefficient = own.get("friction", ca.SX(0)) if friction is None else friction
-        viscous = own.get("viscous_friction", ca.SX(0))
-        found.append(PointContact(depth, normal, jacobian, velocity, coefficient, viscous))
-    return found
+        parameters = {
+            p.name.removeprefix(f"{constraint.name}."): p.symbol for p in constraint.parameters
+        }
+        coefficient = parameters.get("friction", ca.SX(0)) if friction is None else friction
+        viscous = parameters.get("viscous_friction", ca.SX(0))
+        contacts.append(PointContact(depth, normal, jacobian, velocity, coefficient, viscous))
+    return contacts
 
 
 def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
     """The unit normal of the surface and the depth of the overlap of a ball there.
 
-    The distance of a surface may be exact on it alone. Then it is that of the deepest point of the
-    ball, p = ball - radius n(p), which is found by repetition.
+    If the distance is exact only on the surface, the depth is that of the deepest point of the
+    ball, p = ball - radius n(p), by fixed-point iteration.
     """
-    place = ca.SX.sym("place", 3)
-    clearance = touch.clearance(place)
-    slope = ca.gradient(clearance, place)
+    point = ca.SX.sym("point", 3)
+    clearance = touch.clearance(point)
+    slope = ca.gradient(clearance, point)
     if touch.is_exact:
-        normal, gap = ca.substitute([slope, clearance], [place], [ball])
+        normal, gap = ca.substitute([slope, clearance], [point], [ball])
         return normal, radius - gap
     slope = slope / length_of(slope)
-    normal = ca.substitute(slope, place, ball)
+    normal = ca.substitute(slope, point, ball)
     for _ in range(TURNS):
-        normal = ca.substitute(slope, place, ball - radius * normal)
-    return normal, -ca.substitute(clearance, place, ball - radius * normal)
+        normal = ca.substitute(slope, point, ball - radius * normal)
+    return normal, -ca.substitute(clearance, point, ball - radius * normal)

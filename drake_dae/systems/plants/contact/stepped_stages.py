@@ -2,13 +2,14 @@
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import simulation_error
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.systems.plants.robot_ports import stage_ports
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -48,7 +49,7 @@ class SteppedStages(LeafSystem):
         parameters: Values of all parameters.
 
     Attributes:
-        stage_ports: The names of the stages' own ports.
+        stage_ports: Name of a port of the stages -> its part of s.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -71,30 +72,25 @@ class SteppedStages(LeafSystem):
         self._state = self.DeclareDiscreteState(dae.nominal_state[size:])
         # Unrestricted, as the step of a discrete MultibodyPlant, so that both see the same instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._advance))
-        own = {self.discrete_state_ticket(self._state)}
-        both = own | {self.input_port_ticket(self._links.get_index())}
-        count = model.joint_force.numel()
-        self.DeclareVectorOutputPort("joint_torque", count, weakly(self._calc_torque), both)
-        self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._calc_state), both)
-        self.stage_ports: dict[str, slice] = {}
-        start = 0
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                places = slice(start + part.start, start + part.stop)
-                calc = weakly(self._calc_part, places)
-                self.DeclareVectorOutputPort(name, part.stop - part.start, calc, own)
-                self.stage_ports[name] = places
-            start += stage.state.numel()
+        by_stages = {self.discrete_state_ticket(self._state)}
+        by_state = by_stages | {self.input_port_ticket(self._links.get_index())}
+        torque, count = port_value(self._run, self._torque), model.joint_force.numel()
+        self.DeclareVectorOutputPort("joint_torque", count, torque, by_state)
+        self.DeclareVectorOutputPort("state", dae.num_states, port_value(self._whole), by_state)
+        self.stage_ports = stage_ports(model)
+        for name, part in self.stage_ports.items():
+            value = port_value(self._part, part)
+            self.DeclareVectorOutputPort(name, part.stop - part.start, value, by_stages)
 
     def step(self, state: ca.SX, control: ca.SX, parameters: ca.DM) -> ca.SX:
         """s after a step, of x, shape (n, 1), and u, shape (p, 1)."""
-        found: ca.SX = self._step.function(state, control, parameters)[0]
-        return found
+        after: ca.SX = self._step.function(state, control, parameters)[0]
+        return after
 
     def torque(self, state: ca.SX, parameters: ca.DM) -> ca.SX:
         """The joint torque at x, shape (n, 1)."""
-        found: ca.SX = self._torque.function(state, parameters)[0]
-        return found
+        torque: ca.SX = self._torque.function(state, parameters)[0]
+        return torque
 
     def state(self, context: Context) -> FloatArray:
         """s in a context, shape (k,)."""
@@ -112,14 +108,8 @@ class SteppedStages(LeafSystem):
         state.get_mutable_discrete_state().set_value(self._state, after)
         return EventStatus.Succeeded()
 
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._run(self._torque, context))
-
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._whole(context))
-
-    def _calc_part(self, places: slice, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.state(context)[places])
+    def _part(self, part: slice, context: Context) -> FloatArray:
+        return self.state(context)[part]
 
     def _run(self, function: TracedFunction, context: Context, *inputs: FloatArray) -> FloatArray:
         """The value of a function.
@@ -143,13 +133,19 @@ def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
         control: u, shape (p, 1).
     """
     dae, size = model.dae, _num_link_states(model)
-    driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
-    # Stages do not share a mass with the links.
-    rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
-    after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rate)
+    rates = stage_rates(model, control)
+    after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rates)
     for position, velocity in _shafts(model).items():
         after[position] = dae.state[position] + time_step * after[velocity]
     return after[size:]
+
+
+def stage_rates(model: RobotModel, control: ca.SX) -> ca.SX:
+    """s' = E^-1 (drift(q, v, s) + drive u) as an expression of x and u, shape (k, 1)."""
+    dae, size = model.dae, _num_link_states(model)
+    driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
+    # Stages do not share a mass with the links.
+    return PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
 
 
 def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:
@@ -214,13 +210,13 @@ def _num_link_states(model: RobotModel) -> int:
 
 
 def _shafts(model: RobotModel) -> dict[int, int]:
-    """Where positions of shafts stand in x -> where their velocities do."""
-    found: dict[int, int] = {}
+    """The index of each shaft's position in x -> that of its velocity."""
+    velocities: dict[int, int] = {}
     for stage in model.stages:
         if stage.shaft is not None:
             columns = [
                 ca.DM(ca.jacobian(symbols, model.dae.state)).full().argmax(axis=1).tolist()
                 for symbols in stage.shaft
             ]
-            found.update(zip(*columns, strict=True))
-    return found
+            velocities.update(zip(*columns, strict=True))
+    return velocities

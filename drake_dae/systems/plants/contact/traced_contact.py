@@ -1,4 +1,4 @@
-"""What a `ContactPlant` computes of what Drake steps in it."""
+"""The computations of a `ContactPlant` around the part that Drake steps."""
 
 from collections.abc import Sequence
 
@@ -20,27 +20,27 @@ def traced_contact(
     stages: SteppedStages | None,
     values: FloatArray,
 ) -> Block:
-    """The computations of a `ContactPlant`, whose HELD are (q, v), contact forces, and the stages.
+    """The computations of a `ContactPlant`, whose HELD is (q, v), contact forces, and the stages.
 
     Args:
         plant: The `ContactPlant`.
         contact_signals: Names and units of the contact forces.
-        stepped: What Drake steps, which shows (q, v) and the contact forces.
+        stepped: The part that Drake steps, with outputs (q, v) and the contact forces.
         stages: The stages of its actuation, which are traced; None with rigid joints.
         values: Values of all its parameters.
     """
     dae, manifold, forces = plant.dae, plant.structure.manifold, len(contact_signals)
     links = stepped.system.GetOutputPort("link_state").size()
-    held, given = ca.SX.sym("held", stepped.size), ca.DM(values)
+    held, parameters = ca.SX.sym("held", stepped.size), ca.DM(values)
     ends = np.cumsum([0, links, forces, stepped.size - links - forces]).tolist()
     of_links, contact, of_stages = ca.vertsplit(held, ends)
     state = ca.vertcat(of_links, of_stages)
-    normals = contact_normals(plant.robot("contact")).function(state, given)[0]
+    normals = contact_normals(plant.robot("contact")).function(state, parameters)[0]
     force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
     acting = ca.SX.sym("force", force.numel())
-    found = [dae.outputs(acting), manifold.residual_expression]
+    expressions = [dae.outputs(acting), manifold.residual_expression]
     symbols = [dae.state, dae.parameter_symbol, acting]
-    output, residual = ca.substitute(found, symbols, [state, given, force])
+    output, residual = ca.substitute(expressions, symbols, [state, parameters, force])
     shown = {
         "state": state,
         "link_state": of_links,
@@ -51,10 +51,10 @@ def traced_contact(
     }
     updates = []
     if stages is not None:
-        shown["joint_torque"] = stages.torque(state, given)
+        shown["joint_torque"] = stages.torque(state, parameters)
         shown |= {name: of_stages[part] for name, part in stages.stage_ports.items()}
         control = ca.SX.sym("control", dae.num_controls)
-        after = ca.vertcat(of_links, contact, stages.step(state, control, given))
+        after = ca.vertcat(of_links, contact, stages.step(state, control, parameters))
         function = ca.Function("step", [held, control], [after])
         updates = [
             Update(Computation(function, (HELD, "control"), (HELD,)), stepped.period, 0.0, True)
@@ -63,11 +63,5 @@ def traced_contact(
         Computation(ca.Function(name, [held], [value]), (HELD,), (name,))
         for name, value in shown.items()
     )
-    ports = {
-        "state": tuple(dae.state_signals),
-        "contact_force": tuple(contact_signals),
-        "constraint_force": tuple(dae.force_signals),
-        "constraint_residual": tuple(manifold.residual_signals),
-        "controlled_output": tuple(dae.output_signals),
-    }
+    ports = {**plant.port_signals, "contact_force": tuple(contact_signals)}
     return Block(plant, computations, tuple(updates), stepped=stepped, ports=ports)

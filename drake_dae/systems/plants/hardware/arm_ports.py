@@ -1,57 +1,52 @@
-"""What stands between the messages of an arm's driver and the ports of a plant."""
+"""The ports of a plant, computed from the messages of an arm's driver."""
 
 import casadi as ca
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    EventStatus,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.plants.hardware.drivers import LcmDriver
 
 RUNNING, STOPPED, WAITING = 0.0, 2.0, 3.0
-"""What the port `driver_status` says first; the numbers are those of an exported controller."""
+"""The first entry of the port `driver_status`; the numbers are those of an exported controller."""
 
 STATUS_SIGNALS = (Signal("status"), Signal("age", "s"))
 """Names and units of `driver_status`."""
 
 
 class ArmPorts(LeafSystem):
-    """The ports of a plant from what an arm's driver tells, and torques for it from a control.
+    """The ports of a plant from the messages of an arm's driver, and its torques from a control:
 
-        tau = B u + g(q),    lambda = argmin |tau_ext - G(x) lambda|
+        tau = B u + g(q),    lambda = argmin |tau_ext - G(x) lambda|,
 
     with the generalized forces g of gravity, which the driver compensates, and G of the constraint
-    forces. Before the first message it is WAITING: the torque is zero, and the state the one that
-    was set. A message that is not finite counts for none: the last state stays. Where none came for
-    more than max_age, or the control is not finite, it is STOPPED for good: the torque goes to zero
-    linearly within stop_time, and the driver bears the arm's weight.
+    forces. Before the first message it is WAITING: the torque is zero, and the state is the one
+    that was set. Messages that are not finite are ignored. After max_age without a message, or if
+    the control is not finite, it is STOPPED for good: the torque goes linearly to zero within
+    stop_time, and the driver compensates gravity.
 
     Input ports:
         position, velocity, torque_external: q, v and the driver's external torque, shape (k,).
-        message: The status as Python has it.
+        message: The status message as a Python object.
         control: u, shape (p,).
 
     Output ports:
         state, link_state, constraint_force, constraint_residual, controlled_output: As of a plant.
-        torque: What the driver is sent, N m, shape (k,).
+        torque: The torque for the driver, N m, shape (k,).
         driver_status: WAITING, RUNNING or STOPPED; and the time since the last message, s.
 
     Args:
         model: The robot.
         structure: The structure of its system.
         driver: The driver.
-        period: Of the torques, s.
-        max_age, stop_time: In s.
+        period: The period of the torques, s.
+        max_age: The largest time between messages, s.
+        stop_time: The time in which the torque goes to zero, s.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -87,51 +82,51 @@ class ArmPorts(LeafSystem):
         }
         self._message = self.DeclareAbstractInputPort("message", Value(driver.status()))
         self._control = self.DeclareVectorInputPort("control", dae.num_controls)
-        # The last good state, and force.
+        # The last valid state and force.
         self._start = self.DeclareDiscreteState(dae.nominal_state)
-        self._felt = self.DeclareDiscreteState(dae.num_constraints)
-        # The time stamp of the last message, when it came, and when the arm was stopped.
+        self._last_force = self.DeclareDiscreteState(dae.num_constraints)
+        # The time stamp and the arrival time of the last message, and the time of the stop.
         self._watch = self.DeclareDiscreteState([0.0, 0.0, np.inf])
-        self._last = self.DeclareDiscreteState(count)
+        self._last_torque = self.DeclareDiscreteState(count)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, weakly(self._update))
-        known = {
+        tickets = {
             self.xd_ticket(),
             self.input_port_ticket(self._message.get_index()),
             *(self.input_port_ticket(port.get_index()) for port in self._ports.values()),
         }
-        for name, size, calc in (
-            ("state", dae.num_states, self._calc_state),
-            ("link_state", dae.num_states, self._calc_state),
-            ("constraint_force", dae.num_constraints, self._calc_force),
-            ("constraint_residual", len(self._manifold.residual_signals), self._calc_residual),
-            ("controlled_output", dae.num_outputs, self._calc_output),
+        for name, size, value in (
+            ("state", dae.num_states, self.state),
+            ("link_state", dae.num_states, self.state),
+            ("constraint_force", dae.num_constraints, self._force),
+            ("constraint_residual", len(self._manifold.residual_signals), self._residual),
+            ("controlled_output", dae.num_outputs, self._outputs),
         ):
-            self.DeclareVectorOutputPort(name, size, weakly(calc), known)
-        times = known | {self.time_ticket()}
-        self.DeclareVectorOutputPort("driver_status", 2, weakly(self._calc_status), times)
-        self.DeclareVectorOutputPort("torque", count, weakly(self._calc_torque))
+            self.DeclareVectorOutputPort(name, size, port_value(value), tickets)
+        by_time = tickets | {self.time_ticket()}
+        self.DeclareVectorOutputPort("driver_status", 2, port_value(self._status), by_time)
+        self.DeclareVectorOutputPort("torque", count, port_value(self._torque))
 
     def state(self, context: Context) -> FloatArray:
-        """x, shape (n,): what the last good message says; before the first one, what was set."""
-        told = self._told(context)
-        if told is None:
+        """x of the last valid message, shape (n,); before the first one, the state that was set."""
+        measured = self._measured(context)
+        if measured is None:
             return np.array(context.get_discrete_state(self._start).value())
-        return told[: 2 * self._count]
+        return measured[: 2 * self._count]
 
     def set_state(self, context: Context, state: FloatArray) -> None:
-        """Sets the state that is shown before the first message."""
+        """Sets the state before the first message."""
         context.SetDiscreteState(self._start, state)
 
-    def _told(self, context: Context) -> FloatArray | None:
-        """Positions, velocities and external torques of the message; None if it is of no use."""
+    def _measured(self, context: Context) -> FloatArray | None:
+        """Positions, velocities and external torques of the message; None if it is not valid."""
         if not self._message.Eval(context).utime:
             return None
-        found = np.concatenate([port.Eval(context) for port in self._ports.values()])
-        return found if np.isfinite(found).all() else None
+        values = np.concatenate([port.Eval(context) for port in self._ports.values()])
+        return values if np.isfinite(values).all() else None
 
     def _stamp(self, context: Context) -> float:
-        """The time stamp of the last good message; 0 before the first one."""
-        if self._told(context) is None:
+        """The time stamp of the last valid message; 0 before the first one."""
+        if self._measured(context) is None:
             return float(context.get_discrete_state(self._watch).value()[0])
         return float(self._message.Eval(context).utime)
 
@@ -143,23 +138,23 @@ class ArmPorts(LeafSystem):
             return STOPPED, age
         return (RUNNING, age) if self._stamp(context) else (WAITING, age)
 
-    def _wanted(self, context: Context) -> FloatArray:
+    def _commanded(self, context: Context) -> FloatArray:
         """B u + g(q)."""
         self._plant.SetPositions(self._weight, self.state(context)[: self._count])
         gravity = self._plant.CalcGravityGeneralizedForces(self._weight)
-        found: FloatArray = self._select @ self._control.Eval(context) + gravity
-        return found
+        torque: FloatArray = self._select @ self._control.Eval(context) + gravity
+        return torque
 
     def _torque(self, context: Context) -> FloatArray:
         status, _ = self._status(context)
-        last: FloatArray = context.get_discrete_state(self._last).value()
+        last: FloatArray = context.get_discrete_state(self._last_torque).value()
         if status == WAITING:
             return np.zeros(self._count)
         if status == STOPPED:
             passed = context.get_time() - context.get_discrete_state(self._watch).value()[2]
             return last * max(0.0, 1.0 - passed / self._stop_time)
-        wanted = self._wanted(context)
-        return wanted if np.isfinite(wanted).all() else last
+        torque = self._commanded(context)
+        return torque if np.isfinite(torque).all() else last
 
     def _update(self, context: Context, values: DiscreteValues) -> EventStatus:
         now, (status, age) = context.get_time(), self._status(context)
@@ -168,37 +163,24 @@ class ArmPorts(LeafSystem):
         if self._stamp(context) != stamp:
             came_at = now
         if status == RUNNING:
-            values.get_mutable_vector(self._last).SetFromVector(self._torque(context))
-            if age > self._max_age or not np.isfinite(self._wanted(context)).all():
+            values.get_mutable_vector(self._last_torque).SetFromVector(self._torque(context))
+            if age > self._max_age or not np.isfinite(self._commanded(context)).all():
                 stopped_at = now
         watch.SetFromVector([self._stamp(context), came_at, stopped_at])
         values.get_mutable_vector(self._start).SetFromVector(self.state(context))
-        values.get_mutable_vector(self._felt).SetFromVector(self._force(context))
+        values.get_mutable_vector(self._last_force).SetFromVector(self._force(context))
         return EventStatus.Succeeded()
 
     def _force(self, context: Context) -> FloatArray:
-        told = self._told(context)
-        if told is None:
-            return np.array(context.get_discrete_state(self._felt).value())
-        external = self._sign * told[2 * self._count :]
+        measured = self._measured(context)
+        if measured is None:
+            return np.array(context.get_discrete_state(self._last_force).value())
+        external = self._sign * measured[2 * self._count :]
         (mapped, *_) = self._map(self.state(context), self._values)
         return np.asarray(np.linalg.lstsq(mapped.reshape(self._count, -1), external, None)[0])
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.state(context))
+    def _residual(self, context: Context) -> FloatArray:
+        return self._manifold.residual(self.state(context), self._values)
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._force(context))
-
-    def _calc_residual(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._manifold.residual(self.state(context), self._values))
-
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
-        given = self.state(context), self._force(context), self._values
-        output.SetFromVector(self._output(*given)[0])
-
-    def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._status(context))
-
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._torque(context))
+    def _outputs(self, context: Context) -> FloatArray:
+        return self._output(self.state(context), self._force(context), self._values)[0]

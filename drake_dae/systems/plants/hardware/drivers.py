@@ -18,16 +18,16 @@ from pydrake.systems.framework import System
 
 @dataclass(frozen=True)
 class LcmDriver:
-    """What talks to an arm by LCM, commanded by torques beyond those that bear its own weight.
+    """The LCM driver of an arm, which takes torques in addition to gravity compensation.
 
     Attributes:
         status, command: The types of the messages.
-        status_channel, command_channel: Where they are.
+        status_channel, command_channel: The names of their channels.
         receiver: Number of joints -> Drake's block that reads a status.
         sender: Number of joints -> Drake's block that writes a command of torques.
         position, velocity: The names of these ports of the receiver.
-        external_sign: The sign of the external torque in the message: 1 where it is that on the
-            arm, as for a KUKA iiwa, -1 where it is what the arm does, as for a Franka Panda.
+        external_sign: The sign of the external torque in the message: 1 for the torque on the arm,
+            as for a KUKA iiwa, -1 for the torque of the arm, as for a Franka Panda.
     """
 
     status: Any

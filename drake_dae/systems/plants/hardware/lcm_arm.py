@@ -22,7 +22,7 @@ from drake_dae.systems.plants.hardware.arm_ports import STATUS_SIGNALS, ArmPorts
 from drake_dae.systems.plants.hardware.drivers import DRIVERS
 
 CRASHES = (3, 13)
-"""From this Python on a message that Drake 1.51 reads ends the process by a segmentation fault."""
+"""From this version of Python on, Drake 1.51 crashes when it reads a message."""
 
 
 @checked(ModelError)
@@ -32,8 +32,8 @@ class LcmArm(Diagram, Plant):
     It reads status messages and publishes torques by Drake's blocks, and takes the place of the
     simulated plant in the same diagram: `make_closed_loop(LcmArm(...), law, ...)`, simulated at
     the rate of real time, `SimulatorConfig(target_realtime_rate=1.0)`. The driver compensates
-    gravity and sends an external torque, from which the constraint force is estimated. What it does
-    before the first message, and without a fresh one, is said by `ArmPorts`.
+    gravity and sends an external torque, from which the constraint force is estimated. For its
+    behavior before the first message, and without a recent one, see `ArmPorts`.
 
     Input port:
         control: u, shape (p,): torques of the actuators, N m.
@@ -41,17 +41,17 @@ class LcmArm(Diagram, Plant):
     Output ports:
         state: x = (q, v) of the last message, shape (n,). link_state: The same.
         constraint_force, constraint_residual, controlled_output: As of `ArmPorts`.
-        driver_status: 3 before the first message, 0, 2 once it is stopped; and the time since the
-            last message, s.
+        driver_status: 3 before the first message, then 0, and 2 after a stop; and the time since
+            the last message, s.
 
     Args:
         model: The robot, of a MultibodyPlant, with rigid joints and an actuator in each.
-        lcm: Where the driver is, such as DrakeLcm(); DrakeLcm("memq://") in a test.
+        lcm: The LCM interface of the driver, such as DrakeLcm(); DrakeLcm("memq://") in a test.
         driver: "iiwa" or "panda".
         structure: The structure of the model's system.
-        period: Between torques, s.
-        max_age: How old a status may be, s; then the arm is stopped.
-        stop_time: Within which the torque then goes to zero, s.
+        period: The period of the torques, s.
+        max_age: The largest age of a status, s; then the arm is stopped.
+        stop_time: The time in which the torque then goes to zero, s.
 
     Attributes:
         dae, model, structure, time_step: As for `Plant`.
@@ -90,10 +90,10 @@ class LcmArm(Diagram, Plant):
         self.dae, self.structure, self.time_step = model.dae, structure, period
         chosen, count, builder = DRIVERS[driver], model.links.q.numel(), DiagramBuilder()
         bus = builder.AddSystem(LcmInterfaceSystem(lcm))
-        given = chosen.status_channel, chosen.status, bus
-        status = builder.AddSystem(LcmSubscriberSystem.Make(*given, use_cpp_serializer=True))
-        # The same as Python reads it: no block of Drake tells the time stamp of every driver.
-        stamped = builder.AddSystem(LcmSubscriberSystem.Make(*given))
+        channel = chosen.status_channel, chosen.status, bus
+        status = builder.AddSystem(LcmSubscriberSystem.Make(*channel, use_cpp_serializer=True))
+        # The same message in Python: not every receiver of Drake has its time stamp on a port.
+        stamped = builder.AddSystem(LcmSubscriberSystem.Make(*channel))
         stamped.set_name("stamped_status")
         receiver = builder.AddSystem(chosen.receiver(count))
         ports = builder.AddSystem(ArmPorts(model, structure, chosen, period, max_age, stop_time))
@@ -140,18 +140,18 @@ class LcmArm(Diagram, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        own = self.GetMutableSubsystemContext(self._ports, context)
-        self._ports.set_state(own, self.dae.state_vector(state))
+        ports_context = self.GetMutableSubsystemContext(self._ports, context)
+        self._ports.set_state(ports_context, self.dae.state_vector(state))
 
     def traced(self) -> Block:
         raise not_traced(f"'{self.get_name()}', an arm behind LCM,")
 
 
 def _check_model(model: RobotModel) -> None:
-    """Refuses a robot whose joints are not commanded one by one.
+    """Refuses a robot whose joints are not driven one by one.
 
     Raises:
-        ModelError: Why.
+        ModelError: The robot does not fit; the message has the reason.
     """
     links, what = model.links, None
     if model.stages:

@@ -32,7 +32,7 @@ MARGINS = (1e-8, 1e-5, 1e-3, 1e-2)
 """The distances from the boundary of its cone at which an impulse counts as on it."""
 
 NEWTON_STEPS = 12
-"""The largest number of Newton steps for the right contact states."""
+"""The largest number of Newton steps for given contact states."""
 
 ROUND_OFF = 1e-14
 """A Newton step below this, relative to the impulses, is the last."""
@@ -74,7 +74,7 @@ class Cone:
 
 
 def in_cones(matrix: FloatArray, offset: FloatArray, cones: Sequence[Cone]) -> FloatArray | None:
-    """The impulses y, shape (k,); None if none are found.
+    """The impulses y, shape (k,); None if the search fails.
 
     Args:
         matrix: W, positive semidefinite, shape (k, k).
@@ -89,8 +89,8 @@ def in_cones(matrix: FloatArray, offset: FloatArray, cones: Sequence[Cone]) -> F
         unit[cone.rows] = 1.0 / np.sqrt(np.mean(np.diag(matrix)[cone.rows]))
     W, q = matrix * unit * unit[:, None], offset * unit
     size = float(np.abs(q).max())
-    found = _searched(W, q / size, cones)
-    return None if found is None else size * unit * found
+    impulses = _searched(W, q / size, cones)
+    return None if impulses is None else size * unit * impulses
 
 
 def _searched(W: FloatArray, q: FloatArray, cones: Sequence[Cone]) -> FloatArray | None:
@@ -111,9 +111,9 @@ def _searched(W: FloatArray, q: FloatArray, cones: Sequence[Cone]) -> FloatArray
             continue
         if not np.abs(z).max() < LARGEST:
             return None
-        found = _polished(W, q, cones, z)
-        if found is not None:
-            return found
+        impulses = _polished(W, q, cones, z)
+        if impulses is not None:
+            return impulses
         apart, moved = np.linalg.norm(y - z), penalty * np.linalg.norm(z - before)
         if max(apart, moved) > BALANCE * min(apart, moved):
             penalty = float(np.clip(penalty * (2.0 if apart > moved else 0.5), *PENALTIES))
@@ -136,9 +136,9 @@ def _polished(
         kinds = [0 if way is None else 1 + int(way.any()) for way in ways]
         if kinds not in tried:
             tried.append(kinds)
-            found = _solved(W, q, cones, start, ways)
-            if found is not None:
-                return found
+            impulses = _solved(W, q, cones, start, ways)
+            if impulses is not None:
+                return impulses
     return None
 
 
@@ -176,17 +176,17 @@ def _solved(
         change = np.linalg.lstsq(jacobian, -tests.T @ u)[0]
         if not np.isfinite(change).all():
             return None
-        for i, (cone, own) in enumerate(zip(cones, np.split(change, ends[:-1]), strict=True)):
+        for i, (cone, part) in enumerate(zip(cones, np.split(change, ends[:-1]), strict=True)):
             way = ways[i]
             if way is None:
                 continue
             if not way.any():
-                y[cone.rows] += own
+                y[cone.rows] += part
                 continue
-            if own.size == 2:
-                angle = np.arctan2(way[1], way[0]) + own[1]
+            if part.size == 2:
+                angle = np.arctan2(way[1], way[0]) + part[1]
                 way = ways[i] = np.array([np.cos(angle), np.sin(angle)])
-            y[cone.rows] = (y[cone.rows.start] + own[0]) * _against(cone, way)
+            y[cone.rows] = (y[cone.rows.start] + part[0]) * _against(cone, way)
         if np.abs(change).max() <= ROUND_OFF * np.abs(y).max():
             break
     rates = W @ y + q
@@ -199,12 +199,12 @@ def _solved(
 
 def _diagonal(cones: Sequence[Cone], blocks: Sequence[FloatArray]) -> FloatArray:
     """Blocks of columns, each in the rows of its contact."""
-    found = np.zeros((cones[-1].rows.stop, sum(block.shape[1] for block in blocks)))
+    columns = np.zeros((cones[-1].rows.stop, sum(block.shape[1] for block in blocks)))
     first = 0
     for cone, block in zip(cones, blocks, strict=True):
-        found[cone.rows, first : first + block.shape[1]] = block
+        columns[cone.rows, first : first + block.shape[1]] = block
         first += block.shape[1]
-    return found
+    return columns
 
 
 def _way(cone: Cone, impulse: FloatArray, least: float, margin: float) -> FloatArray | None:

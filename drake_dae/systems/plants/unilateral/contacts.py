@@ -52,22 +52,22 @@ class ConstraintTerms:
         return self.all_impulses[:m, :m]
 
     def painleve_outcome(
-        self, kept: Sequence[int], normals: Sequence[int]
+        self, bilateral: Sequence[int], normals: Sequence[int]
     ) -> PainleveOutcome | None:
         """The outcome of a Painleve paradox of touching contacts; None if one set of forces fits.
 
         Args:
-            kept: The bilateral rows.
+            bilateral: The bilateral rows.
             normals: The rows of the contacts.
         """
-        rows = [*kept, *normals]
+        rows = [*bilateral, *normals]
         part = np.ix_(rows, rows)
         matrix, without, offset = (
             self.force_matrix[part],
             self.impulse_matrix[part],
             self.accelerations[rows],
         )
-        places = list(range(len(kept), len(rows)))
+        places = list(range(len(bilateral), len(rows)))
         if is_p_matrix(matrix, without, places):
             return None
         force = np.full(len(rows), np.inf)
@@ -89,7 +89,7 @@ class UnilateralContacts:
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
         along: The rows of the sliding velocities of each contact in `all_rates`.
-        kept: The rows of all other constraints.
+        bilateral: The rows of all other constraints.
         normals: The normal row of each contact.
         gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
@@ -132,10 +132,8 @@ class UnilateralContacts:
             constraint, part = parts[name]
             normal = part.start + constraint.is_unilateral.index(True)
             self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
-        own = {int(row) for touch in self.touches for row in touch.rows}
-        self.kept: Indices = np.array(
-            [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
-        )
+        opening = np.concatenate([touch.rows for touch in self.touches])
+        self.bilateral: Indices = np.setdiff1d(np.arange(model.dae.num_constraints), opening)
         self.normals = [touch.normal for touch in self.touches]
         self.restitution = np.array(
             [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]
@@ -155,8 +153,9 @@ class UnilateralContacts:
         ]
         self.residual = ca.vertcat(ca.SX(0, 1), *holds)
         self.sizes = [held.numel() for held in holds]
-        found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
-        self.gaps = dae.trace("gaps", found)
+        self.gaps = dae.trace(
+            "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
+        )
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
         sliding = self._sliding(model, parts)
@@ -242,17 +241,17 @@ class UnilateralContacts:
         )
 
     def painleve_error(
-        self, time: float, state: FloatArray, names: Sequence[str], found: PainleveOutcome | None
+        self, time: float, state: FloatArray, names: Sequence[str], outcome: PainleveOutcome | None
     ) -> PainleveError:
         """The error of a Painleve paradox."""
-        outcome = f". Its outcome is {found.value}" if found else ""
+        remark = f". Its outcome is {outcome.value}" if outcome else ""
         return PainleveError(
             f"{self.dae.name}: Painleve paradox at the contact of {', '.join(names)} at "
-            f"t = {time:.6g} s, state {show(state)}{outcome}. Lower the friction, slide the other "
+            f"t = {time:.6g} s, state {show(state)}{remark}. Lower the friction, slide the other "
             "way, or hold the robot less steeply to the surface",
             time,
             state,
-            found,
+            outcome,
         )
 
 

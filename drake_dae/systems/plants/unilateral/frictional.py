@@ -1,7 +1,7 @@
 """Impacts of frictional contacts: Newton's law along normals, Coulomb's along surfaces.
 
-With c the rates, A = J M^-1 J^T over all rows, and Lambda the impulses, c+ = c- + A Lambda; kept
-rows have c+ = 0, and each contact with its normal n and its rows t along the surface
+With c the rates, A = J M^-1 J^T over all rows, and Lambda the impulses, c+ = c- + A Lambda;
+bilateral rows have c+ = 0, and each contact with its normal n and its rows t along the surface
 
     0 <= Lambda_n,    0 <= c+_n + e c-_n,    Lambda_n (...) = 0,
     c+_t = 0 and |Lambda_t| <= mu Lambda_n,    or    Lambda_t = -mu Lambda_n c+_t / |c+_t|
@@ -58,27 +58,30 @@ class FrictionalContact:
 
 
 def impact(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
+    matrix: FloatArray,
+    before: FloatArray,
+    bilateral: Indices,
+    contacts: Sequence[FrictionalContact],
 ) -> FloatArray | None:
     """The impulses Lambda of frictional contacts, shape (k,).
 
     Args:
         matrix: A over all rows, positive semidefinite, shape (k, k).
         before: c-, shape (k,).
-        kept: The bilateral rows.
+        bilateral: The bilateral rows.
         contacts: The contacts that touch.
 
     Returns:
         The impulses; None if none are found.
     """
-    found = _impulses(matrix, before, kept, contacts)
-    if found is not None and _gained(matrix, before, found) <= 0.0:
-        return found
+    impulses = _impulses(matrix, before, bilateral, contacts)
+    if impulses is not None and _gained(matrix, before, impulses) <= 0.0:
+        return impulses
     least, most = 0.0, 1.0
-    best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
+    best = _impulses(matrix, before, bilateral, _bouncing(contacts, 0.0))
     for _ in range(HALVINGS if best is not None else 0):
         middle = 0.5 * (least + most)
-        tried = _impulses(matrix, before, kept, _bouncing(contacts, middle))
+        tried = _impulses(matrix, before, bilateral, _bouncing(contacts, middle))
         if tried is not None and _gained(matrix, before, tried) <= 0.0:
             least, best = middle, tried
         else:
@@ -87,7 +90,7 @@ def impact(
 
 
 def _bouncing(contacts: Sequence[FrictionalContact], factor: float) -> list[FrictionalContact]:
-    return [replace(one, restitution=factor * one.restitution) for one in contacts]
+    return [replace(contact, restitution=factor * contact.restitution) for contact in contacts]
 
 
 def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> float:
@@ -98,69 +101,72 @@ def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> flo
 
 
 def _impulses(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
+    matrix: FloatArray,
+    before: FloatArray,
+    bilateral: Indices,
+    contacts: Sequence[FrictionalContact],
 ) -> FloatArray | None:
     # The impulses of bilateral rows follow from c_k = 0.
-    inverse = np.linalg.pinv(matrix[np.ix_(kept, kept)], DEPENDENT, hermitian=True)
-    A = matrix - matrix[:, kept] @ inverse @ matrix[kept]
-    b = before - matrix[:, kept] @ inverse @ before[kept]
-    wanted = b.copy()
+    inverse = np.linalg.pinv(matrix[np.ix_(bilateral, bilateral)], DEPENDENT, hermitian=True)
+    A = matrix - matrix[:, bilateral] @ inverse @ matrix[bilateral]
+    b = before - matrix[:, bilateral] @ inverse @ before[bilateral]
+    target = b.copy()
     blocks = []
-    for one in contacts:
-        wanted[one.normal] += one.restitution * before[one.normal]
-        blocks.append(_axes(A, one))
+    for contact in contacts:
+        target[contact.normal] += contact.restitution * before[contact.normal]
+        blocks.append(_axes(A, contact))
     make = np.hstack(blocks)
-    W, q = make.T @ A @ make, make.T @ wanted
+    W, q = make.T @ A @ make, make.T @ target
     ends = np.cumsum([axes.shape[1] for axes in blocks]).tolist()
     cones = [
-        Cone(slice(end - axes.shape[1], end), one.friction)
-        for axes, end, one in zip(blocks, ends, contacts, strict=True)
+        Cone(slice(end - axes.shape[1], end), contact.friction)
+        for axes, end, contact in zip(blocks, ends, contacts, strict=True)
     ]
-    found = in_cones(W, q, cones) if len(cones) > 1 else _of_one(W, q, cones[0].friction)
-    if found is None:
+    solution = in_cones(W, q, cones) if len(cones) > 1 else _of_one(W, q, cones[0].friction)
+    if solution is None:
         return None
-    total = make @ found
-    total[kept] = -inverse @ (before[kept] + matrix[kept] @ total)
+    total = make @ solution
+    total[bilateral] = -inverse @ (before[bilateral] + matrix[bilateral] @ total)
     return total
 
 
-def _axes(matrix: FloatArray, one: FrictionalContact) -> FloatArray:
+def _axes(matrix: FloatArray, contact: FrictionalContact) -> FloatArray:
     """The normal and the sliding directions, as columns."""
-    rows = one.along if one.friction else one.along[:0]
+    rows = contact.along if contact.friction else contact.along[:0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
     moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
     axes = np.zeros((matrix.shape[0], 1 + moved.shape[1]))
-    axes[one.normal, 0] = 1.0
+    axes[contact.normal, 0] = 1.0
     axes[rows, 1:] = moved
     return axes
 
 
-def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray | None:
+def _of_one(matrix: FloatArray, target: FloatArray, friction: float) -> FloatArray | None:
     """The impulses of one contact, its normal first: it opens, sticks or slides."""
-    if wanted[0] >= 0.0:
-        return np.zeros(wanted.size)
-    if wanted.size == 1:
-        return -wanted / matrix[0]
-    sticking = _sticking(matrix, wanted)
+    if target[0] >= 0.0:
+        return np.zeros(target.size)
+    if target.size == 1:
+        return -target / matrix[0]
+    sticking = _sticking(matrix, target)
     if sticking is not None and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
         return sticking
     if np.isinf(friction):
         return None
     # If there is no impulse, values are not finite and do not fit.
     with np.errstate(invalid="ignore"):
-        ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
-        impulses, after = _slid(matrix, wanted, friction, ways)
+        ways = np.array([[1.0, -1.0]]) if target.size == 2 else _ways(matrix, target, friction)
+        impulses, after = _slid(matrix, target, friction, ways)
         onward = np.sum(after * ways, axis=0)
     fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (onward >= 0.0)
     if not fits.any():
         return None
     # If several fit, the one with the smallest change of direction.
-    left = np.flatnonzero(fits)
-    best = int(np.argmax(wanted[1:] @ after[:, left]))
-    return np.asarray(impulses[:, left[best]])
+    fitting = np.flatnonzero(fits)
+    best = int(np.argmax(target[1:] @ after[:, fitting]))
+    return np.asarray(impulses[:, fitting[best]])
 
 
-def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
+def _sticking(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
     """Impulses with w = 0 in the cone, those with the least friction; None if there are none.
 
     If the robot has fewer degrees of freedom than the contact has rows, they are dependent.
@@ -169,47 +175,47 @@ def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
     is_moved = values > NOTHING * values[-1]
     moved, idle = vectors[:, is_moved], vectors[:, ~is_moved]
     if not idle.size:
-        found = np.linalg.solve(matrix, -wanted)
+        impulses = np.linalg.solve(matrix, -target)
     else:
-        found = -moved @ ((moved.T @ wanted) / values[is_moved])
-        if np.abs(idle.T @ wanted).max() > FITS * np.abs(wanted).max():
+        impulses = -moved @ ((moved.T @ target) / values[is_moved])
+        if np.abs(idle.T @ target).max() > FITS * np.abs(target).max():
             return None
-        found += idle @ np.linalg.lstsq(idle[1:], -found[1:])[0]
-    return np.asarray(found) if found[0] > 0.0 else None
+        impulses += idle @ np.linalg.lstsq(idle[1:], -impulses[1:])[0]
+    return np.asarray(impulses) if impulses[0] > 0.0 else None
 
 
 def _slid(
-    matrix: FloatArray, wanted: FloatArray, friction: float, ways: FloatArray
+    matrix: FloatArray, target: FloatArray, friction: float, ways: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Impulses with friction opposite to given directions, and their tangential c+; columns."""
     push = np.vstack([np.ones((1, ways.shape[1])), -friction * ways])
     mobility = matrix[0] @ push
     impulses = push * np.divide(
-        -wanted[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
+        -target[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
     )
-    return impulses, wanted[1:, None] + matrix[1:] @ impulses
+    return impulses, target[1:, None] + matrix[1:] @ impulses
 
 
-def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
+def _ways(matrix: FloatArray, target: FloatArray, friction: float) -> FloatArray:
     """The directions in a plane for which the contact slides along them after the impact.
 
-    Of c+ along the surface, times the mobility across it, what is across a direction of angle a is
-    a trigonometric polynomial of degree two: sum c_k z^k, |k| <= 2, whose zeros are of length one.
+    The component of c+ across the direction of angle a, times the mobility, is a trigonometric
+    polynomial of degree two in a: sum c_k z^k, |k| <= 2, z = exp(i a), whose zeros have |z| = 1.
     """
     angles = 2.0 * np.pi * np.arange(5) / 5.0
     ways = np.array([np.cos(angles), np.sin(angles)])
     push = np.vstack([np.ones(5), -friction * ways])
-    after = wanted[1:, None] * (matrix[0] @ push) - wanted[0] * (matrix[1:] @ push)
+    after = target[1:, None] * (matrix[0] @ push) - target[0] * (matrix[1:] @ push)
     factors = np.fft.fft(ways[0] * after[1] - ways[1] * after[0])[[2, 1, 0, 4, 3]] / 5.0
     size = np.abs(factors).sum()
     factors[np.abs(factors) < NOTHING * size] = 0.0
     roots = np.roots(factors)
-    found = np.angle(roots[np.abs(np.abs(roots) - 1.0) < NEAR])
+    angle = np.angle(roots[np.abs(np.abs(roots) - 1.0) < NEAR])
     orders = 1j * np.arange(2, -3, -1)
     for _ in range(POLISHED):
-        waves = np.exp(np.outer(found, orders))
+        waves = np.exp(np.outer(angle, orders))
         slopes = (waves @ (orders * factors)).real
         steep = np.abs(slopes) > NOTHING * size
-        found[steep] -= (waves @ factors).real[steep] / slopes[steep]
-    found = found[np.abs((np.exp(np.outer(found, orders)) @ factors).real) < FITS * size]
-    return np.array([np.cos(found), np.sin(found)])
+        angle[steep] -= (waves @ factors).real[steep] / slopes[steep]
+    angle = angle[np.abs((np.exp(np.outer(angle, orders)) @ factors).real) < FITS * size]
+    return np.array([np.cos(angle), np.sin(angle)])

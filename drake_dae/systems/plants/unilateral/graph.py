@@ -55,15 +55,15 @@ class ContactGraph:
         for mode in self.modes:
             for name in self.contacts:
                 if name in mode:
-                    left = tuple(other for other in mode if other != name)
-                    yield Transition(mode, left, name, f"lambda({name}) falls to 0", "")
+                    remaining = tuple(other for other in mode if other != name)
+                    yield Transition(mode, remaining, name, f"lambda({name}) falls to 0", "")
                     continue
-                more = tuple(other for other in self.contacts if other in mode or other == name)
+                joined = tuple(other for other in self.contacts if other in mode or other == name)
                 falls = f"phi({name}) falls to 0"
                 rate = f"phi'({name})"
                 yield Transition(mode, mode, name, falls, f"{rate} := -e {rate}")
                 settles = f"{falls} and bouncing would end within the settling time"
-                yield Transition(mode, more, name, settles, f"{rate} := 0")
+                yield Transition(mode, joined, name, settles, f"{rate} := 0")
 
     def __str__(self) -> str:
         return "\n".join([f"{self.name}: {len(self.modes)} modes", *map(str, self.transitions)])

@@ -60,14 +60,14 @@ class ImpactSolution:
 
 
 def complementary(
-    matrix: FloatArray, offset: FloatArray, kept: Indices, touches: Sequence[TouchRows]
+    matrix: FloatArray, offset: FloatArray, bilateral: Indices, touches: Sequence[TouchRows]
 ) -> ImpactSolution | None:
     """The y that fits with the fewest acting contacts.
 
     Args:
         matrix: A, shape (m, m).
         offset: b, shape (m,).
-        kept: The rows that nothing opens.
+        bilateral: The rows of bilateral constraints.
         touches: The contacts.
 
     Returns:
@@ -75,13 +75,13 @@ def complementary(
     """
     length = np.sqrt(np.abs(np.diag(matrix)))
     length[length == 0.0] = 1.0
-    used = [*kept, *(row for touch in touches for row in touch.rows)]
+    used = [*bilateral, *(row for touch in touches for row in touch.rows)]
     size = float(np.max(np.abs(offset / length)[used], initial=0.0))
     normals = [touch.normal for touch in touches]
     best, least = None, np.inf
     for count in range(len(touches) + 1):
         for pushing in combinations(range(len(touches)), count):
-            rows = rows_of(matrix, kept, [touches[i] for i in pushing])
+            rows = rows_of(matrix, bilateral, [touches[i] for i in pushing])
             if rows is None:
                 continue
             values = np.zeros(offset.size)
@@ -98,7 +98,7 @@ def complementary(
     return best if least <= FITS * size else None
 
 
-def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[TouchRows]) -> Indices | None:
+def rows_of(matrix: FloatArray, bilateral: Indices, pushing: Sequence[TouchRows]) -> Indices | None:
     """The rows that hold while some contacts act, bilateral ones first, then normals.
 
     Dependent normals are not allowed: of four feet of a table only three carry it. Other rows that
@@ -106,27 +106,27 @@ def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[TouchRows]) -> 
 
     Args:
         matrix: A, shape (m, m).
-        kept: The rows that nothing opens.
+        bilateral: The rows of bilateral constraints.
         pushing: The contacts.
 
     Returns:
         The rows; None if there is no such set.
     """
-    first = [*kept, *(touch.normal for touch in pushing)]
+    first = [*bilateral, *(touch.normal for touch in pushing)]
     others = [row for touch in pushing for row in touch.rows if row != touch.normal]
-    found: list[int] = []
+    independent: list[int] = []
     for row in (*first, *others):
-        trial = [*found, row]
+        trial = [*independent, row]
         part = matrix[np.ix_(trial, trial)]
         length = np.sqrt(np.abs(np.diag(part)))
         if length[-1] > 0.0:
             scaled = part / length / length[:, None]
             if np.linalg.svd(scaled, compute_uv=False)[-1] >= DEPENDENT:
-                found = trial
+                independent = trial
                 continue
         if row in first:
             return None
-    return np.array(found, dtype=int)
+    return np.array(independent, dtype=int)
 
 
 def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray:
@@ -145,10 +145,10 @@ def is_p_matrix(matrix: FloatArray, without: FloatArray, contacts: Sequence[int]
         without: A without friction, positive semidefinite, shape (m, m).
         contacts: The rows of the contacts.
     """
-    kept = [i for i in range(len(matrix)) if i not in contacts]
+    bilateral = [i for i in range(len(matrix)) if i not in contacts]
     for count in range(1, len(contacts) + 1):
         for chosen in combinations(contacts, count):
-            part = np.ix_([*kept, *chosen], [*kept, *chosen])
+            part = np.ix_([*bilateral, *chosen], [*bilateral, *chosen])
             whole = np.linalg.det(without[part])
             # Minors of dependent normals are not decisive.
             if whole > DEPENDENT * np.prod(np.diag(without[part])) and not (

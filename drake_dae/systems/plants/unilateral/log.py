@@ -48,11 +48,11 @@ def clearance(log: RunLog, time: float, gaps: FloatArray, rates: FloatArray) -> 
         time: The time, in s.
         gaps, rates: The gaps and rates of the contacts then, in m and m/s.
     """
-    found = np.maximum(gaps, rates + MARGIN)
+    clearances = np.maximum(gaps, rates + MARGIN)
     if not log.gaps.size:
-        return found
+        return clearances
     pierced = gaps < np.minimum(log.gaps, 0.0) - TOUCHING
-    found[pierced] = gaps[pierced]
+    clearances[pierced] = gaps[pierced]
     dips = lowest(time - log.time, log.gaps, log.rates, gaps, rates)
-    found[dips < -TOUCHING] = dips[dips < -TOUCHING]
-    return found
+    clearances[dips < -TOUCHING] = dips[dips < -TOUCHING]
+    return clearances

@@ -1,6 +1,5 @@
 """The modes of a robot with opening contacts: one system for each set of closed contacts."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -25,10 +24,9 @@ class Mode:
         structure: The structure of the system with their constraints alone.
         rows: The indices of its constraints among all; of sticking contacts, the independent ones.
         dynamics: x', a function of state, control if there is one, and parameters.
-        force: All constraint forces, zero where open, likewise if `force_needs_control`.
-        output: The controlled outputs, likewise if `output_needs_control`.
+        force: All constraint forces, zero where open; it takes the control if that enters them.
+        output: The controlled outputs, likewise.
         holds: For each entry of the constraint residual 1, or 0 if its contact is open.
-        force_needs_control, output_needs_control: Whether the control enters them.
     """
 
     closed: Closed
@@ -38,8 +36,6 @@ class Mode:
     force: TracedFunction
     output: TracedFunction
     holds: FloatArray
-    force_needs_control: bool
-    output_needs_control: bool
 
 
 class Modes:
@@ -54,12 +50,7 @@ class Modes:
         self, contacts: UnilateralContacts, structure: ConstraintStructure | None = None
     ) -> None:
         self._contacts, self._whole = contacts, structure
-        self._known: dict[Closed, Mode] = {}
-
-    @property
-    def known(self) -> Sequence[Mode]:
-        """The modes traced so far."""
-        return tuple(self._known.values())
+        self._traced_modes: dict[Closed, Mode] = {}
 
     def __call__(self, closed: Closed, state: FloatArray) -> Mode:
         """A mode.
@@ -71,10 +62,9 @@ class Modes:
         Raises:
             AssumptionError: Its constraints are dependent near the state, or its A(x) is singular.
         """
-        mode = self._known.get(closed)
-        if mode is None:
-            mode = self._known[closed] = self._traced(closed, state)
-        return mode
+        if closed not in self._traced_modes:
+            self._traced_modes[closed] = self._traced(closed, state)
+        return self._traced_modes[closed]
 
     def _traced(self, closed: Closed, state: FloatArray) -> Mode:
         contacts = self._contacts
@@ -82,13 +72,13 @@ class Modes:
         dae = contacts.dae
         terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
         pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
-        found = rows_of(terms.impulse_matrix, contacts.kept, pushing)
-        if found is None:
+        independent = rows_of(terms.impulse_matrix, contacts.bilateral, pushing)
+        if independent is None:
             raise ModelError(
                 f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "
                 "the constraints depend on each other there"
             )
-        rows = sorted(found.tolist())
+        rows = sorted(independent.tolist())
         whole = self._whole if len(rows) == dae.num_constraints else None
         system = subsystem(contacts, rows, state) if whole is None else whole.system
         try:
@@ -100,10 +90,10 @@ class Modes:
         if any(degree > 2 for degree in structure.constraint_degrees):
             raise ModelError(f"{system.name}: a contact that opens and closes has degree 2 at most")
         derivatives = structure.derivatives
-        own = derivatives.expand(derivatives.constraint_input)
+        constraint_input = derivatives.expand(derivatives.constraint_input)
         force = ca.SX(dae.num_constraints, 1)
-        force[rows] = own
-        output = system.outputs(own)
+        force[rows] = constraint_input
+        output = system.outputs(constraint_input)
         by_control = [ca.depends_on(value, derivatives.control) for value in (force, output)]
         rate = derivatives.expand(derivatives.rate)
         return Mode(
@@ -114,8 +104,6 @@ class Modes:
             force=structure.trace("constraint force", ca.densify(force), by_control[0]),
             output=structure.trace("controlled output", output, by_control[1]),
             holds=contacts.holds(closed),
-            force_needs_control=by_control[0],
-            output_needs_control=by_control[1],
         )
 
 

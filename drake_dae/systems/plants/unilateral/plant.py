@@ -17,11 +17,7 @@ from pydrake.systems.framework import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.errors import (
-    InconsistentStateError,
-    ModelError,
-    SimulationError,
-)
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.blocks.failures import off_manifold
@@ -118,9 +114,7 @@ class UnilateralRobotPlant(ModalPorts):
             "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
         ).cache_index()
         self._margins_index = self.DeclareCacheEntry(
-            "margins",
-            ValueProducer(_no_margins, weakly(self._calc_margins)),
-            self._by_control,
+            "margins", ValueProducer(_no_margins, weakly(self._calc_margins)), self._by_control
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
@@ -149,8 +143,8 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _log(self, context: Context) -> RunLog:
         # The object is not replaced, and is changed in place.
-        found: RunLog = self.get_cache_entry(self._log_index).Eval(context)
-        return found
+        log: RunLog = self.get_cache_entry(self._log_index).Eval(context)
+        return log
 
     def _guard(self, place: int, context: Context) -> float:
         """Positive while a contact keeps its mode: Drake locates the zero."""
@@ -167,8 +161,8 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _margins(self, context: Context) -> FloatArray:
         """For each contact: its force if closed; otherwise positive until it penetrates."""
-        found: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
-        return found
+        margins: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
+        return margins
 
     def _calc_margins(self, context: Context, value: AbstractValue) -> None:
         closed = context.get_discrete_state_vector().value() > 0.5
@@ -179,8 +173,7 @@ class UnilateralRobotPlant(ModalPorts):
             log = self._log(context)
             margins[:] = clearance(log, context.get_time(), gaps, rates)
         if closed.any():
-            force = self._shown_force(context)
-            margins[closed] = force[self._contacts.normals][closed]
+            margins[closed] = self._mode_force(context)[self._contacts.normals][closed]
         value.set_value(margins)
 
     def _at_guard(
@@ -190,9 +183,8 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _start(self, context: Context, state: State) -> EventStatus:
         log, now = self._log(context), context.get_time()
-        earlier = [
-            event for event in log.events if event.time < now
-        ]  # For a run that is continued.
+        # For a run that is continued.
+        earlier = [event for event in log.events if event.time < now]
         vars(log).update(vars(RunLog(events=earlier, time=now)))
         if context.get_accuracy() is None:
             raise SimulationError(
@@ -203,7 +195,6 @@ class UnilateralRobotPlant(ModalPorts):
             )
         x, values = self.state(context), self._values(context)
         self._check(x, values)
-        log = self._log(context)
         if np.isnan(self._control(context)).any():
             # Values held between samples change with this event, at the start of the first step.
             log.waits = True
@@ -223,11 +214,11 @@ class UnilateralRobotPlant(ModalPorts):
     def _check(self, state: FloatArray, parameters: FloatArray) -> None:
         """Refuses a state where no run may start, by the parameters that its system has."""
         values = parameters[: self.dae.parameter_symbol.numel()]
-        kept = self.modes((False,) * len(self.contacts), state).structure.manifold
-        if not kept.is_consistent(state, values):
-            residual = kept.residual(state, values)
+        bilateral = self.modes((False,) * len(self.contacts), state).structure.manifold
+        if not bilateral.is_consistent(state, values):
+            residual = bilateral.residual(state, values)
             worst = int(np.argmax(np.abs(residual)))
-            signal = kept.residual_signals[worst]
+            signal = bilateral.residual_signals[worst]
             raise InconsistentStateError(
                 f"{self.dae.name}: the start state is not on the constraints that stay: "
                 f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
@@ -297,14 +288,9 @@ class UnilateralRobotPlant(ModalPorts):
             guard=Guard(traced.guard(), self._react),
             signals=self._signals,
             ports={
-                "state": tuple(dae.state_signals),
-                "mode": self.mode_signals,
-                "gap": self.gap_signals,
-                "constraint_force": tuple(dae.force_signals),
-                "constraint_residual": tuple(self.structure.manifold.residual_signals),
-                "controlled_output": tuple(dae.output_signals),
+                **self.port_signals,
+                **{name: tuple(signals) for name, signals in self.further_signals.items()},
                 "constraint_wrenches": tuple(self.wrench_signals),
-                **{name: tuple(own) for name, own in self._ports.loop_signals.items()},
             },
         )
 

@@ -1,6 +1,6 @@
 """The ports of a robot with opening contacts, in the mode of its context."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -10,17 +10,13 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.structure.constrained import (
-    ConstraintStructure,
-    constraint_structure_of,
-)
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_ports import RobotPorts
@@ -40,6 +36,7 @@ class ModalPorts(ParameterizedSystem, Plant):
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient = "its velocities jump; convert a RobotPlant with the contacts that stay closed"
 
     def __init__(
         self,
@@ -84,23 +81,21 @@ class ModalPorts(ParameterizedSystem, Plant):
         self._by_control = set(self._by_state)
         if ca.depends_on(balanced, derivatives.control):
             self._by_control.add(self.input_port_ticket(self._control_port.get_index()))
-        self._declare("state", dae.num_states, self._copy_state)
-        self.DeclareVectorOutputPort("mode", count, weakly(self._copy_mode), {self.xd_ticket()})
-        self._declare("gap", count, self._calc_gap)
-        self._declare("constraint_force", dae.num_constraints, self._calc_force, True)
-        self._declare("constraint_residual", residual.numel(), self._calc_residual)
-        self._declare("controlled_output", dae.num_outputs, self._calc_output, True)
-        own = weakly(self._values), weakly(self._shown_force)
-        self._ports = RobotPorts(self, model, dae, *own, self._by_state, self._by_control)
+        by_state, by_control, by_mode = self._by_state, self._by_control, {self.xd_ticket()}
+        for name, size, value, tickets in (
+            ("state", dae.num_states, self._state, by_state),
+            ("mode", count, self._mode_numbers, by_mode),
+            ("gap", count, self._gap, by_state),
+            ("constraint_force", dae.num_constraints, self._force, by_control),
+            ("constraint_residual", residual.numel(), self._held_residual, by_state),
+            ("controlled_output", dae.num_outputs, self._output, by_control),
+        ):
+            self.DeclareVectorOutputPort(name, size, port_value(value), tickets)
+        values, force = weakly(self._values), weakly(self._mode_force)
+        self._ports = RobotPorts(self, model, values, force, self._by_state, self._by_control)
         self.wrench_signals = self._ports.wrench_signals
-        known = ("gap", "constraint_force", "constraint_residual", "controlled_output")
-        self.functions = (*known, *self._ports.loop_signals)
-
-    def _declare(
-        self, name: str, size: int, calc: Callable[..., None], by_control: bool = False
-    ) -> None:
-        tickets = self._by_control if by_control else self._by_state
-        self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
+        names = ("gap", "constraint_force", "constraint_residual", "controlled_output")
+        self.functions = (*names, *self._ports.loop_signals)
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,), such as "<contact>.restitution".
@@ -139,13 +134,8 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        own = {"mode": self.mode_signals, "gap": self.gap_signals}
-        return {**self._ports.loop_signals, **own}
-
-    def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
-        self.check_context(context)
-        return super().state(context)
+        contacts = {"mode": self.mode_signals, "gap": self.gap_signals}
+        return {**self._ports.loop_signals, **contacts}
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets x as given, shape (n,), all contacts open: a run finds its mode at its start.
@@ -153,13 +143,11 @@ class ModalPorts(ParameterizedSystem, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        self.check_context(context)
         super().set_state(context, state)
         context.SetDiscreteState(np.zeros(len(self.contacts)))
 
     def gaps(self, context: Context) -> FloatArray:
         """phi of each contact, m, shape (k,)."""
-        self.check_context(context)
         return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
 
     @cached_property
@@ -189,40 +177,30 @@ class ModalPorts(ParameterizedSystem, Plant):
         """
         if port not in self.functions:
             raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
-        found = np.full((len(given["state"]), self.GetOutputPort(port).size()), np.nan)
-        for now in np.unique(given["mode"], axis=0):
-            rows = np.flatnonzero((given["mode"] == now).all(axis=1))
-            here = {name: values[rows] for name, values in given.items()}
-            mode = self.modes(closed_of(now), here["state"][0])
+        table = np.full((len(given["state"]), self.GetOutputPort(port).size()), np.nan)
+        for flags in np.unique(given["mode"], axis=0):
+            rows = np.flatnonzero((given["mode"] == flags).all(axis=1))
+            in_mode = {name: values[rows] for name, values in given.items()}
+            mode = self.modes(closed_of(flags), in_mode["state"][0])
             if port == "constraint_residual":
-                found[rows] = mode.holds * function_along(self._residual, here)
+                table[rows] = mode.holds * function_along(self._residual, in_mode)
             else:
-                function = {
+                functions = {
                     "gap": self._contacts.gaps,
                     "constraint_force": mode.force,
                     "controlled_output": mode.output,
-                    "loop_state": self._ports.loops,
-                }[port]
-                assert function is not None  # It is one of `functions`.
-                found[rows] = function_along(function, here)
-        return self._pushing(found) if port == "constraint_force" else found
+                    **self._ports.joints,
+                }
+                table[rows] = function_along(functions[port], in_mode)
+        return self._pushing(table) if port == "constraint_force" else table
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        dynamics = self._mode(context).dynamics
-        derivatives.SetFromVector(self._evaluated(dynamics, context, self._is_controlled))
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.dae.name}: a plant whose contacts open and close does not convert to "
-            "AutoDiffXd, since its velocities jump; convert a RobotPlant with those contacts that "
-            "stay closed"
-        )
+        derivatives.SetFromVector(self._evaluate(self._mode(context).dynamics, context))
 
     def _mode(self, context: Context) -> Mode:
+        # Called in each evaluation, so without tuples.
         numbers = context.get_discrete_state_vector().value()
-        mode = self._by_numbers.get(
-            numbers.tobytes()
-        )  # Called in each evaluation, so without tuples.
+        mode = self._by_numbers.get(numbers.tobytes())
         if mode is None:
             state = context.get_continuous_state_vector().value()
             mode = self.modes(closed_of(numbers), state)
@@ -233,17 +211,11 @@ class ModalPorts(ParameterizedSystem, Plant):
     def _control(self, context: Context) -> FloatArray:
         return self._control_port.Eval(context) if self._is_controlled else np.zeros(0)
 
-    def _evaluated(
-        self, function: TracedFunction, context: Context, needs_control: bool
-    ) -> FloatArray:
+    def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
         x = context.get_continuous_state_vector().value()
-        if needs_control:
+        if "control" in function.input_names:
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
-
-    def _shown_force(self, context: Context) -> FloatArray:
-        mode = self._mode(context)
-        return self._evaluated(mode.force, context, mode.force_needs_control)
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
@@ -252,41 +224,42 @@ class ModalPorts(ParameterizedSystem, Plant):
         if not (self.dae.frictional_contacts and isinstance(error, SingularityError) and self._now):
             return error
         control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
-        bound = self._contacts
-        terms = bound.terms(error.state, control, parameters)
+        contacts = self._contacts
+        terms = contacts.terms(error.state, control, parameters)
         places = [i for i, shut in enumerate(self._now.closed) if shut]
-        found = terms.painleve_outcome(bound.kept.tolist(), [bound.normals[i] for i in places])
-        if found is None:
+        normals = [contacts.normals[i] for i in places]
+        outcome = terms.painleve_outcome(contacts.bilateral.tolist(), normals)
+        if outcome is None:
             return error
-        return bound.painleve_error(
-            error.time, error.state, [self.contacts[i] for i in places], found
-        )
+        names = [self.contacts[i] for i in places]
+        return contacts.painleve_error(error.time, error.state, names, outcome)
 
-    def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFrom(context.get_continuous_state_vector())
+    def _state(self, context: Context) -> FloatArray:
+        return context.get_continuous_state_vector().value()
 
-    def _copy_mode(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
+    def _mode_numbers(self, context: Context) -> FloatArray:
+        return context.get_discrete_state_vector().value()
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._pushing(self._shown_force(context)))
+    def _mode_force(self, context: Context) -> FloatArray:
+        return self._evaluate(self._mode(context).force, context)
+
+    def _force(self, context: Context) -> FloatArray:
+        return self._pushing(self._mode_force(context))
 
     def _pushing(self, force: FloatArray) -> FloatArray:
         """Forces, along the last axis; those of contacts are at least zero.
 
         A contact opens at the end of a step, within round-off after the zero of its force.
         """
-        found, normals = force.copy(), self._contacts.normals
-        found[..., normals] = np.maximum(found[..., normals], 0.0)
-        return found
+        pushing, normals = force.copy(), self._contacts.normals
+        pushing[..., normals] = np.maximum(pushing[..., normals], 0.0)
+        return pushing
 
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
-        mode = self._mode(context)
-        output.SetFromVector(self._evaluated(mode.output, context, mode.output_needs_control))
+    def _output(self, context: Context) -> FloatArray:
+        return self._evaluate(self._mode(context).output, context)
 
-    def _calc_residual(self, context: Context, output: BasicVector) -> None:
-        residual = self._evaluated(self._residual, context, False)
-        output.SetFromVector(self._mode(context).holds * residual)
+    def _held_residual(self, context: Context) -> FloatArray:
+        return self._mode(context).holds * self._evaluate(self._residual, context)
 
-    def _calc_gap(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluated(self._contacts.gaps, context, False))
+    def _gap(self, context: Context) -> FloatArray:
+        return self._evaluate(self._contacts.gaps, context)

@@ -125,11 +125,12 @@ class Resets:
             )
         touches = [contacts.touches[i] for i in touching]
         if contacts.dae.frictional_contacts:
-            found = terms.painleve_outcome(
-                contacts.kept.tolist(), [touch.normal for touch in touches]
+            outcome = terms.painleve_outcome(
+                contacts.bilateral.tolist(), [touch.normal for touch in touches]
             )
-            if found in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
-                raise contacts.painleve_error(time, x, [contacts.names[i] for i in touching], found)
+            if outcome in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
+                in_paradox = [contacts.names[i] for i in touching]
+                raise contacts.painleve_error(time, x, in_paradox, outcome)
         fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
         pushing = {touching[place] for place in fit.pushing}
         closed = tuple(i in pushing for i in range(len(closed)))
@@ -143,12 +144,12 @@ class Resets:
         control = np.zeros(contacts.dae.num_controls)
         matrix = contacts.terms(state, control, parameters).impulse_matrix
         gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
-        found: list[int] = []
+        closed: list[int] = []
         for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
-            trial = [contacts.touches[j] for j in (*found, i)]
-            if rows_of(matrix, contacts.kept, trial) is not None:
-                found.append(i)
-        return tuple(i in found for i in range(len(contacts.touches)))
+            trial = [contacts.touches[j] for j in (*closed, i)]
+            if rows_of(matrix, contacts.bilateral, trial) is not None:
+                closed.append(i)
+        return tuple(i in closed for i in range(len(contacts.touches)))
 
     def _impact(
         self,
@@ -165,25 +166,23 @@ class Resets:
         normals = np.array([touch.normal for touch in touches])
         matrix = terms.all_impulses
         frictional = [
-            contacts.frictional_contact(i, parameters, own)
-            for i, own in zip(touching, e, strict=True)
+            contacts.frictional_contact(i, parameters, coefficient)
+            for i, coefficient in zip(touching, e, strict=True)
         ]
-        if any(0.0 < one.friction < np.inf for one in frictional):
-            found = impact(matrix, before, contacts.kept, frictional)
-            if found is None:
-                raise self._unfit(time, state)
-            impulse = found
+        if any(0.0 < contact.friction < np.inf for contact in frictional):
+            impulse = impact(matrix, before, contacts.bilateral, frictional)
         else:
-            wanted = before.copy()
-            wanted[normals] *= 1.0 + e
-            impulse = self._fit(time, state, matrix, wanted, touches).values
+            offset = before.copy()
+            offset[normals] *= 1.0 + e
+            impulse = self._fit(time, state, matrix, offset, touches).values
+        if impulse is None:
+            raise self._unfit(time, state)
         after = before + matrix @ impulse
         x = state + terms.velocity_change @ impulse
         rest = self._rest(time, x, touches, before, control, parameters)
         if rest is not None:
-            rows = np.array([*contacts.kept, *(r for touch in touches for r in touch.rows)])
-            added = stopping(matrix, after, rows)
-            impulse = impulse + added
+            rows = np.array([*contacts.bilateral, *(r for touch in touches for r in touch.rows)])
+            impulse = impulse + stopping(matrix, after, rows)
             after = before + matrix @ impulse
             x = state + terms.velocity_change @ impulse
         took_part = [i for i, n in zip(touching, normals, strict=True) if impulse[n] != 0.0]
@@ -213,7 +212,9 @@ class Resets:
         if not leaving:
             return 0.0
         staying = [touch for touch in touches if touch not in leaving]
-        fit = complementary(terms.force_matrix, terms.accelerations, self._contacts.kept, staying)
+        fit = complementary(
+            terms.force_matrix, terms.accelerations, self._contacts.bilateral, staying
+        )
         if fit is None:
             return None
         normals = [touch.normal for touch in leaving]
@@ -233,7 +234,7 @@ class Resets:
         offset: FloatArray,
         touches: Sequence[TouchRows],
     ) -> ImpactSolution:
-        fit = complementary(matrix, offset, self._contacts.kept, touches)
+        fit = complementary(matrix, offset, self._contacts.bilateral, touches)
         if fit is None:
             raise self._unfit(time, state)
         return fit
@@ -251,7 +252,7 @@ class Resets:
     ) -> list[ContactEvent]:
         """The contacts that opened or closed without impact."""
         named = {name for event in events for name in event.contacts}
-        found = []
+        changes = []
         for kind, was in ((ContactChange.OPENING, True), (ContactChange.CLOSING, False)):
             names = tuple(
                 name
@@ -259,15 +260,15 @@ class Resets:
                 if old is was and new is not was and not (name in named and not was)
             )
             if names:
-                found.append(ContactEvent(time, kind, names, ()))
-        return found
+                changes.append(ContactEvent(time, kind, names, ()))
+        return changes
 
     def _completed(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
         names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
-        named = []
+        all_events = []
         for event in events:
-            found = replace(event, closed=names)
+            completed = replace(event, closed=names)
             if event.kind is ContactChange.REST and not set(event.contacts) & set(names):
-                found = replace(found, kind=ContactChange.IMPACT, rest_time=None)
-            named.append(found)
-        return named
+                completed = replace(completed, kind=ContactChange.IMPACT, rest_time=None)
+            all_events.append(completed)
+        return all_events

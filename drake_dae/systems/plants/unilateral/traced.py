@@ -1,4 +1,4 @@
-"""What a plant computes whose contacts open and close, as traced functions of its mode."""
+"""The computations of a plant with opening contacts, as traced functions of its mode."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -28,11 +28,11 @@ from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, close
 from drake_dae.trace.functions import TracedFunction
 
 MOST = 3
-"""So many contacts have eight modes, all of which are in each function."""
+"""The largest number of contacts: each function contains all of their eight modes."""
 
 
 class TracedContacts:
-    """The functions of a plant, each with all modes in it.
+    """The functions of a plant, each with all of its modes.
 
     Args:
         contacts: The contacts.
@@ -54,10 +54,10 @@ class TracedContacts:
         self._state, self._held = ca.SX.sym("state", dae.num_states), ca.SX.sym("mode", count)
         self._control = ca.SX.sym("control", dae.num_controls)
         size = dae.parameter_symbol.numel()
-        # The coefficients of restitution come last; no motion needs them.
+        # The coefficients of restitution come last; no motion depends on them.
         self._all = ca.SX.sym("parameters", size + count)
         self._parameters = self._all[:size]
-        self._each = [
+        self._all_modes = [
             (closed, self._mode(closed)) for closed in product((False, True), repeat=count)
         ]
 
@@ -71,137 +71,125 @@ class TracedContacts:
     def _chosen(
         self, values: Callable[[Mode], Sequence[ca.SX]], none: Sequence[ca.SX]
     ) -> list[ca.SX]:
-        """What a function of the mode gives in that which holds, column by column."""
-        found = [ca.SX.zeros(value.numel()) for value in none]
-        for closed, mode in self._each:
-            shut = [self._held[i] > 0.5 for i in range(len(closed))]
-            holds = ca.SX(1)
-            for own, wanted in zip(shut, closed, strict=True):
-                holds = ca.logic_and(holds, own if wanted else ca.logic_not(own))
-            given = none if mode is None else values(mode)
-            found = [
-                old + ca.if_else(holds, ca.densify(value), 0)
-                for old, value in zip(found, given, strict=True)
-            ]
-        return found
+        """The columns of a function of the mode in the current mode.
 
-    def _function(
-        self, name: str, parts: Sequence[str], sizes: Sequence[int], by_control: bool
-    ) -> TracedFunction:
-        """Some functions of all modes, as one."""
+        Args:
+            values: The columns in a mode.
+            none: The columns in a mode that is not possible.
+        """
+        columns = [ca.SX.zeros(value.numel()) for value in none]
+        for closed, mode in self._all_modes:
+            is_current = ca.SX(1)
+            for i, shut in enumerate(closed):
+                is_shut = self._held[i] > 0.5
+                is_current = ca.logic_and(is_current, is_shut if shut else ca.logic_not(is_shut))
+            in_mode = none if mode is None else values(mode)
+            columns = [
+                column + ca.if_else(is_current, ca.densify(value), 0)
+                for column, value in zip(columns, in_mode, strict=True)
+            ]
+        return columns
+
+    def _function(self, attribute: str, size: int, by_control: bool) -> TracedFunction:
+        """A function of a `Mode` by its attribute, for all modes."""
 
         def values(mode: Mode) -> list[ca.SX]:
-            found, pivot = [], ca.SX(1)
-            for part in parts:
-                function = getattr(mode, part)
-                given = [self._state, self._parameters]
-                if len(function.input_names) == 3:
-                    given.insert(1, self._control)
-                value, pivot, *_ = function.function.call(given)
-                found.append(value)
-            return [*found, pivot]
+            function = getattr(mode, attribute)
+            control = [self._control] if "control" in function.input_names else []
+            value, pivot, *_ = function.function.call([self._state, *control, self._parameters])
+            return [value, pivot]
 
-        none = [*(ca.SX.nan(size, 1) for size in sizes), ca.SX(1)]
-        *found, pivot = self._chosen(values, none)
-        inputs = {"state": self._state, "mode": self._held, "control": self._control}
-        if not by_control:
-            del inputs["control"]
+        value, pivot = self._chosen(values, [ca.SX.nan(size, 1), ca.SX(1)])
+        control = {"control": self._control} if by_control else {}
         return TracedFunction(
-            f"{self._dae.name} {name}",
-            {**inputs, "parameters": self._all},
-            dict(zip(parts, found, strict=True)),
+            f"{self._dae.name} {attribute}",
+            {"state": self._state, "mode": self._held, **control, "parameters": self._all},
+            {attribute: value},
             pivot,
             "A(x) of Assumption (2)",
             compiled=self._dae.compiled,
         )
 
-    @property
-    def _known(self) -> list[Mode]:
-        return [mode for _, mode in self._each if mode is not None]
-
     def computations(self, ports: RobotPorts) -> tuple[Computation, ...]:
         """All outputs, and the derivative of the state.
 
         Args:
-            ports: What the plant shows of its robot.
+            ports: The ports of the plant's robot.
         """
         dae, contacts = self._dae, self._contacts
         by_state, by_control = (STATE, HELD, PARAMETERS), (STATE, HELD, "control", PARAMETERS)
-        motion = self._function("motion", ["dynamics"], [dae.num_states], True)
-        found = [Computation.of(motion, by_control, (DERIVATIVE,))]
-        force_needs, output_needs = (
-            any(getattr(mode, f"{name}_needs_control") for mode in self._known)
-            for name in ("force", "output")
-        )
-        for name, needs, size, port in (
-            ("force", force_needs, dae.num_constraints, "acting_force"),
-            ("output", output_needs, dae.num_outputs, "controlled_output"),
+        motion = self._function("dynamics", dae.num_states, True)
+        computations = [Computation.of(motion, by_control, (DERIVATIVE,))]
+        modes = [mode for _, mode in self._all_modes if mode is not None]
+        for name, size, port in (
+            ("force", dae.num_constraints, "acting_force"),
+            ("output", dae.num_outputs, "controlled_output"),
         ):
-            function = self._function(name, [name], [size], needs)
-            found.append(Computation.of(function, by_control if needs else by_state, (port,)))
+            needs = any("control" in getattr(mode, name).input_names for mode in modes)
+            function = self._function(name, size, needs)
+            computations.append(
+                Computation.of(function, by_control if needs else by_state, (port,))
+            )
         acting = ca.SX.sym("force", dae.num_constraints)
         pushing = ca.SX(acting)
         pushing[contacts.normals] = ca.fmax(pushing[contacts.normals], 0)
         pushed = ca.Function("pushing", [acting], [pushing])
-        found.append(Computation(pushed, ("acting_force",), ("constraint_force",)))
-        x, mode, given = self._state, self._held, (self._state, self._parameters)
+        computations.append(Computation(pushed, ("acting_force",), ("constraint_force",)))
+        x, mode, inputs = self._state, self._held, (self._state, self._parameters)
         same = ca.Function(
             "shown", [x, mode], [x, mode, *(x[part] for part in ports.parts.values())]
         )
-        found.append(Computation(same, (STATE, HELD), ("state", "mode", *ports.parts)))
-        holds = {row: mode[i] for i, one in enumerate(contacts.touches) for row in one.rows}
+        computations.append(Computation(same, (STATE, HELD), ("state", "mode", *ports.parts)))
+        holds = {row: mode[i] for i, touch in enumerate(contacts.touches) for row in touch.rows}
         rows = [
             ca.repmat(ca.SX(holds.get(row, 1)), size, 1) for row, size in enumerate(contacts.sizes)
         ]
-        residual = ca.vertcat(*rows) * self._residual.function.call(given)[0]
-        gap = contacts.gaps.function.call(given)[0]
+        residual = ca.vertcat(*rows) * self._residual.function.call(inputs)[0]
+        gap = contacts.gaps.function.call(inputs)[0]
         shown = ca.Function("shown", [x, mode, self._all], [residual, gap])
-        found.append(Computation(shown, by_state, ("constraint_residual", "gap")))
+        computations.append(Computation(shown, by_state, ("constraint_residual", "gap")))
         wrenches = ca.Function(
             "wrenches",
             [x, acting, self._all],
             ports.wrench_function.function.call([x, acting, self._parameters])[:1],
         )
-        sources = (STATE, "acting_force", PARAMETERS)
-        found.append(Computation(wrenches, sources, ("constraint_wrenches",)))
-        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
-            if known is not None:
-                values = known.function.call(given)[:1]
-                function = ca.Function("part", [x, self._all], values)
-                found.append(Computation(function, (STATE, PARAMETERS), (name,)))
-        return tuple(found)
+        by_force = (STATE, "acting_force", PARAMETERS)
+        computations.append(Computation(wrenches, by_force, ("constraint_wrenches",)))
+        for name, of_joints in ports.joints.items():
+            part = ca.Function("part", [x, self._all], of_joints.function.call(inputs)[:1])
+            computations.append(Computation(part, (STATE, PARAMETERS), (name,)))
+        return tuple(computations)
 
     def guard(self) -> Computation:
-        """The margins of contacts, as those of the plant: force if closed, clearance if open."""
+        """The margins of contacts, the same as those of the plant: their forces or clearances."""
         acting = ca.SX.sym("force", self._dae.num_constraints)
-        given = (self._state, self._parameters)
-        gaps, rates = self._contacts.gaps.function.call(given)[:2]
+        gaps, rates = self._contacts.gaps.function.call([self._state, self._parameters])[:2]
         clear = ca.if_else(gaps < -TOUCHING, gaps, ca.fmax(gaps, rates + MARGIN))
         is_closed = self._held > 0.5
         margins = ca.if_else(is_closed, acting[self._contacts.normals], clear)
-        # A contact that is closed does not fall.
-        own = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_closed, 0, rates))]
-        function = ca.Function("guard", [self._state, self._held, acting, self._all], own)
+        # The gap of a closed contact does not fall.
+        values = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_closed, 0, rates))]
+        function = ca.Function("guard", [self._state, self._held, acting, self._all], values)
         return Computation(
             function, (STATE, HELD, "acting_force", PARAMETERS), (MARGINS, GAPS, RATES)
         )
 
     def projection(self) -> Projection:
-        """How the state stays on the manifold of its mode."""
+        """The projection of the state onto the manifold of its mode."""
         start = ca.SX.sym("start", self._dae.num_states)
 
         def values(mode: Mode) -> list[ca.SX]:
-            own = mode.structure.manifold.newton_step.function
-            (step, *_) = own.call([self._state, start, self._parameters])
+            function = mode.structure.manifold.newton_step.function
+            (step, *_) = function.call([self._state, start, self._parameters])
             return [step * ca.DM(mode.structure.system.scale / self._dae.scale)]
 
-        found = self._chosen(values, [ca.SX.nan(self._dae.num_states, 1)])
-        newton = ca.Function("newton", [self._state, start, self._all, self._held], found)
+        steps = self._chosen(values, [ca.SX.nan(self._dae.num_states, 1)])
+        newton = ca.Function("newton", [self._state, start, self._all, self._held], steps)
         return Projection(newton, self._dae.scale, partial(_project, self._modes))
 
 
 def _project(
     modes: Modes, state: FloatArray, parameters: FloatArray, held: FloatArray
 ) -> FloatArray:
-    own = parameters[: parameters.size - held.size]
-    return modes(closed_of(held), state).structure.manifold.project(state, own)
+    of_system = parameters[: parameters.size - held.size]
+    return modes(closed_of(held), state).structure.manifold.project(state, of_system)

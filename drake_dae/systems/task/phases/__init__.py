@@ -1,4 +1,4 @@
-"""The phases of a task, what each wants, and what ends it."""
+"""The phases of a task, with their goals and their ends."""
 
 from drake_dae.systems.task.phases.guarded import GuardedMove, Wait
 from drake_dae.systems.task.phases.guards import PhaseGuard

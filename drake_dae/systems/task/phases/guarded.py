@@ -1,4 +1,4 @@
-"""A move until a force is felt, and waiting for a signal."""
+"""A move until contact, and waiting for a signal."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ from drake_dae.systems.task.phases.phase import Moment, Phase
 @checked(ModelError)
 @dataclass(frozen=True)
 class GuardedMove(Phase):
-    """The tool moves straight on at a constant speed until a force is felt.
+    """The tool moves in a straight line at constant speed until it measures a force.
 
-    It fails where it has moved a distance without that. Unlike an Approach it decides by the force
-    alone, and the place of the surface in the law's model does not matter.
+    It fails if it has moved its largest distance without that. Unlike an Approach it uses the force
+    alone; the position of the surface in the law's model does not matter.
 
     Attributes:
-        distance: How far it may move, in m.
-        speed: How fast, in m/s.
+        distance: The largest distance of the move, in m.
+        speed: The speed, in m/s.
         force: The force that ends it, in N; the task's contact_force if left out.
-        direction: Output -> component of the direction; outputs in m, the distance from the
-            surface among them. Straight towards the surface if left out.
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where it has moved so far, or so long; as on_failure if left out.
+        direction: Output -> component of the direction; for outputs in m, including the distance
+            from the surface. Straight towards the surface if left out.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it has moved so far or lasts longer; on_failure if left out.
     """
 
     distance: float
@@ -72,8 +72,8 @@ class GuardedMove(Phase):
         return self.felt(contact_force) - now.force
 
     def remaining(self, now: Moment) -> float:
-        found: float = ca.fmin(super().remaining(now), self.distance - now.travel)
-        return found
+        remaining: float = ca.fmin(super().remaining(now), self.distance - now.travel)
+        return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
         if now.time >= self.within:
@@ -87,17 +87,17 @@ class GuardedMove(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Wait(Phase):
-    """All outputs come to rest where they are, the force too, until a signal comes.
+    """All outputs, including the force, come to rest until a signal is present.
 
     Attributes:
-        for_signal: The name of the signal; it has come where it is above 1/2. In Python it is the
-            input port signal_<name> of the controller and of its loop, in a scenario one of
+        for_signal: The name of the signal, which is present above 1/2. In Python it is the input
+            port signal_<name> of the controller and of its loop, in a scenario one of
             task.signals. Empty for no signal.
-        duration: After this time it is over also without the signal, in s; None for never.
-        over: How long the references before take to become those of this phase, in s.
-        within: It fails after so long, in s.
-        if_late: What follows where it lasts longer; as on_failure if left out.
-        if_lost: What follows where the contact is lost; as on_failure if left out.
+        duration: The time in s after which it ends without the signal; None for never.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
+        if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     for_signal: str = ""
@@ -112,7 +112,7 @@ class Wait(Phase):
         if self.duration is not None:
             positive("Wait: duration", self.duration)
         elif not self.for_signal:
-            raise ModelError("Wait: give the signal for which it waits, for_signal, or a duration")
+            raise ModelError("Wait: give the signal that it waits for, for_signal, or a duration")
 
     @property
     def signal(self) -> str:
@@ -125,8 +125,8 @@ class Wait(Phase):
         signal: float = 0.5 - now.signal if self.signal else 1.0
         if self.duration is None:
             return signal
-        found: float = ca.fmin(signal, self.duration - now.time)
-        return found
+        margin: float = ca.fmin(signal, self.duration - now.time)
+        return margin
 
     def awaited(self, contact_force: float) -> str:
         parts = [f"the signal {self.signal}"] if self.signal else []

@@ -12,7 +12,7 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
 _AWAY = 0.02
-"""So far from where it began, in m, a Release has left the contact."""
+"""The distance in m from its start at which a Release has left the contact."""
 
 
 @checked(ModelError)
@@ -21,13 +21,13 @@ class Approach(Phase):
     """The distance falls at a constant speed until the robot touches.
 
     Attributes:
-        speed: With which it touches, in m/s; less where it touches before the references of this
-            phase are reached, as where it starts from rest nearer than speed * over / 2.
-        behind: The largest distance behind the surface of the model, in m, up to which it seeks
-            the contact; farther behind it is late.
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where it lasts longer; as on_failure if left out.
+        speed: The speed of the touch, in m/s; less if it touches during the transition, such as
+            after a start at rest nearer than speed * over / 2.
+        behind: The largest distance behind the surface of the model, in m; farther behind it is
+            late.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
     """
 
     speed: float = 0.05
@@ -43,8 +43,8 @@ class Approach(Phase):
         for key in ("if_late", "on_failure"):
             if getattr(self, key) == "approach":
                 raise ModelError(
-                    f"Approach: {key}: 'approach' would go on as before; a phase by its name, "
-                    "hold, leave, stop or fail is left"
+                    f"Approach: {key}: 'approach' would go on as before; choose a phase by its "
+                    "name, hold, leave, stop or fail"
                 )
 
     @property
@@ -52,8 +52,8 @@ class Approach(Phase):
         return self.speed
 
     def remaining(self, now: Moment) -> float:
-        found: float = ca.fmin(super().remaining(now), now.distance + self.behind)
-        return found
+        remaining: float = ca.fmin(super().remaining(now), now.distance + self.behind)
+        return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
         if now.time >= self.within:
@@ -76,15 +76,15 @@ class Approach(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Press(Phase):
-    """The force goes from what it is to a goal, smoothly.
+    """The force goes smoothly to a goal.
 
     Attributes:
-        force: The goal, in N: a positive number, or a reference in s after the phase began.
-        tolerance: How near to its reference the force must be for the phase to end, in N.
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where it lasts longer; as on_failure if left out.
-        if_lost: What follows where the contact is lost; as on_failure if left out.
+        force: The goal, in N: a positive number, or a reference, whose time starts with the phase.
+        tolerance: The largest error of the force at which the phase ends, in N.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
+        if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     force: float | Reference
@@ -111,15 +111,15 @@ class Press(Phase):
 
     def margin(self, now: Moment, contact_force: float) -> float:
         off = abs(now.force - now.wanted)
-        found: float = ca.fmax(self.over - now.time, off - self.tolerance)
-        return found
+        margin: float = ca.fmax(self.over - now.time, off - self.tolerance)
+        return margin
 
     def awaited(self, contact_force: float) -> str:
         return f"a force within {self.tolerance:g} N of its reference"
 
 
 class _Lasting(Phase):
-    """A phase that ends after its `duration`, a field of the phases of this kind."""
+    """A phase that ends after its `duration`."""
 
     duration: float
 
@@ -143,11 +143,11 @@ class Move(_Lasting):
     """Outputs follow references for some time, in contact or not, as the phase before.
 
     Attributes:
-        references: Name -> reference in s after the phase began, or a number; names as those of
-            `references_by_name`. The force may be among them, or the distance.
-        duration: How long the phase lasts, in s.
-        over: How long the references before take to become those of this phase, in s.
-        if_lost: What follows where the contact is lost; as on_failure if left out.
+        references: Name -> reference, whose time starts with the phase, or a number; names as those
+            of `references_by_name`. They may include the force or the distance.
+        duration: The duration of the phase, in s.
+        over: The duration of the transition from the previous references, in s.
+        if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     references: Mapping[str, Reference | float]
@@ -162,12 +162,12 @@ class Move(_Lasting):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Dwell(_Lasting):
-    """All outputs come to rest where they are, the force too, for some time.
+    """All outputs, including the force, come to rest for some time.
 
     Attributes:
-        duration: How long the phase lasts, in s.
-        over: How long the references before take to become those of this phase, in s.
-        if_lost: What follows where the contact is lost; as on_failure if left out.
+        duration: The duration of the phase, in s.
+        over: The duration of the transition from the previous references, in s.
+        if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     duration: float
@@ -178,15 +178,15 @@ class Dwell(_Lasting):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Release(Phase):
-    """The force goes to zero, smoothly; the phase ends where it is none.
+    """The force goes smoothly to zero; the phase ends below the task's contact_force.
 
-    It is late also where the tool has gone 20 mm away and a force is still measured, which is then
-    the bias of a sensor.
+    It is also late if the tool is 20 mm away and a force is still measured, which is then the bias
+    of a sensor.
 
     Attributes:
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where it lasts longer; as on_failure if left out.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
     """
 
     within: float = field(default=60.0, kw_only=True)
@@ -200,8 +200,8 @@ class Release(Phase):
         return now.force - contact_force
 
     def remaining(self, now: Moment) -> float:
-        found: float = ca.fmin(super().remaining(now), _AWAY - now.away)
-        return found
+        remaining: float = ca.fmin(super().remaining(now), _AWAY - now.away)
+        return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
         if now.time >= self.within:
@@ -218,14 +218,14 @@ class Release(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Retreat(Phase):
-    """The distance goes from what it is to a goal, smoothly.
+    """The distance goes smoothly to a goal.
 
     Attributes:
         distance: The goal, in m.
-        tolerance: How near to it the robot must be for the phase to end, in m.
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where it lasts longer; as on_failure if left out.
+        tolerance: The largest error of the distance at which the phase ends, in m.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
     """
 
     distance: float
@@ -247,8 +247,8 @@ class Retreat(Phase):
 
     def margin(self, now: Moment, contact_force: float) -> float:
         off = abs(now.distance - self.distance)
-        found: float = ca.fmax(self.over - now.time, off - self.tolerance)
-        return found
+        margin: float = ca.fmax(self.over - now.time, off - self.tolerance)
+        return margin
 
     def awaited(self, contact_force: float) -> str:
         return f"a distance within {self.tolerance:g} m of {self.distance:g} m"

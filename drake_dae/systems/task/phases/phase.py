@@ -1,4 +1,4 @@
-"""A phase of a task: what all have in common."""
+"""The contract of the phases of a task."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.guards import PhaseGuard
 
 Outcome = Literal["success", "guard", "late", "lost"]
-"""How a phase ends: as it should, by one of its guards, too late, or without its contact."""
+"""How a phase ends: by its success, one of its guards, lateness, or a lost contact."""
 
 NEXT, DONE, APPROACH, HOLD, LEAVE, STOP, FAIL = ENDS = (
     "next",
@@ -24,24 +24,25 @@ NEXT, DONE, APPROACH, HOLD, LEAVE, STOP, FAIL = ENDS = (
     "stop",
     "fail",
 )
-"""What may follow besides a phase by its name."""
+"""The successors besides the name of a phase."""
 
 _NOTHING: str | None = None
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What ends a phase is decided by: numbers, or expressions of CasADi.
+    """The measurements that decide when a phase ends, as numbers or expressions of CasADi.
 
     Attributes:
-        time: Since the phase began, in s.
+        time: The time since the phase began, in s.
         force: The measured force of the contact, in N.
         distance: The distance from the surface by the law's model, in m.
         rate: Its derivative, in m/s.
-        wanted: What the reference of the force is (in contact), in N, or of the distance, in m.
-        away: How much the distance has grown since the phase began, in m.
-        speed, travel, work, control: See `PhaseGuard`; work and control only where guarded.
-        signal: What the phase waits for; 0 without.
+        wanted: The reference of the force (in contact), in N, or of the distance, in m.
+        away: The increase of the distance since the phase began, in m.
+        speed, travel, work, control: See `PhaseGuard`; work and control only if a guard watches
+            them.
+        signal: The signal that the phase waits for; 0 without one.
     """
 
     time: float
@@ -62,34 +63,34 @@ class Moment:
 class Phase(ABC):
     """A part of a task, with its own goals for the outputs and its own end.
 
-    1. `begins_in_contact` and `ends_in_contact` say whether the robot touches then; None is as in
-       the phase before it in the list. From its begin on the law acts that fits.
-    2. `goals` are references in s after the phase began, and with `is_relative` from where the
-       outputs would come to rest. All other outputs come to rest where they are, within `over`, but
-       those with `rates`, which go on so fast.
-    3. A phase takes over without a bump: its references are those of the phase before, with all
-       derivatives that the law has, and lead to the goals within `over`.
-    4. `margin` is positive until the phase is over, which is its success. It fails where it is not
-       over `within` that time, or `remaining` says that it will not be; where one of its guards
-       trips; and, with `holds_contact`, where it is in contact and that is lost.
-    5. What follows is the name of a phase, or "next", the next one in the list; "done", the task is
-       done, and the robot rests; "approach", from the last phase on that leads into contact, at
-       most as often as the task has `retries`; "hold", the robot rests where it is, with contact
-       and force, for good; "leave", the force goes to zero, and the run ends; "stop", the robot
-       rests, and the run ends; "fail", the run ends with an error.
+    1. `begins_in_contact` and `ends_in_contact` say whether the robot is in contact at the start
+       and at the end; None means as at the end of the phase before it in the list. The law that
+       fits is active from the start on.
+    2. `goals` are references, whose time starts with the phase; with `is_relative` they are added
+       to the positions at which the outputs would come to rest. Outputs with `rates` keep these
+       rates, and all others come to rest within `over`.
+    3. References do not jump: they start with the values and all derivatives of those before that
+       the law uses, and reach the goals within `over`.
+    4. `margin` is positive until the phase succeeds. The phase fails if it lasts longer than
+       `within`, or `remaining` becomes 0; if one of its guards trips; and, with `holds_contact`, if
+       the contact is lost.
+    5. The successor is the name of a phase, or "next", the next one in the list; "done", the task
+       is done, and the robot rests; "approach", back to the last phase that leads into contact, at
+       most `retries` of the task times; "hold", the robot rests in its present state with contact
+       and force; "leave", the force goes to zero, and the run ends; "stop", the robot rests, and
+       the run ends; "fail", the run ends with an error.
 
     Attributes:
-        over: How long the references before take to become those of this phase, in s.
-        name: What others call it; the name of the class if left out, with a number if there are
-            more of these.
-        guards: What may not be exceeded.
-        on_success: What follows where it succeeds: the name of a phase, or next, done, approach,
+        over: The duration of the transition from the previous references, in s.
+        name: The name of the phase; by default that of its class, with a number if there are
+            several.
+        guards: The limits at which it fails.
+        on_success: The successor if it succeeds: the name of a phase, or next, done, approach,
             hold, leave, stop or fail.
-        on_failure: What follows where it fails. Left out it is fail, and hold where a contact is
-            lost.
-        retries: How many times it may be entered again; a phase to which others lead back needs
-            this number.
-        if_spent: What follows in its place where it would be entered once more.
+        on_failure: The successor if it fails; by default fail, and hold after a lost contact.
+        retries: The number of times that it may be entered again; needed for a phase to which
+            others lead back.
+        if_spent: The successor in its place once these are used up.
     """
 
     over: float = 0.5
@@ -103,7 +104,7 @@ class Phase(ABC):
     ends_in_contact: ClassVar[bool | None] = None
     holds_contact: ClassVar[bool] = False
     is_relative: ClassVar[bool] = False
-    # No fields here: phases that wait, and those that hold a contact, have them.
+    # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING
 
@@ -120,11 +121,11 @@ class Phase(ABC):
 
     @property
     def speed_of_approach(self) -> float:
-        """How fast the distance falls at last, in m/s."""
+        """The final rate at which the distance falls, in m/s."""
         return 0.0
 
     def felt(self, contact_force: float) -> float:
-        """The force with which it has touched, in N, where it comes with `speed_of_approach`.
+        """The force at which it has touched, in N, for a phase with a `speed_of_approach`.
 
         Args:
             contact_force: As of `margin`.
@@ -133,19 +134,19 @@ class Phase(ABC):
 
     @property
     def signal(self) -> str:
-        """The name of the signal that it waits for; empty if for none."""
+        """The name of the signal that it waits for; empty for none."""
         return ""
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
-        """Output name -> its reference in s after the phase began.
+        """Output name -> its reference, whose time starts with the phase.
 
         Args:
-            contact_output: The name of the force, or of the distance where the robot is free.
+            contact_output: The name of the force, or of the distance if the robot is free.
         """
         return {}
 
     def rates(self, contact_output: str) -> Mapping[str, float]:
-        """Output name -> how fast it goes at last, in its unit per s, of those without goals.
+        """Name of an output without a goal -> its final rate, in its unit per s.
 
         Args:
             contact_output: As of `goals`.
@@ -153,7 +154,7 @@ class Phase(ABC):
         return {contact_output: -self.speed_of_approach} if self.speed_of_approach else {}
 
     def needed(self, contact_force: float) -> Mapping[str, float]:
-        """What a guard watches -> what that reaches at least before the phase is over.
+        """Watched quantity of a guard -> the value that it reaches at least before success.
 
         Args:
             contact_force: As of `margin`.
@@ -162,31 +163,34 @@ class Phase(ABC):
 
     @abstractmethod
     def margin(self, now: Moment, contact_force: float) -> float:
-        """A number that is positive until the phase is over, or an expression, as `now` has.
+        """A number that is positive until the phase succeeds; an expression if `now` has them.
 
         Args:
-            now: What is measured.
-            contact_force: A force that is less than this, in N, is none.
+            now: The measurements.
+            contact_force: Forces below this, in N, count as zero.
         """
 
     def remaining(self, now: Moment) -> float:
-        """A number that is positive until the phase is late, or an expression, as `now` has."""
+        """A number that is positive until the phase is late; an expression if `now` has them."""
         return self.within - now.time if self.within < inf else inf
 
     def lateness(self, now: Moment, contact_force: float) -> str:
-        """Why it is late, for messages."""
+        """The reason why it is late, for messages."""
         return f"{self.name} has waited {self.within:g} s for {self.awaited(contact_force)}"
 
     @abstractmethod
     def awaited(self, contact_force: float) -> str:
-        """What ends it, for messages: "a force of 0.5 N"."""
+        """The condition that ends it, for messages: "a force of 0.5 N"."""
 
     def key_of(self, outcome: Outcome) -> str:
-        """Which attribute says what follows an outcome."""
-        own = {"success": "on_success", "late": "if_late", "lost": "if_lost"}.get(outcome, "")
-        return own if own and getattr(self, own) is not None else "on_failure"
+        """The name of the attribute with the successor after an outcome."""
+        keys = {"success": "on_success", "late": "if_late", "lost": "if_lost"}
+        key = keys.get(outcome, "on_failure")
+        return key if getattr(self, key) is not None else "on_failure"
 
     def chosen(self, outcome: Outcome) -> str:
-        """What follows an outcome, as rule 5 has it."""
-        found = getattr(self, self.key_of(outcome))
-        return found if found is not None else HOLD if outcome == "lost" else FAIL
+        """The successor after an outcome; see rule 5."""
+        successor = getattr(self, self.key_of(outcome))
+        if successor is None:
+            return HOLD if outcome == "lost" else FAIL
+        return str(successor)

@@ -1,4 +1,4 @@
-"""What follows what in a task, and the check that every way through it ends."""
+"""The order of the phases of a task, and the check that every path through it ends."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,19 +21,19 @@ from drake_dae.systems.task.phases.phase import (
 
 OUTCOMES: tuple[Outcome, ...] = ("success", "guard", "late", "lost")
 
-_TAKEN = (*ENDS, "held", "end")
-"""Words that are no names of phases."""
+_RESERVED = (*ENDS, "held", "end")
+"""Words that cannot be names of phases."""
 
 
 @dataclass(frozen=True)
 class Successor:
-    """What follows a phase.
+    """The successor of a phase.
 
     Attributes:
-        chosen: The word that led there: the name of a phase, "next", "stop" and so on.
-        place: The phase that begins; the number of phases where the task is done, None where the
+        chosen: The key word that led there: the name of a phase, "next", "stop" and so on.
+        place: The index of the next phase; the number of phases if the task is done, None if the
             robot rests for another reason.
-        remark: What is to be told of it: "retry 1 of 2"; empty for nothing.
+        remark: A remark for the record: "retry 1 of 2"; empty for none.
     """
 
     chosen: str
@@ -42,55 +42,55 @@ class Successor:
 
 
 def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
-    """The phases with a name each: those that have the name of their class are numbered.
+    """The phases with distinct names: those with the name of their class are numbered.
 
     Raises:
-        ModelError: Two have one name, or a name is a word of another meaning.
+        ModelError: Two phases have one name, or a name is a reserved word.
     """
-    owns = [type(phase).__name__ for phase in phases]
-    given = [phase.name or own for phase, own in zip(phases, owns, strict=True)]
-    chosen = [name for name, own in zip(given, owns, strict=True) if name != own]
-    found = list[Phase]()
-    for index, (phase, name, own) in enumerate(zip(phases, given, owns, strict=True)):
-        where, number = f"phase {index + 1} of the task", 1
-        if name in _TAKEN or name != name.strip():
+    chosen = [phase.name for phase in phases if phase.name != type(phase).__name__]
+    renamed = list[Phase]()
+    for index, phase in enumerate(phases):
+        where, name, number = f"phase {index + 1} of the task", phase.name, 1
+        if name in _RESERVED or name != name.strip():
             raise ModelError(f"{where}: '{name}' is no name of a phase; give it another one")
         if chosen.count(name) > 1:
             raise ModelError(f"{where}: more than one phase has the name '{name}'")
-        taken = {*chosen, *(each.name for each in found)}
-        if given[index] == own:
+        if name not in chosen:
+            taken = {*chosen, *(other.name for other in renamed)}
             while name in taken:
                 number += 1
-                name = f"{own} {number}"
-        found.append(phase if phase.name == name else replace(phase, name=name))
-    return tuple(found)
+                name = f"{phase.name} {number}"
+        renamed.append(phase if phase.name == name else replace(phase, name=name))
+    return tuple(renamed)
 
 
 def contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
-    """Whether each phase begins in contact; last whether the last one ends so."""
-    found, left = [], False
+    """Whether each phase begins in contact; last whether the last one ends in contact."""
+    begins, in_contact = [], False
     for phase in phases:
-        begins = phase.begins_in_contact
-        found.append(left if begins is None else begins)
-        left = found[-1] if phase.ends_in_contact is None else phase.ends_in_contact
-    return (*found, left)
+        if phase.begins_in_contact is not None:
+            in_contact = phase.begins_in_contact
+        begins.append(in_contact)
+        if phase.ends_in_contact is not None:
+            in_contact = phase.ends_in_contact
+    return (*begins, in_contact)
 
 
 class PhasePlan:
-    """What follows what in a task.
+    """The order of the phases of a task.
 
     Args:
-        phases: The phases, each with a name of its own.
-        retries: How often a task may go back to an approach.
+        phases: The phases, with distinct names.
+        retries: The number of times that a task may go back to an approach.
 
     Attributes:
-        phases: The same, and last the Release of what leaves, where something may.
-        contacts: Whether each phase begins in contact; last whether the last one ends so.
+        phases: The same, followed by the Release for "leave" if it may be needed.
+        contacts: Whether each phase begins in contact; last whether the last one ends in contact.
         last: The number of phases that were given.
 
     Raises:
-        ModelError: What shall follow is no phase; a phase begins in contact where the robot is
-            free, or the other way round; none leads to a phase; or phases may follow each other
+        ModelError: A successor is not a phase; a phase begins in contact although the robot is
+            free, or the other way round; no phase leads to a phase; or phases may follow each other
             without an end.
     """
 
@@ -112,7 +112,7 @@ class PhasePlan:
         return f"phase {place + 1} of the task, {name}"
 
     def last_approach(self, index: int) -> int | None:
-        """The place of the last phase up to one that leads into contact; None if there is none."""
+        """The index of the last phase up to this one that leads into contact; None if none does."""
         for place in range(index, -1, -1):
             phase = self.phases[place]
             if phase.ends_in_contact and not phase.begins_in_contact:
@@ -122,13 +122,13 @@ class PhasePlan:
     def successor(
         self, place: int, outcome: Outcome, entered: Sequence[int], chosen: Sequence[str]
     ) -> Successor:
-        """What follows where a phase ends.
+        """The successor of a phase that has ended.
 
         Args:
-            place: The phase.
-            outcome: How it ends.
-            entered: The places of all phases that began, in order.
-            chosen: The words that led to these.
+            place: The index of the phase.
+            outcome: How it ended.
+            entered: The indices of all phases that began, in order.
+            chosen: The key words that led to these.
         """
         word, remarks = self.phases[place].chosen(outcome), list[str]()
         counts = Counter(entered)
@@ -144,7 +144,7 @@ class PhasePlan:
             phase, most = self.phases[to], self.phases[to].retries
             count = counts[to]
             if most is None and word == APPROACH:
-                count, most = 1 + sum(one == APPROACH for one in chosen), self._retries
+                count, most = 1 + sum(key == APPROACH for key in chosen), self._retries
             if most is None or count <= most:
                 if count and most is not None:
                     remarks.append(f"retry {count} of {most}")
@@ -170,7 +170,7 @@ class PhasePlan:
         return any(self.contacts) and any(phase.if_spent == LEAVE for phase in self.phases)
 
     def _place(self, place: int, word: str) -> int | None:
-        """The phase that a word means, seen from a phase; None for none."""
+        """The index of the phase that a key word of a phase leads to; None for none."""
         if word == NEXT:
             return place + 1 if place + 1 < self.last else len(self.phases)
         if word == DONE:
@@ -182,8 +182,8 @@ class PhasePlan:
     # The checks.
 
     def _all_from(self, place: int) -> list[tuple[str, int]]:
-        """The words and phases that may follow a phase, each checked."""
-        phase, found = self.phases[place], list[tuple[str, int]]()
+        """The key words and phases that may follow a phase, each checked."""
+        phase, edges = self.phases[place], list[tuple[str, int]]()
         if phase.retries is not None:
             self._check_word(place, "if_spent", phase.if_spent)
         outcomes: list[Outcome] = ["success", "guard", "late"]
@@ -194,13 +194,13 @@ class PhasePlan:
             self._check_word(place, key, word)
             while (to := self._place(at, word)) is not None and to < self.last:
                 self._check_contact(place, key, outcome, to)
-                found.append((word, to))
+                edges.append((word, to))
                 if to in tried or self.phases[to].retries is None:
                     break
                 tried.add(to)
                 at, key, word = to, "if_spent", self.phases[to].if_spent
                 self._check_word(at, key, word)
-        return found
+        return edges
 
     def _check_word(self, place: int, key: str, word: str) -> None:
         if word == APPROACH and self.last_approach(place) is None:
@@ -219,22 +219,22 @@ class PhasePlan:
         way = "" if is_next else f", after {self.phases[place].name} by {key}"
         begins, ends = self.contacts[to], self.ends_in_contact(to)
         if outcome == "lost" and begins and ends:
-            text = "it begins in contact, which is lost there; choose another one by if_lost"
+            text = "it begins in contact, but the contact is lost; choose another one by if_lost"
         elif begins and not (
             self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
         ):
-            text = "it begins in contact, where the robot is free; an Approach must lead there"
+            text = "it begins in contact, but the robot is free; an Approach must lead there"
         elif outcome == "success" and not begins and self.ends_in_contact(place):
-            text = "it begins with a free robot, which is in contact; a Release must lead there"
+            text = "it begins with a free robot, but it is in contact; a Release must lead there"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
 
     def _check_reached(self) -> None:
-        reached, left = {0}, [0]
-        while left:
-            after = {to for _, to in self._edges[left.pop()]} - reached
+        reached, unexplored = {0}, [0]
+        while unexplored:
+            after = {to for _, to in self._edges[unexplored.pop()]} - reached
             reached |= after
-            left += after
+            unexplored += after
         for place in range(self.last):
             if place not in reached:
                 raise ModelError(
@@ -243,10 +243,10 @@ class PhasePlan:
                 )
 
     def _check_ends(self) -> None:
-        """Refuses ways that lead back to where they were and are not counted.
+        """Refuses loops of phases that are not counted.
 
-        What is counted are the phases with `retries`, and all goings back by "approach". A phase
-        with a count that is spent passes on to what follows in its place.
+        Phases with `retries` are counted, and so is each return by "approach". A phase whose
+        retries are used up passes on to its `if_spent`.
         """
 
         def counts(word: str, to: int) -> bool:
@@ -271,7 +271,7 @@ class PhasePlan:
                     else f"{names[0]} leads back to itself"
                 )
                 raise ModelError(
-                    f"the task may not end: {words}, as often as it comes; give {names[0]} a count "
+                    f"the task may not end: {words}, any number of times; give {names[0]} a count "
                     "of retries"
                 )
             if place in done:
@@ -285,10 +285,10 @@ class PhasePlan:
 
 
 def check_guards(phases: Sequence[Phase], contact_force: float) -> None:
-    """Refuses guards that trip before their phase can be over.
+    """Refuses guards that trip before their phase can succeed.
 
     Raises:
-        ModelError: One does, two watch the same, or a move ends by less than the contact's force.
+        ModelError: A guard does, two watch the same quantity, or a move ends below `contact_force`.
     """
     for index, phase in enumerate(phases):
         where, needed = f"phase {index + 1} of the task, {phase.name}", phase.needed(contact_force)

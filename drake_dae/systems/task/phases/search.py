@@ -16,27 +16,28 @@ from drake_dae.systems.task.phases.phase import Moment, Phase
 @checked(ModelError)
 @dataclass(frozen=True)
 class Search(Phase):
-    """The tool slides outward along a spiral around where it is, until it falls into something.
+    """The tool slides outward along a spiral around its position until it falls into something.
 
-    It presses on with the force that there is. It succeeds where the distance by the law's model
-    has fallen by a depth, as in a hole or beyond an edge with a ground below it; it fails where the
-    spiral ends. A surface that is tilted against the model falls, too: the depth has to be more
+    The force stays as it was. The phase succeeds when the distance by the law's model has fallen by
+    `depth`, as in a hole or beyond an edge with a ground below it; it fails when the spiral ends. A
+    surface that is tilted relative to the model also changes the distance: the depth must be larger
     than the radius times the tilt.
 
-    The law's model has no hole. A tool that presses on in a steep one may be pushed out of it (in a
-    dimple 4 mm deep and 3 mm wide after 0.5 s), so let a Release, "leave" or "stop" follow.
+    The law's model has no hole. A tool that keeps pressing in a steep one may be pushed out of it
+    (in a dimple 4 mm deep and 3 mm wide after 0.5 s), so choose a Release, "leave" or "stop" as the
+    successor.
 
     Attributes:
         outputs: The two outputs along the surface, in m: "tool.yz" for example.
         radius: The radius at which the search ends, in m.
-        depth: By so much the distance falls, in m.
+        depth: The fall of the distance that ends the search, in m.
         pitch: The distance between neighbouring turns, in m.
         speed: The largest speed, in m/s.
         acceleration: The largest acceleration, in m/s^2.
-        over: How long the references before take to become those of this phase, in s.
-        within: How long the phase may last, in s.
-        if_late: What follows where the spiral has ended; as on_failure if left out.
-        if_lost: What follows where the contact is lost; as on_failure if left out.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if the spiral has ended; on_failure if left out.
+        if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     outputs: str
@@ -58,7 +59,7 @@ class Search(Phase):
 
     @cached_property
     def spiral(self) -> SpiralReference:
-        """The way of the tool from where it begins."""
+        """The path of the tool, relative to its start."""
         limits = PathLimits(self.speed, self.acceleration)
         return SpiralReference([0.0, 0.0], 0.0, self.radius, self.pitch, limits)
 
@@ -70,8 +71,8 @@ class Search(Phase):
 
     def remaining(self, now: Moment) -> float:
         end = self.spiral.travel.duration + self.over - now.time
-        found: float = ca.fmin(super().remaining(now), end)
-        return found
+        remaining: float = ca.fmin(super().remaining(now), end)
+        return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
         if now.time >= self.within:

@@ -1,4 +1,4 @@
-"""What a task counts from sample to sample for the guards of its phases."""
+"""The sums and counts over samples for the guards of a task's phases."""
 
 from collections.abc import Sequence
 
@@ -10,21 +10,21 @@ from drake_dae.systems.task.phases.phase import Moment, Phase
 
 
 class GuardMemory:
-    """Numbers from which guards are decided that one sample does not decide.
+    """The numbers for guards that need more than one sample.
 
-    They are the work since the phase began, where a guard watches it, and for each guard that takes
-    several samples, in how many it has been at its largest value. All numbers may be expressions.
+    They are the work since the phase began, if a guard watches it, and for each guard of several
+    samples the number of consecutive samples at its limit. All numbers may be expressions.
 
     Args:
         phases: All phases of the task.
-        sample_period: In s.
+        sample_period: The sample period, in s.
 
     Attributes:
-        size: How many numbers there are; 0 where one sample decides all guards.
+        size: The number of these numbers; 0 if one sample decides all guards.
     """
 
     def __init__(self, phases: Sequence[Phase], sample_period: float) -> None:
-        self._works = int(any(guard.of == "work" for one in phases for guard in one.guards))
+        self._works = int(any(guard.of == "work" for phase in phases for guard in phase.guards))
         counts = [sum(guard.samples > 1 for guard in phase.guards) for phase in phases]
         self._period, self.size = sample_period, self._works + max(counts, default=0)
 
@@ -43,28 +43,28 @@ class GuardMemory:
     def after(self, phase: Phase, tally: Sequence[float] | FloatArray, now: Moment) -> list[float]:
         """The numbers after a sample in which the phase goes on."""
         counts = self._counts(phase, tally)
-        found = [tally[0] + now.force * now.speed * self._period] if self._works else []
-        found += [
+        numbers = [tally[0] + now.force * now.speed * self._period] if self._works else []
+        numbers += [
             _counted(guard, count, getattr(now, guard.of))
             for guard, count in zip(phase.guards, counts, strict=True)
             if guard.samples > 1
         ]
-        return found + [0.0] * (self.size - len(found))
+        return numbers + [0.0] * (self.size - len(numbers))
 
     def _counts(self, phase: Phase, tally: Sequence[float] | FloatArray) -> list[float]:
-        """For each guard, in how many samples it has been at its largest value."""
-        found, place = list[float](), self._works
+        """For each guard the number of consecutive samples at its limit."""
+        at_limit, place = list[float](), self._works
         for guard in phase.guards:
             counts = guard.samples > 1
-            found.append(tally[place] if counts else 0.0)
+            at_limit.append(tally[place] if counts else 0.0)
             place += counts
-        return found
+        return at_limit
 
 
 def _counted(guard: PhaseGuard, count: float, value: float) -> float:
-    """In how many consecutive samples a value has been at the largest one, with one more."""
-    found: float = ca.if_else(value >= guard.most, count + 1, 0)
-    return found
+    """The number of consecutive samples at the limit after one more."""
+    counted: float = ca.if_else(value >= guard.most, count + 1, 0)
+    return counted
 
 
 def _margin(guard: PhaseGuard, count: float, value: float) -> float:

@@ -1,4 +1,4 @@
-"""What decides whether a phase goes on, and how it has ended."""
+"""The decision whether a phase goes on, and how it has ended."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ from drake_dae.systems.task.traced import EARLY
 
 @dataclass(frozen=True, eq=False)
 class PhaseDecision:
-    """What decides whether a phase goes on.
+    """The numbers that decide whether a phase goes on.
 
     Attributes:
-        moment: What is measured.
-        guards: How far each guard of the phase is from its end; infinite without any.
-        margins: How far the phase is from a guard, from its end, from a lost contact, from late;
-            last how far the contact is from being felt, or from being felt no more.
+        moment: The measurements.
+        guards: For each guard of the phase a number that is positive until it trips.
+        margins: Numbers that are positive until a guard trips, the phase succeeds, the contact is
+            lost, the phase is late, and the contact begins or ceases to be felt.
     """
 
     moment: Moment
@@ -32,7 +32,7 @@ class PhaseDecision:
 
     @property
     def turns(self) -> bool:
-        """Whether the contact begins to be felt, or to be felt no more."""
+        """Whether the contact begins or ceases to be felt."""
         return bool(self.margins[-1] <= 2.0 * EARLY)
 
     def outcome(self, phase: Phase, contact_force: float) -> tuple[Outcome, str]:
@@ -40,7 +40,7 @@ class PhaseDecision:
 
         Args:
             phase: The phase.
-            contact_force: A force that is less than this, in N, is none.
+            contact_force: Forces below this, in N, count as zero.
         """
         ended = self.margins <= 2.0 * EARLY
         if ended[0]:
@@ -57,7 +57,7 @@ class PhaseDecision:
         """The error of a task that ends by "fail".
 
         Args:
-            reason: Why it does.
+            reason: The reason.
             time: In s.
             state: x, shape (n,).
         """
