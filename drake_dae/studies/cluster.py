@@ -19,10 +19,10 @@ class Cluster:
     """A connection to a scheduler; a context manager.
 
     Args:
-        address: Its address, for example "tcp://head:8786".
+        address: The address of the scheduler, for example "tcp://head:8786".
 
     Raises:
-        ModelError: `distributed` is not installed, nothing answers, or there are no workers.
+        ModelError: `distributed` is not installed, no scheduler answers, or it has no workers.
     """
 
     def __init__(self, address: str) -> None:
@@ -48,9 +48,10 @@ class Cluster:
     def run(
         self, settings: Sequence[Any], batches: Sequence[Batch]
     ) -> Generator[list[RunResult], None, None]:
-        """The results of all runs, as their batches come.
+        """Simulates all runs; yields the results of each batch when it ends.
 
-        A batch whose worker dies is submitted again; after several failures, run by run.
+        Dask submits a batch again if its worker dies; after several failures each of its runs is
+        submitted separately.
 
         Args:
             settings: The arguments of `Runner`, as plain data.
@@ -60,26 +61,25 @@ class Cluster:
             ModelError: The scheduler is gone, or a worker has another version of the library.
         """
         text = json.dumps(settings)
+        pending: dict[Any, Batch] = {}
 
         def submit(batch: Batch) -> Any:
             future = self._client.submit(run_batch, text, list(batch), pure=False)
-            given[future.key] = batch
+            pending[future.key] = batch
             return future
 
-        given: dict[Any, Batch] = {}
         futures = [submit(batch) for batch in batches]
         awaited = self._dask.as_completed(futures, loop=self._client.loop)
         for future in awaited:
-            batch = given.pop(future.key)
+            batch = pending.pop(future.key)
             try:
-                found = [RunResult.from_dict(data) for data in future.result()]
+                results = [RunResult.from_dict(data) for data in future.result()]
             except self._dask.KilledWorker as error:
                 if len(batch) > 1:
                     awaited.update([submit([run]) for run in batch])
                     continue
-                said = str(error).partition(". ")[0]
-                reason = f"the workers that had it ended: {said}"
-                found = [RunResult(batch[0][0], Outcome.CRASHED, reason)]
+                reason = f"the workers that had it ended: {str(error).partition('. ')[0]}"
+                results = [RunResult(batch[0][0], Outcome.CRASHED, reason)]
             except CancelledError:
                 raise ModelError(
                     f"the Dask scheduler at {self._address} is gone; runs that have ended are kept"
@@ -89,10 +89,10 @@ class Cluster:
                     f"the Dask cluster at {self._address} failed, {type(error).__name__}: "
                     f"{brief(str(error))}; its workers need the same drake_dae"
                 ) from error
-            yield found
+            yield results
 
     def close(self) -> None:
-        """Cancels runs that are not yet simulated."""
+        """Closes the connection, which cancels runs without a result."""
         self._client.close()
 
     def __enter__(self) -> "Cluster":

@@ -1,8 +1,7 @@
-"""The file of a study: a first line with its identity, then one line for each finished run.
+"""The file of a study: a first line that identifies the study, then a line for each run.
 
-Lines are only appended, each synced to the disk before the next run counts as done. A killed
-process leaves whole lines and at most one incomplete line, which is removed when the study
-continues.
+Lines are only appended. A run counts as done when its line is synced to the disk. A killed process
+leaves complete lines and at most one incomplete line, which is removed when the study continues.
 """
 
 import errno
@@ -28,7 +27,7 @@ def study_head(
     variations: Sequence[Variation],
     rollout: bool = False,
 ) -> dict[str, Any]:
-    """The first line of a study's file: equal for equal studies."""
+    """Returns the data of the first line of a study's file; equal studies have equal data."""
     return {
         "study": FORMAT,
         "drake_dae": version,
@@ -42,9 +41,9 @@ class Journal:
     """An open file of a study.
 
     Attributes:
-        path: The file.
-        results: Number of a run -> its result in the file: the first final one, otherwise the last
-            one.
+        path: The path of the file.
+        results: Number of a run -> its first final result in the file, or the last result if no
+            result is final.
     """
 
     def __init__(self, path: Path, file: int, results: dict[int, RunResult]) -> None:
@@ -53,53 +52,53 @@ class Journal:
         self._file = file
 
     def append(self, results: Iterable[RunResult]) -> None:
-        """Appends runs, and returns when they are on the disk.
+        """Appends results, and returns when they are on the disk.
 
         Raises:
-            ModelError: They cannot be written, as on a full disk.
+            ModelError: They cannot be written, for example to a full disk.
         """
-        found = list(results)
+        results = list(results)
         try:
-            _write(self._file, b"".join(_line(result.to_dict()) for result in found))
+            _write(self._file, b"".join(_line(result.to_dict()) for result in results))
             os.fsync(self._file)
         except OSError as error:
             raise ModelError(
                 f"cannot write to '{self.path}': {error.strerror or error}; the study continues "
                 "from what it has when there is room again"
             ) from None
-        self.results.update((result.run, result) for result in found)
+        self.results.update((result.run, result) for result in results)
 
 
 @contextmanager
 def open_journal(path: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
-    """Opens the file of a study, new or to continue it, and locks it.
+    """Creates the file of a study, or opens it to continue the study, and locks it.
 
     Args:
-        path: The file; its folder is made.
-        head: What `study_head` returns.
+        path: The path of the file; missing folders are created.
+        head: The first line, from `study_head`.
 
     Raises:
-        ModelError: The file belongs to another study, with the differences in the message; it is
-            not the file of a study; another process writes to it; or it cannot be written.
+        ModelError: The file belongs to another study (the message lists the differences), it is not
+            the file of a study, another process writes to it, or it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = _open(path, head)
     except ModelError:
         raise
-    except (OSError, ValueError) as error:  # The latter for a null byte.
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the path.
         reason = getattr(error, "strerror", None) or error
         raise ModelError(f"cannot write to {brief(str(path))}: {reason}") from None
     try:
-        yield Journal(path, file, _continued(path, file, head))
+        yield Journal(path, file, _recorded(path, file, head))
     finally:
         os.close(file)
 
 
 def _open(path: Path, head: Mapping[str, Any]) -> int:
-    """The locked file, which has its first line."""
+    """Opens and locks the file; a new one gets its first line."""
     if not path.exists():
-        # Created completely or not at all.
+        # Renaming a complete file is atomic.
         part = path.with_name(f".{path.name}.{os.getpid()}")
         new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
@@ -110,7 +109,7 @@ def _open(path: Path, head: Mapping[str, Any]) -> int:
         finally:
             os.close(new)
             part.unlink(missing_ok=True)
-        _sync_folder(path.parent)
+        _sync_folder(path.parent)  # Otherwise the new name may be lost.
     if not path.is_file():
         raise ModelError(f"'{path}' is no file")
     file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -126,7 +125,6 @@ def _open(path: Path, head: Mapping[str, Any]) -> int:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Syncs a folder, so that a new file name is kept."""
     entry = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(entry)
@@ -134,36 +132,35 @@ def _sync_folder(folder: Path) -> None:
         os.close(entry)
 
 
-def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunResult]:
-    """The runs in a file; an incomplete last line is removed."""
+def _recorded(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunResult]:
+    """Reads the results in a file, and removes an incomplete last line."""
     first, *lines = path.read_bytes().split(b"\n")
     try:
-        found = json.loads(first)
-        known = found["study"]
+        file_head = json.loads(first)
+        file_format = file_head["study"]
     except (ValueError, TypeError, LookupError, RecursionError):
         raise ModelError(f"'{path}' is no file of a study; choose another name") from None
-    if known != FORMAT:
-        raise ModelError(f"'{path}' has format {brief(known)}, this version writes {FORMAT}")
-    differing = differences(found, json.loads(_line(head)))
-    if differing:
+    if file_format != FORMAT:
+        raise ModelError(f"'{path}' has format {brief(file_format)}, this version writes {FORMAT}")
+    if differing := differences(file_head, json.loads(_line(head))):
         raise ModelError(
             f"'{path}' belongs to another study: {'; '.join(differing)}. Choose another folder, or "
             "remove it"
         )
     rest = lines.pop() if lines else b""
     results: dict[int, RunResult] = {}
-    for place, line in enumerate(lines, start=2):
+    for number, line in enumerate(lines, start=2):
         try:
             result = RunResult.from_dict(json.loads(line))
             if result.run >= len(head["variations"]):
                 raise LookupError(result.run)
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             is_json = not isinstance(error, (json.JSONDecodeError, UnicodeDecodeError))
-            if place == len(lines) + 1 and not is_json:  # Zeros after a power failure.
+            if number == len(lines) + 1 and not is_json:  # Zeros after a power failure.
                 rest = line + b"\n" + rest
                 break
             raise ModelError(
-                f"'{path}' was changed: line {place} is no run of this study"
+                f"'{path}' was changed: line {number} is no run of this study"
             ) from None
         if not (result.run in results and results[result.run].outcome.is_final):
             results[result.run] = result
@@ -174,21 +171,19 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Some differences of the heads of two studies, in words."""
-    differing = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
-    differing += list(
-        _different("rollout", there.get("rollout", False), here.get("rollout", False))
-    )
-    differing += list(_different("", there.get("scenario"), here.get("scenario")))
+    """The differences between the first lines of two studies, in words; at most six."""
+    differing = [
+        *_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")),
+        *_different("rollout", there.get("rollout", False), here.get("rollout", False)),
+        *_different("", there.get("scenario"), here.get("scenario")),
+    ]
     old, new = there.get("variations", []), here["variations"]
     if len(old) != len(new):
         differing.append(f"{len(old)} runs there, {len(new)} here")
-    pairs = enumerate(zip(old, new, strict=False))
-    other = next(((i, a, b) for i, (a, b) in pairs if a != b), None)
-    if other is not None:
-        number, a, b = other
-        first = next(iter(_different("", a, b)))
-        differing.append(f"run {number} has {first}")
+    for number, (a, b) in enumerate(zip(old, new, strict=False)):
+        if a != b:
+            differing.append(f"run {number} has {next(_different('', a, b))}")
+            break
     return differing if len(differing) <= 6 else [*differing[:6], f"and {len(differing) - 6} more"]
 
 

@@ -1,8 +1,8 @@
 """Processes of this machine that simulate the runs of a study.
 
-They are used instead of `concurrent.futures`, where a dying process ends all others: here a crash,
-as in Drake's C++, is the outcome of one run, and scripts need no guard for their main module. Tasks
-and results are lines of JSON.
+`concurrent.futures` would end all processes if one of them dies. Here a crash, for example in
+Drake's C++ code, is the outcome of a single run; a run has a time limit; and a script needs no
+guard for its main module. Runs and results are lines of JSON.
 """
 
 import json
@@ -26,23 +26,23 @@ from drake_dae.studies.runs import Runner
 from drake_dae.studies.structures import Batch
 
 BUILDS = 200
-"""The number of loops after which a process is replaced, since Drake does not free all memory."""
+"""The number of loops of a process until it is replaced, since Drake does not free all memory."""
 
 PERIOD = 0.02
-"""The period of reporting results, in s: those of short runs are synced to the disk together."""
+"""The shortest time between reports, in s. Results of short runs are written to disk together."""
 
 STARTING = 300.0
-"""The longest start of a process, in s."""
+"""The longest time that a process may need to start, in s."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _ENDED = {128 + signal.SIGINT, *(-number for number in ENDING_SIGNALS)}
-"""Exit codes of a process that was ended by a signal."""
+"""Exit codes of a process that was ended by a signal to the study."""
 
 
 def cores() -> int:
-    """The number of cores available to this process."""
-    if hasattr(os, "sched_getaffinity"):
+    """The number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # macOS has none.
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
@@ -53,20 +53,20 @@ def run_in_processes(
     workers: int,
     time_limit: float = float("inf"),
 ) -> Generator[list[RunResult], None, None]:
-    """The results of all runs, in the order in which they end.
+    """Simulates all runs; yields their results in the order in which they end.
 
     Args:
         settings: The arguments of `Runner`, as plain data.
         batches: The runs.
         workers: The number of processes.
-        time_limit: The time limit of a run, in s; a process that exceeds it is ended.
+        time_limit: The time limit of a run, in s; a process that exceeds it is killed.
 
     Raises:
         ModelError: A process does not start.
     """
     waiting, workers = deque(batches), min(workers, len(batches))
     running: list[_Worker] = []
-    found: list[RunResult] = []
+    results: list[RunResult] = []
     last_report = -PERIOD
     with selectors.DefaultSelector() as selector:
         try:
@@ -77,29 +77,30 @@ def run_in_processes(
                     selector.register(worker.output, selectors.EVENT_READ, worker)
                 now = time.monotonic()
                 due = min(worker.due(time_limit) for worker in running) - now
-                due = min(due, last_report + PERIOD - now) if found else due
+                due = min(due, last_report + PERIOD - now) if results else due
                 for key, _ in selector.select(max(0.0, due) if isfinite(due) else None):
                     worker = key.data
                     is_open = worker.read()
-                    found += worker.take()
+                    results += worker.take_results()
                     if not is_open:
                         selector.unregister(worker.output)
                         running.remove(worker)
-                        lost = worker.close()
-                        found += [lost] if lost else []
-                        if worker.left:
-                            waiting.appendleft(worker.left)
+                        if crashed := worker.close():
+                            results.append(crashed)
+                        if worker.unfinished:
+                            waiting.appendleft(worker.unfinished)
                     elif worker.is_idle and waiting and worker.builds < BUILDS:
-                        worker.give(waiting.popleft())
+                        worker.start(waiting.popleft())
                     elif worker.is_idle:
-                        worker.dismiss()
+                        worker.finish()
                 for worker in running:
                     if time.monotonic() >= worker.due(time_limit):
                         worker.stop(time_limit)  # Its run is reported when its output ends.
-                if found and (time.monotonic() >= last_report + PERIOD or not (waiting or running)):
+                is_over = not (waiting or running)
+                if results and (is_over or time.monotonic() >= last_report + PERIOD):
                     last_report = time.monotonic()
-                    yield found
-                    found = []
+                    yield results
+                    results = []
         finally:
             for worker in running:
                 worker.kill()
@@ -109,15 +110,16 @@ class _Worker:
     """A worker process and its runs.
 
     Attributes:
-        output: The pipe of its results.
-        left: Its runs without a result.
-        is_idle: Whether it waits for runs.
-        builds: The number of loops that it has built.
-        began: The start of its present run, by the monotonic clock in s; infinite while it is idle.
+        output: The pipe with the results of the process.
+        unfinished: The runs of the process that have no result yet.
+        is_idle: Whether the process waits for runs.
+        builds: The number of loops that the process has built.
+        began: The time at which the present run began, by the monotonic clock in s; infinite while
+            the process is idle.
     """
 
     def __init__(self, settings: Sequence[Any]) -> None:
-        # Loaded modules are permanent, so the garbage collector need not examine them.
+        # The garbage collector does not have to examine modules, which stay loaded.
         code = (
             f"import gc, sys; gc.disable(); sys.path[:] = {sys.path!r}; "
             f"from {__name__} import serve; gc.freeze(); gc.enable(); sys.exit(serve())"
@@ -129,10 +131,10 @@ class _Worker:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**dict.fromkeys(_THREADS, "1"), **os.environ},
-            start_new_session=True,  # Ctrl-C is handled by the study, which ends them.
+            start_new_session=True,  # Ctrl-C reaches only the study, which ends its processes.
         )
         self.output: IO[bytes] = self._process.stdout  # type: ignore[assignment]
-        self.left: Batch = []
+        self.unfinished: Batch = []
         self.is_idle = False
         self.builds = 0
         self.began = time.monotonic()
@@ -142,19 +144,19 @@ class _Worker:
         self._results: list[RunResult] = []
         self._send(settings)
 
-    def give(self, batch: Batch) -> None:
-        """Gives it runs."""
-        self.left, self.is_idle = list(batch), False
+    def start(self, batch: Batch) -> None:
+        """Sends runs to the process."""
+        self.unfinished, self.is_idle = list(batch), False
         self.began = time.monotonic()
-        self._send(self.left)
+        self._send(self.unfinished)
 
-    def dismiss(self) -> None:
-        """Lets it end."""
+    def finish(self) -> None:
+        """Closes the input of the process, which then ends."""
         with suppress(OSError):
             self._process.stdin.close()  # type: ignore[union-attr]
 
     def read(self) -> bool:
-        """Reads its results; False at the end of its output."""
+        """Reads results; returns False at the end of the output."""
         data = os.read(self.output.fileno(), 1 << 16)
         *lines, self._text = (self._text + data).split(b"\n")
         for line in lines:
@@ -164,39 +166,39 @@ class _Worker:
                 self.began, self.builds = float("inf"), line_data["builds"]
             else:
                 self._results.append(RunResult.from_dict(line_data))
-                self.left, self.began = self.left[1:], time.monotonic()
+                self.unfinished, self.began = self.unfinished[1:], time.monotonic()
         return bool(data)
 
     def due(self, limit: float) -> float:
-        """The time at which its run exceeds the limit, by the monotonic clock in s."""
+        """The time at which the present run exceeds a limit, by the monotonic clock in s."""
         return self.began + (limit if self._is_ready else max(limit, STARTING))
 
     def stop(self, limit: float) -> None:
-        """Ends it, since its run exceeds a limit in s; `read` and `close` report it."""
+        """Kills the process, since its run exceeds a limit in s; `close` returns this outcome."""
         if self._limit is None:
             self._limit = limit
             self._process.kill()
         self.began = float("inf")
 
-    def take(self) -> list[RunResult]:
-        """The results since the last call."""
-        found, self._results = self._results, []
-        return found
+    def take_results(self) -> list[RunResult]:
+        """Returns the results since the last call."""
+        results, self._results = self._results, []
+        return results
 
     def close(self) -> RunResult | None:
-        """Closes it, and returns the outcome of its unfinished run if it died.
+        """Closes the pipes; returns the outcome of the run that was unfinished, None without one.
 
         Raises:
-            ModelError: It did not start.
-            KeyboardInterrupt: It was ended by a signal, as at a shutdown.
+            ModelError: The process did not start.
+            KeyboardInterrupt: The process was ended by a signal, as at a shutdown.
         """
         code = self._process.wait()
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").split("\n")
         self._close()
-        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
-        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        reason = f"the process ended with {how}" + (f": {said[:200]}" if said else "")
+        message = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        cause = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        reason = f"the process ended with {cause}" + (f": {message[:200]}" if message else "")
         outcome = Outcome.CRASHED
         if self._limit is not None:
             outcome, reason = Outcome.TIMED_OUT, f"no end within {self._limit:g} s"
@@ -204,49 +206,47 @@ class _Worker:
             raise ModelError(f"no process for the runs of a study starts; {reason}")
         if code in _ENDED:
             raise KeyboardInterrupt(signal.SIGTERM)
-        if not self.left:
+        if not self.unfinished:
             return None
-        (number, _), *rest = self.left
-        self.left = rest
+        (number, _), *self.unfinished = self.unfinished
         return RunResult(number, outcome, reason)
 
     def kill(self) -> None:
-        """Kills it."""
+        """Kills the process, and closes its pipes."""
         self._process.kill()
         self._process.wait()
         self._close()
 
     def _send(self, data: Any) -> None:
-        with suppress(OSError):  # A process that has ended is noticed by reading.
+        with suppress(OSError):  # `read` notices that a process has ended.
             self._process.stdin.write(json.dumps(data).encode() + b"\n")  # type: ignore[union-attr]
             self._process.stdin.flush()  # type: ignore[union-attr]
 
     def _close(self) -> None:
-        with suppress(OSError):
-            self._process.stdin.close()  # type: ignore[union-attr]
+        self.finish()
         self.output.close()
         self._errors.close()
 
 
 def serve() -> int:
-    """The main function of a process: it reads the scenario, then runs, and reports each result.
+    """The main function of a process: reads settings and batches of runs, and writes results.
 
-    After each batch, and at the start, it reports the number of loops it has built.
+    At the start and after each batch it writes the number of loops that it has built.
     """
     results = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # Other output is redirected to stderr.
 
-    def tell(data: Mapping[str, Any]) -> None:
+    def write(data: Mapping[str, Any]) -> None:
         results.write(json.dumps(data).encode() + b"\n")
         results.flush()
 
     try:
         runner = Runner(*json.loads(sys.stdin.buffer.readline()))
-        tell({"builds": 0})
+        write({"builds": 0})
         for line in sys.stdin.buffer:
             for result in runner.run_all(json.loads(line)):
-                tell(result.to_dict())
-            tell({"builds": runner.builds})
+                write(result.to_dict())
+            write({"builds": runner.builds})
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:  # The study was killed.

@@ -1,4 +1,4 @@
-"""How runs of a study ended, and their figures."""
+"""The outcomes of the runs of a study, and their figures."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -12,19 +12,19 @@ class Outcome(StrEnum):
 
     FINISHED = "finished"
     FAILED = "failed"
-    """During the run; figures are up to the failure."""
+    """The run failed before its end. Its figures are those up to the failure."""
     NO_START = "no start"
-    """No consistent state satisfies the start."""
+    """There is no consistent initial state."""
     REFUSED = "refused"
-    """The scenario is inconsistent, or violates an assumption."""
+    """The scenario contradicts itself, or violates an assumption."""
     CRASHED = "crashed"
-    """The process ended, or failed unexpectedly."""
+    """The process ended, or raised an unexpected error."""
     TIMED_OUT = "timed out"
-    """The process was ended, since the run exceeded its time limit."""
+    """The process was killed, since the run exceeded its time limit."""
 
     @property
     def is_final(self) -> bool:
-        """Whether it is a property of the run itself; otherwise it may be tried again."""
+        """Whether another attempt would have the same outcome."""
         return self not in (Outcome.CRASHED, Outcome.TIMED_OUT)
 
 
@@ -33,12 +33,12 @@ class RunResult:
     """The result of a run of a study.
 
     Attributes:
-        run: Its number in the study.
-        outcome: How it ended.
-        reason: The reason, if it did not finish.
-        figures: Name with unit -> value, as `run_figures` has them.
-        exceeded: Names of the signals beyond their limits.
-        seconds: The elapsed time, including the build.
+        run: The number of the run in the study.
+        outcome: How the run ended.
+        reason: Why the run did not finish; empty if it finished.
+        figures: Name with unit -> value, from `run_figures`.
+        exceeded: The names of the signals that exceed their limits.
+        seconds: The elapsed time in s, including the time to build the loop.
     """
 
     run: int
@@ -54,23 +54,23 @@ class RunResult:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The result of plain data.
+        """Creates a result from plain data, the inverse of `to_dict`.
 
         Raises:
-            KeyError, TypeError, ValueError: The data are those of something else.
+            KeyError, TypeError, ValueError: The data are no result of a run.
         """
         values = dict(data)
         values["outcome"] = Outcome(values["outcome"])
         values["exceeded"] = tuple(values["exceeded"])
-        found = cls(**values)
-        numbers = [*found.figures.values(), found.seconds]
+        result = cls(**values)
+        numbers = [*result.figures.values(), result.seconds]
         if not (
-            type(found.run) is int
-            and found.run >= 0
+            type(result.run) is int
+            and result.run >= 0
             and all(type(number) in (int, float) and isfinite(number) for number in numbers)
-            and all(isinstance(text, str) for text in (found.reason, *found.exceeded))
-            and isinstance(found.figures, dict)
-            and found.seconds >= 0.0
+            and all(isinstance(text, str) for text in (result.reason, *result.exceeded))
+            and isinstance(result.figures, dict)
+            and result.seconds >= 0.0
         ):
             raise ValueError("no result of a run")
-        return found
+        return result

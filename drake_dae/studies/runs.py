@@ -41,28 +41,28 @@ class Runner:
     """Simulates runs of a study, and reuses the closed loop for equal structures.
 
     Attributes:
-        builds: The number of loops it has built; Drake does not free all of their memory.
+        builds: The number of loops that were built. Drake does not free all of their memory.
 
     Args:
         base: The plain data of the study's scenario.
-        lasting: The total duration of runs of one structure, in s, for rollouts; None for Drake's
+        lasting: The simulated time of all runs with one loop, in s, for rollouts; None for Drake's
             Simulator.
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
-        self._base, self._own = base, study_data(base, {}, lasting is not None)
+        self._base, self._completed = base, study_data(base, {}, lasting is not None)
         self._lasting = lasting
-        self._key, self._known = "", dict[Any, Any]()
+        self._key, self._read = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
-        """The closed loop of a run's data.
+        """Returns the closed loop for the data of a run; builds it if the structure changed.
 
         Raises:
-            ScenarioError: Something does not fit; the message names its key.
+            ScenarioError: The loop cannot be built; the message names the key.
         """
-        built = built_data(data, self._own)
+        built = built_data(data, self._completed)
         key = json.dumps(built, sort_keys=True)
         if key != self._key:
             self._key, self._built = "", None
@@ -77,9 +77,9 @@ class Runner:
         return cast(ClosedLoop, self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
-        """The problem with the keys and values of a variation; None if there is none.
+        """Returns the error in the keys and values of a variation; None if there is none.
 
-        A start out of reach or a violated assumption is an outcome of a run.
+        An unreachable start or a violated assumption is no such error: it is the outcome of a run.
         """
         try:
             data = study_data(self._base, variation, self._lasting is not None)
@@ -99,62 +99,70 @@ class Runner:
         return None
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
-        """Simulates runs; yields each result, in their order."""
+        """Simulates runs; yields their results in the same order."""
         size = 1 if self._lasting is None else TOGETHER
         for first in range(0, len(batch), size):
-            begun = [self._timed(self._begin, *pair) for pair in batch[first : first + size]]
-            self._roll_together([each for each in begun if isinstance(each, _Begun)])
-            for each in begun:
-                yield self._timed(self._end, each) if isinstance(each, _Begun) else each
+            started = [
+                self._timed(number, 0.0, self._start, number, variation)
+                for number, variation in batch[first : first + size]
+            ]
+            self._roll_together([run for run in started if isinstance(run, _StartedRun)])
+            for run in started:
+                if isinstance(run, _StartedRun):
+                    yield self._timed(run.number, run.seconds, self._finish, run)
+                else:
+                    yield run
 
-    def _timed(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What a part of a run comes to, with the time that its run has taken up to then."""
-        began, given = time.perf_counter(), arguments[0]
-        number, before = (given.number, given.seconds) if isinstance(given, _Begun) else (given, 0)
+    def _timed(
+        self, number: int, before: float, function: Callable[..., Any], *arguments: Any
+    ) -> Any:
+        """Calls a part of a run, and adds its time to the time `before`, in s."""
+        began = time.perf_counter()
         try:
-            found = function(*arguments)
+            result = function(*arguments)
         except Exception as error:  # A study of thousands of runs continues.
             text = f"{type(error).__name__}: {brief(str(error))}"
-            found = RunResult(number, Outcome.CRASHED, text)
-        return replace(found, seconds=before + time.perf_counter() - began)
+            result = RunResult(number, Outcome.CRASHED, text)
+        return replace(result, seconds=before + time.perf_counter() - began)
 
-    def _begin(self, number: int, variation: Variation) -> "_Begun | RunResult":
+    def _start(self, number: int, variation: Variation) -> "_StartedRun | RunResult":
+        """Reads the scenario of a run, builds its loop, and finds its initial state."""
         try:
             data = study_data(self._base, variation, self._lasting is not None)
-            scenario = read_scenario(data, known=self._known)
+            scenario = read_scenario(data, known=self._read)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.
                 loop = self.loop(data)
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
         try:
-            return _Begun(number, scenario, loop, start_scenario(scenario, loop))
+            return _StartedRun(number, scenario, loop, start_scenario(scenario, loop))
         except DrakeDaeError as error:
             return _not_started(number, error)
 
-    def _roll_together(self, begun: Sequence["_Begun"]) -> None:
-        """Makes rollouts of one loop at once, where they can be made."""
+    def _roll_together(self, started: Sequence["_StartedRun"]) -> None:
+        """Computes the rollouts of runs with the same loop together; failed ones stay None."""
         if self._lasting is None:
             return
         from drake_dae.scenario.rolled import roll_together
 
-        for loop in dict.fromkeys(each.loop for each in begun):
-            own = [each for each in begun if each.loop is loop]
-            scenarios, contexts = [each.scenario for each in own], [each.context for each in own]
+        for loop in dict.fromkeys(run.loop for run in started):
+            runs = [run for run in started if run.loop is loop]
+            scenarios, contexts = [run.scenario for run in runs], [run.context for run in runs]
             began = time.perf_counter()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                with suppress(Exception):  # Each run says so itself.
-                    found = roll_together(scenarios, loop, contexts, self._lasting)
-                    for each, rollout in zip(own, found, strict=True):
-                        each.rollout = rollout
-            share = (time.perf_counter() - began) / len(own)
-            for each in own:
-                each.seconds += share
+                with suppress(Exception):  # `_finish` repeats the rollout, and reports the error.
+                    rollouts = roll_together(scenarios, loop, contexts, self._lasting)
+                    for run, rollout in zip(runs, rollouts, strict=True):
+                        run.rollout = rollout
+            seconds = (time.perf_counter() - began) / len(runs)
+            for run in runs:
+                run.seconds += seconds
 
-    def _end(self, begun: "_Begun") -> RunResult:
-        """The result of a run that has a start."""
-        number, scenario, loop, context = begun.number, begun.scenario, begun.loop, begun.context
+    def _finish(self, run: "_StartedRun") -> RunResult:
+        """Simulates a run, unless its rollout exists, and returns its result."""
+        number, scenario, loop, context = run.number, run.scenario, run.loop, run.context
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -163,8 +171,8 @@ class Runner:
                 else:
                     from drake_dae.scenario.rolled import roll_scenario
 
-                    found = begun.rollout or roll_scenario(scenario, loop, context, self._lasting)
-                    record, steps, failure = found.record, found.steps, found.failure
+                    rollout = run.rollout or roll_scenario(scenario, loop, context, self._lasting)
+                    record, steps, failure = rollout.record, rollout.steps, rollout.failure
         except DrakeDaeError as error:
             return _not_started(number, error)
         limits = Limits.of(loop.plant.robot("a study"))
@@ -175,14 +183,13 @@ class Runner:
 
 
 @dataclass(eq=False)
-class _Begun:
-    """A run that has a start.
+class _StartedRun:
+    """A run with a consistent initial state, in `context`.
 
     Attributes:
-        number: Its number in the study.
-        scenario, loop, context: What is run.
-        rollout: What it came to, if that is known by now.
-        seconds: The time that it has taken up to now.
+        number: The number of the run in the study.
+        rollout: The rollout, if it was computed together with others.
+        seconds: The time that the run has taken so far, in s.
     """
 
     number: int
@@ -199,7 +206,7 @@ def _not_started(number: int, error: DrakeDaeError) -> RunResult:
 
 
 def _is_about_states(error: BaseException | None) -> bool:
-    """Whether an error comes from states or assumptions rather than from the file."""
+    """Whether an error is about states or assumptions, and not about keys of the scenario."""
     while error is not None:
         if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
             return True
@@ -210,7 +217,7 @@ def _is_about_states(error: BaseException | None) -> bool:
 def _stepped(
     scenario: Scenario, loop: ClosedLoop, context: Context
 ) -> tuple[Record, int, SimulationError | None]:
-    """A run by Drake's Simulator: its record, number of steps, and reason of failure."""
+    """Runs Drake's Simulator; returns the record, the number of steps, and the failure if any."""
     steps, failure = 0, None
     try:
         run = simulate(
@@ -229,11 +236,11 @@ def _stepped(
 
 
 _ALONE = Lock()
-"""Threads of one process share the built loop."""
+"""Threads of a worker share one loop, so that only one of them simulates at a time."""
 
 
 def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
-    """Simulates runs in this process, for a cluster's workers.
+    """Simulates runs in a worker of a cluster, and returns their results as plain data.
 
     Args:
         base: The arguments of `Runner` as JSON.

@@ -1,4 +1,4 @@
-"""The data of a study's runs, and which of them the same closed loop can simulate."""
+"""The data of a study's runs, and groups of runs that the same closed loop can simulate."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,27 +15,27 @@ from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.studies.variations import Variation
 
 TOGETHER = 32
-"""At most so many rollouts are made at once."""
+"""The largest number of rollouts that are computed together."""
 
 Batch = Sequence[tuple[int, Variation]]
-"""Runs of one structure, with their numbers."""
+"""(number, variation) of runs with one structure."""
 
 
 def study_data(
     base: Mapping[str, Any], variation: Variation, is_rollout: bool = False
 ) -> dict[str, Any]:
-    """The complete data of a run, for a rollout with the plant that this runs.
+    """Returns the complete data of a run; for a rollout, with the plant that rollouts simulate.
 
     Args:
         base: The plain data of the study's scenario.
-        variation: What the run has different.
-        is_rollout: Whether it is a rollout.
+        variation: Dotted key -> the value of this run.
+        is_rollout: Whether the run is a rollout.
 
     Raises:
-        ScenarioError: A scenario cannot have this.
+        ScenarioError: The scenario does not accept a key or a value.
     """
     data = varied_data(base, variation)
-    if any(map(_has_keys, variation.values())):  # It may leave out keys that have defaults.
+    if any(map(_has_keys, variation.values())):  # A mapping may lack keys that have defaults.
         data = scenario_data(read_scenario(data))
     if is_rollout:
         from drake_dae.scenario.rolled import rolled_data
@@ -49,18 +49,18 @@ def _has_keys(value: Any) -> bool:
 
 
 def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
-    """Text that is equal for scenarios that the same closed loop can simulate.
+    """Returns a text that is equal for scenarios that the same closed loop can simulate.
 
-    They may differ in the data of a context: start, parameters of the plant, uncoupled gains, seed;
-    or in the settings of the run.
+    Such scenarios differ only in settings of the run and in data of a context: start, parameters of
+    the plant, uncoupled gains, seed.
     """
     return json.dumps(built_data(data, base), sort_keys=True)
 
 
 def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's data with the data of a context taken from the base of the study.
+    """Returns a scenario's data in which all data of a context are those of the base.
 
-    So the loop does not depend on which run comes first.
+    Then the loop does not depend on the order of runs.
     """
     own = dict(data)
     for key in ("description", "plant_parameters", "duration", "integrator", "write"):
@@ -76,21 +76,21 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
     if kind.carries:  # It is built with its own parameters.
         own["plant_parameters"] = data["plant_parameters"]
     elif kind.adjusts:
-        own["plant_payloads"] = [{**each, "mass": 1.0} for each in own["plant_payloads"]]
-        still = {"force": [0.0, 0.0, 0.0]}
-        own["plant_disturbances"] = [{**each, **still} for each in own["plant_disturbances"]]
+        zero = {"force": [0.0, 0.0, 0.0]}
+        own["plant_payloads"] = [{**payload, "mass": 1.0} for payload in own["plant_payloads"]]
+        own["plant_disturbances"] = [{**force, **zero} for force in own["plant_disturbances"]]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
     own["start"] = {**first, "positions": positions}
-    # Default gains depend on the built loop; and a task is built with its numbers.
+    # Default gains depend on the built loop, and a task contains the values of its gains.
     if own["gains"] and base["gains"] and not own["task"]:
         tag = own["gains"].get(TAG, "!Poles")
         if tag == base["gains"][TAG] != "!Matrices":
             own["gains"] = base["gains"]
     if "seed" in (force := own["force_feedback"]):
         deviation = force["noise_deviation"]
-        if not own["task"]:  # The guards of a task know the noise.
+        if not own["task"]:  # The guards of a task depend on the noise.
             deviation = float(np.any(np.array(deviation) != 0.0))
         errors = {"seed": 0, "bias": 0.0, "noise_deviation": deviation}
         own["force_feedback"] = {**force, **errors}
@@ -100,7 +100,7 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
 
 
 def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
-    """The mean total duration of the runs of one structure, in s of simulated time.
+    """The simulated time of all runs divided by the number of structures, in s.
 
     Args:
         base: The plain data of the study's scenario.
@@ -108,7 +108,7 @@ def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
     """
     total, keys, own = 0.0, set(), study_data(base, {}, True)
     for variation in variations:
-        with suppress(ScenarioError):  # That run says so itself.
+        with suppress(ScenarioError):  # The run itself reports the error.
             data = study_data(base, variation, True)
             total += data["duration"]
             keys.add(structure_key(data, own))
@@ -121,19 +121,19 @@ def batches(
     workers: int,
     are_rollouts: bool = False,
 ) -> list[Batch]:
-    """The runs by structure, in portions: a worker builds at most one loop per portion.
+    """Divides runs into batches of one structure; a worker builds one loop for a batch.
 
     Args:
         base: The plain data of the study's scenario.
-        runs: The runs.
+        runs: The numbers and variations of the runs.
         workers: The number of workers.
-        are_rollouts: Whether they are rollouts.
+        are_rollouts: Whether the runs are rollouts.
     """
     groups: dict[str, list[tuple[int, Variation]]] = {}
     own = study_data(base, {}, are_rollouts)
     for number, variation in runs:
         key = ""
-        with suppress(ScenarioError):  # That run says so itself.
+        with suppress(ScenarioError):  # The run itself reports the error.
             key = structure_key(study_data(base, variation, are_rollouts), own)
         groups.setdefault(key, []).append((number, variation))
     total = sum(map(len, groups.values()))

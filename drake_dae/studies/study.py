@@ -21,10 +21,10 @@ from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.variations import Variation, rerun_commands, run_name
 
 FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
-"""The files of `Study.save`."""
+"""The names of the files that `Study.save` writes."""
 
 MOST_REASONS = 5
-"""The largest number of listed reasons of unfinished runs."""
+"""The largest number of unfinished runs that are listed with their reasons."""
 
 
 @checked(ModelError)
@@ -34,8 +34,9 @@ class Study:
 
     Attributes:
         variations: For each run, dotted key of the scenario -> value.
-        results: For each run its outcome, its figures and the signals beyond their limits.
-        scenario: What was varied, of which `save` tells how a run is made again; None if unknown.
+        results: The result of each run.
+        scenario: The scenario of the study, from which `save` derives the commands that repeat a
+            run; None if unknown.
         rollout: Whether the runs were rollouts.
     """
 
@@ -52,7 +53,7 @@ class Study:
             )
 
     def __repr__(self) -> str:
-        return f"Study({count_of(len(self.results), 'run')}: {_counts(self.results)})"
+        return f"Study({self._outcomes()})"
 
     def __str__(self) -> str:
         return to_text(self._parts())
@@ -68,7 +69,7 @@ class Study:
         return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
 
     def values(self, figure: str) -> FloatArray:
-        """A figure of every run, shape (number of runs,); nan if a run has none.
+        """A figure of every run, shape (number of runs,); nan for runs without this figure.
 
         Raises:
             ModelError: There is no such figure.
@@ -78,11 +79,11 @@ class Study:
         return np.array([result.figures.get(figure, np.nan) for result in self.results])
 
     def table(self) -> dict[str, list[Any]]:
-        """The whole study: name of a column -> its entries; None if a run has none.
+        """The study as a table: name of a column -> one entry for each run, None if it has none.
 
-        Columns are the number of the run, the keys that vary, the outcome with its reason, the
-        signals beyond their limits, and the figures. It does not depend on who ran it or on
-        interruptions.
+        The columns are the number of the run, the keys that vary, the outcome with its reason, the
+        signals that exceed their limits, and the figures. The table does not depend on the machine
+        or on interruptions.
         """
         return {
             "run": [result.run for result in self.results],
@@ -95,15 +96,15 @@ class Study:
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
-        found = {}
-        for name in self.figures:
-            values = self.values(name)
-            found[name] = {
+        return {
+            name: {
                 "least": float(np.nanmin(values)),
                 "median": float(np.nanmedian(values)),
                 "largest": float(np.nanmax(values)),
             }
-        return found
+            for name in self.figures
+            for values in [self.values(name)]
+        }
 
     def save(
         self,
@@ -112,32 +113,36 @@ class Study:
         again: Sequence[str] = (),
         duration: float | None = None,
     ) -> list[Path]:
-        """Writes `runs.csv`, `summary.txt`, `study.html`, and the plots that it has figures for.
+        """Writes `runs.csv`, `summary.txt`, `study.html`, and one plot for each available figure.
 
-        `study.html` is one page without anything from outside: a table to sort, parallel
-        coordinates, and runs beside each other. It shows the plots and the animation of a run that
-        has a folder "run<number>" beside the page. A study that knows its scenario writes
-        `scenario.yaml` as well, and the page has the commands that make these folders.
+        `study.html` is a self-contained page with a sortable table, parallel coordinates, and a
+        comparison of runs. If a folder "run<number>" exists beside the page, the page shows the
+        plots and the animation of this run. If the study has a scenario, `scenario.yaml` is
+        written, too, and the page shows the commands that create these folders.
 
         Args:
-            folder: The folder to write to; it is made.
-            title: The title of the page; that of the folder if empty.
-            again: For each run a command that makes its folder, in place of these.
-            duration: The duration of the runs, in s; that of the scenario, or 1, if None.
+            folder: The folder to write to; created if it does not exist.
+            title: The title of the page; the name of the folder if empty.
+            again: For each run a command that creates its folder, instead of the default one.
+            duration: The duration of the runs, in s; None for that of the scenario, or 1 without a
+                scenario.
+
+        Returns:
+            The paths of `runs.csv`, `summary.txt`, `study.html` and the plots.
         """
         from drake_dae.studies.study_plots import save_study_plots
 
         if again and len(again) != len(self.results):
             raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
         if self.scenario is not None:
-            base = place / "scenario.yaml"
+            base = folder / "scenario.yaml"
             save_scenario(self.scenario, base)
             made = ["drake-dae", "simulate", str(base), *(["--rollout"] if self.rollout else [])]
-            again = again or rerun_commands(made, self.variations, place)
+            again = again or rerun_commands(made, self.variations, folder)
             duration = self.scenario.duration if duration is None else duration
-        table, summary, page = (place / name for name in FILES[:3])
+        table, summary, page = (folder / name for name in FILES[:3])
         columns = self.table()
         with open(table, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -146,35 +151,40 @@ class Study:
                 [_cell(entry) for entry in row] for row in zip(*columns.values(), strict=True)
             )
         summary.write_text(f"{self}\n", encoding="utf-8")
-        named = title or place.resolve().name
+        title = title or folder.resolve().name
         seconds = 1.0 if duration is None else duration
-        page.write_text(self._page(named, again, seconds), encoding="utf-8")
-        plots = save_study_plots(columns, self.keys, self.figures, place)
+        page.write_text(self._page(title, again, seconds), encoding="utf-8")
+        plots = save_study_plots(columns, self.keys, self.figures, folder)
         return [table, summary, page, *plots]
 
     def _repr_html_(self) -> str:
-        """The page of `save`, in a notebook."""
+        """The page of `save`, for a notebook."""
         return self._page(repr(self), (), 1.0)._repr_html_()
 
     def _page(self, title: str, again: Sequence[str], duration: float) -> InlinePage:
         from drake_dae.studies.study_page import PageText, study_page
 
-        said = f"{count_of(len(self.results), 'run')}: {_counts(self.results)}"
         names = [run_name(changes) for changes in self.variations]
-        text = PageText(title, said, names, again, duration)
+        text = PageText(title, self._outcomes(), names, again, duration)
         return InlinePage(study_page(self.table(), self.keys, self.figures, text))
 
+    def _outcomes(self) -> str:
+        """The number of runs, and of each outcome, in words."""
+        counts = Counter(result.outcome for result in self.results)
+        texts = [f"{counts[outcome]} {outcome}" for outcome in Outcome if counts[outcome]]
+        return f"{count_of(len(self.results), 'run')}: {', '.join(texts)}"
+
     def _parts(self) -> list[Part]:
-        parts: list[Part] = [[f"{count_of(len(self.results), 'run')}: {_counts(self.results)}"]]
+        parts: list[Part] = [[self._outcomes()]]
         others = [result for result in self.results if result.outcome is not Outcome.FINISHED]
         if others:
-            names = [run_name(self.variations[r.run]) for r in others[:MOST_REASONS]]
-            shown = [
-                f"run {r.run}, {name}, {r.outcome}: {r.reason}"
-                for r, name in zip(others, names, strict=False)
+            lines = [
+                f"run {r.run}, {run_name(self.variations[r.run])}, {r.outcome}: {r.reason}"
+                for r in others[:MOST_REASONS]
             ]
-            more = len(others) - len(shown)
-            parts.append([*shown, f"and {more} more, see runs.csv"] if more else shown)
+            if len(others) > MOST_REASONS:
+                lines.append(f"and {len(others) - MOST_REASONS} more, see runs.csv")
+            parts.append(lines)
         beyond = Counter(name for result in self.results for name in result.exceeded)
         if beyond:
             counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
@@ -197,11 +207,6 @@ class Study:
         ]
 
 
-def _counts(results: Sequence[RunResult]) -> str:
-    counts = Counter(result.outcome for result in results)
-    return ", ".join(f"{counts[outcome]} {outcome}" for outcome in Outcome if counts[outcome])
-
-
 def _cell(entry: Any) -> Any:
-    """Lists and tags as JSON, other values unchanged."""
+    """Returns lists and mappings as JSON, and other values unchanged."""
     return json.dumps(entry) if isinstance(entry, (dict, list)) else entry

@@ -2,8 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
@@ -29,7 +29,7 @@ from drake_dae.studies.study import Study
 from drake_dae.studies.variations import MOST_RUNS, Variation, plain
 
 MOST_PROBLEMS = 10
-"""The largest number of wrong values that are reported together."""
+"""The largest number of invalid values that are reported together."""
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -44,39 +44,39 @@ def sweep(
     rollout: bool = False,
     time_limit: float = 3600.0,
 ) -> Study:
-    """Runs a scenario once for each variation; what runs come to is in a file from then on.
+    """Runs a scenario once for each variation, and stores each result in a file at once.
 
-    A study that ended early, by whatever, continues when the same call is made again: runs that the
-    file has are not run again, and the table is the same as without the interruption. Runs that
-    fail are outcomes with a reason; those whose process died or was too slow are run again by the
-    next call. Before the first run, keys and values are checked, of numbers
-    the least and the largest, and the first, the middle or the last variation is built.
+    A study that was interrupted continues when the same call is made again: it skips runs with a
+    result in the file, and its table is the same as without the interruption. A failed run is an
+    outcome with a reason. The next call repeats runs whose process died or exceeded the time limit.
+    Before the first run, all keys and values are checked (of numbers, the least and the largest),
+    and up to three variations are built until one starts.
 
-    Runs that differ in start, plant_parameters, seed of the sensor, gains that couple no outputs,
-    or in the integrator share one closed loop in each process.
+    Runs that differ only in start, plant_parameters, seed of the sensor, gains that couple no
+    outputs, or integrator share one closed loop in each process.
 
     Args:
-        scenario: What `load_scenario` returns.
-        variations: For each run, dotted key of the scenario -> value; for example those of
+        scenario: A scenario from `load_scenario`.
+        variations: For each run, dotted key of the scenario -> value; for example from
             `grid_variations`, `random_variations` or `listed_variations`.
-        file: The file in JSON Lines: a line for the study, then one for each finished run.
-        workers: How many processes of this machine; all its cores if None.
-        cluster: The address of a Dask scheduler, whose workers run it instead; its machines need
-            drake_dae and the robot's files.
-        progress: Shows a bar with the time left, if stderr is a terminal.
-        rollout: Runs by `rollout` in place of Drake's Simulator, many times as fast; machine code
-            is made where that pays for the whole study. Figures are those of 1,000 even rows of
-            each run, of all steps where these are fixed.
-        time_limit: How long a run may take on this machine by the clock, in s, building included: a
-            process that takes longer, as one that was stopped does, is ended.
+        file: The file, in JSON Lines: a line for the study, then a line for each run.
+        workers: The number of processes of this machine; None for the number of its cores.
+        cluster: The address of a Dask scheduler, whose workers simulate the runs instead. Their
+            machines need drake_dae and the files of the robot.
+        progress: Shows a bar with the remaining time, if stderr is a terminal.
+        rollout: Simulates by `rollout` instead of Drake's Simulator, which is many times as fast.
+            Machine code is compiled if this saves time in the whole study. Figures are computed
+            from 1,000 equally spaced rows of each run, or from all steps if steps are fixed.
+        time_limit: The longest elapsed time of a run on this machine, in s, including the time to
+            build its loop. A process that exceeds it is killed.
 
     Raises:
-        ScenarioError: A key or a value cannot be used, or no variation that was tried starts, or a
-            loop has what no rollout has.
-        ModelError: The file belongs to another study, or cannot be written; processes or cluster
+        ScenarioError: A key or a value is not valid, or none of the variations that were tried
+            starts, or a rollout does not support the loop.
+        ModelError: The file belongs to another study or cannot be written, or processes or cluster
             cannot be used.
     """
-    with suppress(ScenarioError):  # It is reported by each run, which may have other values.
+    with suppress(ScenarioError):  # Each run reports it; a run may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
     chosen = [{key: plain(key, value) for key, value in changes.items()} for changes in variations]
@@ -104,55 +104,47 @@ def _run(
     progress: bool,
     time_limit: float,
 ) -> None:
-    """Runs what is missing, and puts it into the journal as it comes."""
+    """Simulates the runs that have no final result in the journal, and appends their results."""
     final = {run for run, result in journal.results.items() if result.outcome.is_final}
     missing = [pair for pair in enumerate(variations) if pair[0] not in final]
     if not missing:
         return
     base, total = settings[0], len(variations)
-    with _bar(total, total - len(missing), progress) as show:
-        if cluster is None:
-            count = workers or cores()
-            portions = batches(base, missing, count, settings[1] is not None)
-            _collect(run_in_processes(settings, portions, count, time_limit), journal, show)
-            return
-        with Cluster(cluster) as connected:
-            portions = batches(base, missing, connected.workers, settings[1] is not None)
-            _collect(connected.run(settings, portions), journal, show)
-
-
-def _collect(
-    found: Generator[list[RunResult], None, None],
-    journal: Journal,
-    show: Callable[[list[RunResult]], None],
-) -> None:
-    with closing(found):
-        for results in found:
-            journal.append(results)
-            show(results)
+    with _bar(total, total - len(missing), progress) as show, ExitStack() as stack:
+        connected = None if cluster is None else stack.enter_context(Cluster(cluster))
+        count = connected.workers if connected else workers or cores()
+        groups = batches(base, missing, count, settings[1] is not None)
+        results = (
+            connected.run(settings, groups)
+            if connected
+            else run_in_processes(settings, groups, count, time_limit)
+        )
+        for some in stack.enter_context(closing(results)):
+            journal.append(some)
+            show(some)
 
 
 @contextmanager
-def _bar(total: int, done: int, is_wanted: bool) -> Iterator[Callable[[list[RunResult]], None]]:
-    """A bar with the time left on a terminal; gives what is to be called with new results."""
+def _bar(total: int, done: int, progress: bool) -> Iterator[Callable[[list[RunResult]], None]]:
+    """Shows a progress bar on a terminal; yields a function that counts new results."""
     form = "{percentage:3.0f}%|{bar}| {n}/{total} runs, {remaining} left{postfix}"
     bar = tqdm(
         total=total,
         initial=done,
-        disable=not (is_wanted and sys.stderr.isatty()),
+        disable=not (progress and sys.stderr.isatty()),
         file=sys.stderr,
         bar_format=form,
         smoothing=0.05,
         **default_size(),
     )
-    other = 0
+    unfinished = 0
 
     def show(results: list[RunResult]) -> None:
-        nonlocal other
-        other += sum(result.outcome is not Outcome.FINISHED for result in results)
-        with suppress(OSError):  # A terminal that is closed ends no study.
-            if other:
-                bar.set_postfix_str(f"{other} not finished", refresh=False)
+        nonlocal unfinished
+        unfinished += sum(result.outcome is not Outcome.FINISHED for result in results)
+        with suppress(OSError):  # The study continues after its terminal was closed.
+            if unfinished:
+                bar.set_postfix_str(f"{unfinished} not finished", refresh=False)
             bar.update(len(results))
 
     try:
@@ -163,7 +155,7 @@ def _bar(total: int, done: int, is_wanted: bool) -> Iterator[Callable[[list[RunR
 
 
 def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
-    """Refuses keys and values that a scenario cannot have."""
+    """Checks that a scenario accepts all keys and values."""
     if not variations:
         raise ScenarioError(("", "a study needs at least one variation"))
     if len(variations) > MOST_RUNS:
@@ -185,17 +177,17 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
 
 
 def _representatives(variations: Sequence[Variation]) -> Iterator[Variation]:
-    """Variations that together have each value of each key, of its numbers the extreme ones."""
-    for alike in _same_keys(variations):
-        first = alike[0]
+    """Variations with each value of each key; of a key's numbers, the least and the largest."""
+    for group in _same_keys(variations):
+        first = group[0]
         yield first
         for key in first:
-            for value in _extremes([changes[key] for changes in alike]):
+            for value in _extremes([changes[key] for changes in group]):
                 yield {**first, key: value}
 
 
 def _same_keys(variations: Sequence[Variation]) -> list[list[Variation]]:
-    """The variations, those that change the same keys together."""
+    """Groups of variations that change the same keys."""
     groups: dict[tuple[str, ...], list[Variation]] = {}
     for changes in variations:
         groups.setdefault(tuple(changes), []).append(changes)
@@ -203,7 +195,7 @@ def _same_keys(variations: Sequence[Variation]) -> list[list[Variation]]:
 
 
 def _extremes(values: Sequence[Any]) -> list[Any]:
-    """Different values; of finite numbers the least and the largest of each type."""
+    """The different values; of finite numbers, the least and the largest of each type."""
     numbers: dict[type, list[float]] = {int: [], float: []}
     others = {}
     for value in values:
@@ -211,24 +203,23 @@ def _extremes(values: Sequence[Any]) -> list[Any]:
             numbers[type(value)].append(value)
         else:
             others[repr(value)] = value
-    ends = [end for found in numbers.values() if found for end in (min(found), max(found))]
+    ends = [end for same in numbers.values() if same for end in (min(same), max(same))]
     return [*others.values(), *ends]
 
 
 def _try(runner: Runner, variations: Sequence[Variation]) -> None:
-    """Refuses a study of which nothing starts, as where a parameter has another name.
+    """Checks that runs can be built, for example that the names of parameters exist.
 
     Raises:
-        ScenarioError: Neither the first, nor the middle, nor the last run can be built and started,
-            of those that change the same keys, and not by what the robot can reach; why the first
-            cannot.
+        ScenarioError: The first, the middle and the last run of a group with the same keys all have
+            an error in keys or values; it is the error of the first run.
     """
-    for alike in _same_keys(variations):
-        reasons = []
-        for place in dict.fromkeys((0, len(alike) // 2, len(alike) - 1)):
-            reason = runner.why_not(alike[place])
-            if reason is None:
+    for group in _same_keys(variations):
+        errors = []
+        for index in dict.fromkeys((0, len(group) // 2, len(group) - 1)):
+            error = runner.why_not(group[index])
+            if error is None:
                 break
-            reasons.append(reason)
+            errors.append(error)
         else:
-            raise reasons[0]
+            raise errors[0]

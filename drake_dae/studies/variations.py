@@ -1,4 +1,4 @@
-"""What the runs of a study have different from each other: scenario keys with their values."""
+"""The variations of a study: for each run, keys of the scenario and their values."""
 
 import re
 import shlex
@@ -20,7 +20,7 @@ from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 
 MOST_RUNS = 1_000_000
-"""A study has no more runs than these: they would take weeks."""
+"""The largest number of runs of a study; more would take weeks."""
 
 Variation = dict[str, Any]
 """Dotted key of a scenario -> its value in one run, as plain data."""
@@ -32,54 +32,54 @@ def _error(text: str) -> ScenarioError:
 
 @checked(_error)
 def grid_variations(values: Mapping[str, Any]) -> list[Variation]:
-    """Every combination of some values of some keys; those of the last key change first.
+    """Returns every combination of the values of some keys; the last key changes fastest.
 
     Args:
-        values: Dotted key -> its values, for example {"start.errors.tool.z": [0.0, 0.05]}.
+        values: Dotted key -> values, for example {"start.errors.tool.z": [0.0, 0.05]}.
 
     Raises:
         ScenarioError: A key has no values, or there are more than a million combinations.
     """
-    columns = {key: _values(key, given) for key, given in values.items()}
+    columns = _all_values(values)
     _check_count(prod(map(len, columns.values())))
     return [dict(zip(columns, chosen, strict=True)) for chosen in product(*columns.values())]
 
 
 @checked(_error)
 def random_variations(ranges: Mapping[str, Any], count: int, seed: int = 0) -> list[Variation]:
-    """Random values of some keys, the same for the same seed.
+    """Returns random values of some keys; equal seeds give equal values.
 
-    What a key draws depends on the seed and its own name alone: a study with more runs, or with
-    another key, has the runs of the first one.
+    The values of a key depend only on the seed and on its name. Therefore a study with more runs or
+    further keys contains the values of the smaller study.
 
     Args:
-        ranges: Dotted key -> a tuple (low, high) for numbers in between, all equally likely; a
-            `range` for its whole numbers; any list for one of its values. A text "low..high" within
-            such a value, as in [["0.69..0.71", 0.0, 0.0]], is a number in between.
-        count: How many runs.
-        seed: The seed, from 0.
+        ranges: Dotted key -> a tuple (low, high) for uniformly distributed numbers; a `range` for
+            one of its whole numbers; or a list for one of its values. A text "low..high" within a
+            value of a list, as in [["0.69..0.71", 0.0, 0.0]], is a uniformly distributed number.
+        count: The number of runs.
+        seed: The seed, 0 or more.
 
     Raises:
-        ScenarioError: A range is empty, or count or seed makes no sense.
+        ScenarioError: A range is empty, or count or seed is not valid.
     """
     _whole("count", count, 1)
     _whole("seed", seed, 0)
     _check_count(count)
-    columns = {key: _drawn(key, given, count, seed) for key, given in ranges.items()}
+    columns = {key: _drawn(key, choices, count, seed) for key, choices in ranges.items()}
     return [{key: column[i] for key, column in columns.items()} for i in range(count)]
 
 
 @checked(_error)
 def listed_variations(values: Mapping[str, Any]) -> list[Variation]:
-    """The first values of all keys together, then the second ones, and so on.
+    """Returns variations in which run i has the i-th value of each key.
 
     Args:
-        values: Dotted key -> its values, as many for each key.
+        values: Dotted key -> values, equally many for each key.
 
     Raises:
         ScenarioError: The keys have different numbers of values, or none.
     """
-    columns = {key: _values(key, given) for key, given in values.items()}
+    columns = _all_values(values)
     counts = {key: len(column) for key, column in columns.items()}
     if len(set(counts.values())) > 1:
         counted = ", ".join(f"{key} has {count}" for key, count in counts.items())
@@ -92,17 +92,17 @@ def listed_variations(values: Mapping[str, Any]) -> list[Variation]:
 def parse_variations(
     texts: Sequence[str], scenario: Scenario, count: int | None, seed: int, together: bool
 ) -> list[Variation]:
-    """The runs that options "KEY=VALUES" of the command line ask for.
+    """Returns the variations of the options "KEY=VALUES" of the command line.
 
-    VALUES is a list in YAML, one value, LOW..HIGH:COUNT for as many even values, or, where runs are
-    random, LOW..HIGH, which may then stand within a value, too.
+    VALUES is a list in YAML, a single value, or LOW..HIGH:COUNT for equally spaced values. For
+    random runs it may be LOW..HIGH, or contain LOW..HIGH within a value.
 
     Args:
         texts: The options.
-        scenario: What varies.
-        count: How many random runs; None for a grid.
+        scenario: The scenario of the study.
+        count: The number of random runs; None for a grid.
         seed: The seed of the random runs.
-        together: Whether the values of all keys change together, instead of a grid.
+        together: Whether run i has the i-th value of each key, instead of a grid.
 
     Raises:
         ScenarioError: An option cannot be read, or its values are empty.
@@ -114,28 +114,28 @@ def parse_variations(
 
 
 def parse_ranges(texts: Sequence[str], scenario: Scenario) -> dict[str, tuple[float, float]]:
-    """The ranges that options "KEY=LOW..HIGH" of the command line name.
+    """Returns the ranges of the options "KEY=LOW..HIGH" of the command line: key -> (low, high).
 
     Raises:
         ScenarioError: An option cannot be read, or is no range of numbers.
     """
     columns = _columns(texts, scenario, True)
-    for key, given in columns.items():
-        if not isinstance(given, tuple):
+    for key, ends in columns.items():
+        if not isinstance(ends, tuple):
             raise _wrong(key, "expected LOW..HIGH, of a key that takes any number in between")
     return columns
 
 
 def _columns(texts: Sequence[str], scenario: Scenario, is_random: bool) -> dict[str, Any]:
-    """What options "KEY=VALUES" name."""
+    """The keys and parsed values of options "KEY=VALUES"."""
     data, columns = scenario_data(scenario), dict[str, Any]()
     for text in texts:
-        key, separator, given = text.partition("=")
-        if not (separator and given.strip() and all(key.split("."))):
+        key, separator, values = text.partition("=")
+        if not (separator and values.strip() and all(key.split("."))):
             raise _wrong(text, "expected KEY=VALUES, for example start.errors.tool.z=0..0.05:6")
         if key in columns:
             raise _wrong(key, "the key varies twice; give all its values at once")
-        columns[key] = _parse(key, given, data, is_random)
+        columns[key] = _parse(key, values, data, is_random)
     return columns
 
 
@@ -144,13 +144,13 @@ _INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,9}}))?\s*")
 
 
 def _parse(key: str, text: str, data: Mapping[str, Any], is_random: bool) -> Any:
-    found = _INTERVAL.fullmatch(text)
-    if not found:
+    interval = _INTERVAL.fullmatch(text)
+    if not interval:
         value = load_yaml(text, key)
         return value if isinstance(value, list) else [value]
-    low, high = _ends(key, found)
-    if found[3]:
-        number = int(found[3])
+    low, high = _ends(key, interval)
+    if interval[3]:
+        number = int(interval[3])
         if number < 2:
             raise _wrong(key, f"a range has at least 2 values, got {text.strip()}")
         _check_count(number)
@@ -167,11 +167,11 @@ def _parse(key: str, text: str, data: Mapping[str, Any], is_random: bool) -> Any
     return low, high
 
 
-def _ends(key: str, found: re.Match[str]) -> tuple[float, float]:
+def _ends(key: str, interval: re.Match[str]) -> tuple[float, float]:
     """The ends of an interval."""
-    low, high = (float(found[1]), float(found[2]))
+    low, high = (float(interval[1]), float(interval[2]))
     if not (np.isfinite([low, high]).all() and low < high):
-        text = found[0].strip()
+        text = interval[0].strip()
         raise _wrong(key, f"{text} is an empty range; the first number is the lower one")
     _check_width(key, low, high)
     return low, high
@@ -183,52 +183,57 @@ def _check_width(key: str, low: float, high: float) -> None:
 
 
 def _is_whole_number(key: str, low: float, high: float, data: Mapping[str, Any]) -> bool:
-    """Whether a scenario takes whole numbers only."""
+    """Whether a key of the scenario accepts only whole numbers."""
 
-    def takes(value: float) -> bool:
+    def accepts(value: float) -> bool:
         try:
             read_scenario(varied_data(data, {key: value}))
         except ScenarioError:
             return False
         return True
 
-    return takes(int(low)) and not takes(low + (high - low) / 2**0.5)
+    return accepts(int(low)) and not accepts(low + (high - low) / 2**0.5)
 
 
-def _values(key: str, given: Any) -> list[Any]:
-    """Values as plain data."""
-    if isinstance(given, np.ndarray) and given.ndim:
-        given = list(given)
-    if not isinstance(given, (list, tuple, range)):
-        raise _wrong(key, f"expected a list of values, got {brief(given)}")
-    if not given:
+def _all_values(values: Mapping[str, Any]) -> dict[str, list[Any]]:
+    return {key: _values(key, column) for key, column in values.items()}
+
+
+def _values(key: str, values: Any) -> list[Any]:
+    """Checks the values of a key, and returns them as plain data."""
+    if isinstance(values, np.ndarray) and values.ndim:
+        values = list(values)
+    if not isinstance(values, (list, tuple, range)):
+        raise _wrong(key, f"expected a list of values, got {brief(values)}")
+    if not values:
         raise _wrong(key, "expected at least one value")
     try:
-        _check_count(len(given))
+        _check_count(len(values))
     except OverflowError:  # Of a range.
-        raise _wrong(key, f"{brief(given)} has more values than a study has runs") from None
-    return [plain(key, value) for value in given]
+        raise _wrong(key, f"{brief(values)} has more values than a study has runs") from None
+    return [plain(key, value) for value in values]
 
 
-def _drawn(key: str, given: Any, count: int, seed: int) -> list[Any]:
+def _drawn(key: str, choices: Any, count: int, seed: int) -> list[Any]:
+    """Draws the values of a key for all runs, see `random_variations`."""
     random = np.random.default_rng([seed, crc32(key.encode())])
-    if isinstance(given, tuple):
-        low, high = vector(f"the range of {key}", given, 2)
+    if isinstance(choices, tuple):
+        low, high = vector(f"the range of {key}", choices, 2)
         if not low < high:
-            raise _wrong(key, f"the range {brief(given)} is empty; the first is the lower one")
+            raise _wrong(key, f"the range {brief(choices)} is empty; the first is the lower one")
         _check_width(key, low, high)
-        share = random.random(count)
-        return (low * (1.0 - share) + high * share).tolist()
-    # One number of the generator for each value, so that more runs begin with the same ones.
-    if isinstance(given, range) and given:
-        if given[-1] - given[0] > 2**53:
-            raise _wrong(key, f"{brief(given)} has more whole numbers than can be drawn from")
-        return [given[int(len(given) * share)] for share in random.random(count)]
-    values = _values(key, given)
-    chosen = [values[int(len(values) * share)] for share in random.random(count)]
+        fractions = random.random(count)
+        return (low * (1.0 - fractions) + high * fractions).tolist()
+    # One random number for each value, so that the values of fewer runs are the first of more runs.
+    if isinstance(choices, range) and choices:
+        if choices[-1] - choices[0] > 2**53:
+            raise _wrong(key, f"{brief(choices)} has more whole numbers than can be drawn from")
+        return [choices[int(len(choices) * fraction)] for fraction in random.random(count)]
+    values = _values(key, choices)
+    chosen = [values[int(len(values) * fraction)] for fraction in random.random(count)]
 
     @cache
-    def shares(path: str) -> FloatArray:
+    def fractions_at(path: str) -> FloatArray:
         return np.random.default_rng([seed, crc32(f"{key}.{path}".encode())]).random(count)
 
     def filled(value: Any, path: str, run: int) -> Any:
@@ -236,20 +241,20 @@ def _drawn(key: str, given: Any, count: int, seed: int) -> list[Any]:
             return [filled(entry, f"{path}.{i}", run) for i, entry in enumerate(value)]
         if isinstance(value, dict):
             return {name: filled(entry, f"{path}.{name}", run) for name, entry in value.items()}
-        found = _INTERVAL.fullmatch(value) if path and isinstance(value, str) else None
-        if not found or found[3]:
+        interval = _INTERVAL.fullmatch(value) if path and isinstance(value, str) else None
+        if not interval or interval[3]:
             return value
-        low, high = _ends(key, found)
-        share = shares(path)[run]
-        return low * (1.0 - share) + high * share
+        low, high = _ends(key, interval)
+        fraction = fractions_at(path)[run]
+        return low * (1.0 - fraction) + high * fraction
 
     return [filled(value, "", run) for run, value in enumerate(chosen)]
 
 
 def run_name(changes: Variation) -> str:
-    """What is special about a run: "link1.mass=9.6, tool.z=0.05".
+    """Returns a name of a run from its values: "link1.mass=9.6, tool.z=0.05".
 
-    A key is shortened to its last parts as long as it differs from the others.
+    A key is shortened to its last two parts, or more if needed to distinguish it from other keys.
     """
     parts = {key: key.split(".") for key in changes}
 
@@ -268,7 +273,7 @@ def _in_brief(value: Any) -> str:
 
 
 def setting(key: str, value: Any) -> str:
-    """The change "key=value" of a command line, which `load_scenario` reads back."""
+    """Returns a change as "key=value", in the form that the command line accepts."""
     return f"{key}={dump_yaml({'v': value}, on_one_line=True).strip()[4:-1]}"
 
 
@@ -293,10 +298,10 @@ def rerun_commands(made: Sequence[str], variations: Sequence[Variation], folder:
 
 
 def plain(key: str, value: Any) -> Any:
-    """A value as JSON has it.
+    """Returns a value in JSON types.
 
     Raises:
-        ScenarioError: It is no plain data.
+        ScenarioError: The value has no JSON type, for example a function.
     """
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()

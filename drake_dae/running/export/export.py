@@ -1,6 +1,5 @@
-"""A closed loop's law, plant and projection as plain C99, for somebody's real-time loop."""
+"""Export of a closed loop's law, plant and projection as plain C99, for real-time programs."""
 
-from importlib.metadata import version
 from pathlib import Path
 
 import casadi as ca
@@ -15,12 +14,13 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.samples import samples, tests
-from drake_dae.running.export.steps.words import file_of, parameter_names, prefix_of
+from drake_dae.running.export.steps.words import common_words, file_of, parameter_names, prefix_of
 from drake_dae.running.export.text import (
     CFunction,
     Vector,
     braced,
     comment,
+    entry_lines,
     generated,
     string,
     written,
@@ -37,25 +37,25 @@ def export_code(
 ) -> list[Path]:
     """Writes the law, the plant and the projection of a closed loop as C99 without dependencies.
 
-    Where all of its blocks can be traced, see `compile_diagram`, the loop as a whole as well: the
-    derivative of all states, all outputs, and what blocks hold between their samples.
+    If all blocks can be traced, see `compile_diagram`, it also writes functions of the whole loop:
+    the derivative of all continuous states, all outputs, and the updates of all discrete states.
 
-    In the folder stand then: name.h with sizes, names and units; name.c; test_name.c, which
-    compares them with values that Python computed; a Makefile, whose `make` compiles and runs that;
-    and LICENSE.txt. Files of these names are overwritten.
+    The files are name.h with sizes, names and units; name.c; test_name.c, which compares the
+    functions with values that Python computed; a Makefile, which compiles and runs the test; and
+    LICENSE.txt. Existing files are overwritten.
 
     Args:
         loop: The closed loop, or any diagram with one plant and one law.
-        context: Its context at the start, whose state and parameters the test program has too.
-        name: What the files are called, and, in letters that C takes, the functions.
-        folder: Where to write; made if there is none.
+        context: Its context at the start time; the test uses its state and parameters.
+        name: The name of the files, and, as a C identifier, the prefix of the functions.
+        folder: The folder to write to; created if it does not exist.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        ModelError: No sample has values, so that nothing could be compared; or a diagram has not
-            one plant and one law, or cannot be traced.
+        ModelError: A function has no finite values to compare, the diagram does not have exactly
+            one plant and one law, or it cannot be traced.
         OSError: A file cannot be written.
     """
     parts = parts_of(loop)
@@ -69,13 +69,8 @@ def export_code(
     if whole is not None:
         vectors |= whole_vectors(whole, whole.values(context))
         calls |= whole_calls(whole)
-    words = {
+    words = common_words(name) | {
         "title": comment(f"{structure.system.name} ({name})"),
-        "name": file,
-        "prefix": prefix,
-        "guard": prefix.upper(),
-        "version": version("drake_dae"),
-        "casadi": ca.__version__,
         "vectors": "".join(_declared(prefix, *item) for item in vectors.items()),
         "names": "".join(_defined(prefix, *item) for item in vectors.items()),
         "law": calls["law"].signature,
@@ -109,7 +104,7 @@ def _vectors(
     plant_parameters: FloatArray,
     law_parameters: FloatArray,
 ) -> dict[str, Vector]:
-    """All vectors of the C code, by their names there."""
+    """The vectors of the C code, by their C names."""
     system = structure.system
     moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
     vectors = {
@@ -142,7 +137,7 @@ def _vectors(
 
 
 def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, CFunction]:
-    """The functions of the C code, by their names there."""
+    """The functions of the C code, by their C names."""
     system, derivatives = structure.system, structure.derivatives
     force = derivatives.expand(derivatives.constraint_input)
     plant = system.trace(
@@ -158,38 +153,34 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, CFunct
     residual = system.trace(
         "residual", {"constraint_residual": structure.manifold.residual_expression}
     )
-    own = structure.manifold.newton_step
-    inputs = {name: own.function.sx_in(i) for i, name in enumerate(own.input_names)}
-    moved = ca.SX(system.scale) * own.function(*inputs.values())[0]
-    step = TracedFunction("step to the manifold", inputs, {"step": moved}, often=False)
-    named = {"parameters": "law_parameters"}
+    newton = structure.manifold.newton_step
+    inputs = {name: newton.function.sx_in(i) for i, name in enumerate(newton.input_names)}
+    change = ca.SX(system.scale) * newton.function(*inputs.values())[0]
+    step = TracedFunction("step to the manifold", inputs, {"step": change}, often=False)
+    c_names = {"parameters": "law_parameters"}
     if is_of_links(law, structure):
-        named |= {"state": "link_state", "control": "wanted_torque"}
-    read, shown = (
-        [named.get(name, name) for name in names]
+        c_names |= {"state": "link_state", "control": "wanted_torque"}
+    arguments, results = (
+        [c_names.get(name, name) for name in names]
         for names in (law.function.input_names, law.function.output_names)
     )
+    others = {"plant": plant, "residual": residual, "newton_step": step}
     return {
-        "law": CFunction(law.function, read, shown),
-        "plant": CFunction(plant, plant.input_names, plant.output_names),
-        "residual": CFunction(residual, residual.input_names, residual.output_names),
-        "newton_step": CFunction(step, step.input_names, step.output_names),
+        "law": CFunction(law.function, arguments, results),
+        **{key: CFunction(f, f.input_names, f.output_names) for key, f in others.items()},
     }
 
 
 def is_of_links(law: TrackingLaw, structure: ConstraintStructure) -> bool:
-    """Whether a law is that of the links of a robot with springs, by themselves."""
+    """Whether the law controls only the links of a robot with elastic joints."""
     return law.system.num_states != structure.system.num_states
 
 
 def _declared(prefix: str, name: str, vector: Vector) -> str:
-    """What the header says of a vector."""
+    """The declarations of a vector in the header."""
     size = f"{prefix}_{name}_SIZE".upper()
-    width = max([len(comment(signal.name)) for signal in vector.signals], default=0)
-    lines = [f"/* {name}: {vector.what}"]
-    for index, signal in enumerate(vector.signals):
-        entry = f"     {index:3d}  {comment(signal.name).ljust(width)}  {comment(signal.unit)}"
-        lines.append(entry.rstrip())
+    entries = (f"     {line}" for line in entry_lines(vector.signals))
+    lines = [f"/* {name}: {vector.what}", *entries]
     lines[-1] += " */"
     lines.append(f"enum {{ {size} = {len(vector.signals)} }};")
     for what in ("names", "units"):
@@ -212,12 +203,12 @@ def _defined(prefix: str, name: str, vector: Vector) -> str:
 
 
 def _called(prefix: str, name: str, call: CFunction) -> str:
-    """The C function that calls what CasADi generated."""
+    """The C function that calls the code that CasADi generated."""
     traced = f"{prefix}_traced_{name}"
     function = call.function.function
     kind = f"static int {name}" if name == "newton_step" else f"int {prefix}_{name}"
     own, count = len(call.outputs), len(call.inputs)
-    # Without a matrix that must be regular its pivot is 1, and there is no check of it.
+    # If no matrix must be regular, there is no pivot to check, and it keeps the value 1.
     checks = ["&pivot", "&finite", "&valid"][: function.n_out() - own]
     lines = [
         f"{kind}({call.signature}) {{",

@@ -1,4 +1,4 @@
-"""What an export takes of a closed loop, or of any diagram with a plant and a law in it."""
+"""The plant, the law and the traced functions of a closed loop or another diagram."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.running.export.steps.boundary import check_events
 from drake_dae.running.rollout.program import program_of
 
 
@@ -20,10 +21,10 @@ class LoopParts:
     """A diagram with one plant and one law.
 
     Attributes:
-        plant, controller: The blocks.
+        plant, controller: The blocks of the plant and the law.
         diagram: The diagram.
-        compiled: Its functions; None where something in it cannot be traced, is stepped by Drake,
-            or changes at moments that a run has to find.
+        compiled: The functions of the diagram; None if a block cannot be traced, has Drake's own
+            contact, or changes at times that a simulation has to find.
     """
 
     plant: Any
@@ -32,7 +33,7 @@ class LoopParts:
     compiled: CompiledDiagram | None
 
     def reference(self, context: Context) -> Callable[[float], FloatArray]:
-        """R(t) as the controller takes it, in a context of the diagram."""
+        """Returns the controller's reference t -> R(t) for a context of the diagram."""
         own = self.diagram.CreateDefaultContext()
         own.SetTimeStateAndParametersFrom(context)
         own_of_controller = self.controller.GetMyContextFromRoot(own)
@@ -43,17 +44,17 @@ class LoopParts:
             if port.HasValue(own_of_controller):
                 return np.array(port.Eval(own_of_controller))
             (value, *_) = self.controller.traced().unwired["reference"].function.call([time])
-            found: FloatArray = value.full()[:, 0]
-            return found
+            references: FloatArray = value.full()[:, 0]
+            return references
 
         return reference
 
 
 def parts_of(loop: ClosedLoop | Diagram) -> LoopParts:
-    """The parts of a closed loop or of a diagram.
+    """Finds the parts of a closed loop or of a diagram.
 
     Raises:
-        ModelError: A diagram has no plant or no law, or more than one of them, or cannot be traced.
+        ModelError: The diagram does not have exactly one plant and one law, or it cannot be traced.
     """
     if not isinstance(loop, Diagram):
         try:
@@ -64,20 +65,9 @@ def parts_of(loop: ClosedLoop | Diagram) -> LoopParts:
             compiled = None
         return LoopParts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)
-    if compiled.changes:
-        names = ", ".join(system.get_name() for system, _ in (*compiled.guards, *compiled.watched))
-        raise ModelError(
-            f"'{names}' changes at moments that a run has to find, as where a contact opens: no "
-            "export knows it, and a rollout does"
-        )
-    if compiled.has_stepped:
-        name = compiled.stepped[1].system.get_name()
-        raise ModelError(
-            f"'{name}' has Drake's own contact, which no export knows; a rollout does. Export a "
-            "diagram with an ideal plant"
-        )
-    plants = [each for each, block in compiled.blocks.items() if block.check_start is not None]
-    laws = [each for each, block in compiled.blocks.items() if block.under is not None]
+    check_events(compiled, "the diagram")
+    plants = [system for system, block in compiled.blocks.items() if block.check_start is not None]
+    laws = [system for system, block in compiled.blocks.items() if block.under is not None]
     if len(plants) != 1 or len(laws) != 1:
         raise ModelError(
             f"an export is of one plant and one law; this diagram has {len(plants)} plants and "

@@ -1,4 +1,4 @@
-"""What Python writes in C: vectors, calls, lists, strings and comments."""
+"""C code from Python: vectors, functions, lists, strings, comments and files from templates."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -19,9 +19,9 @@ class Vector:
     """A vector of the C code.
 
     Attributes:
-        what: What it is, in words.
+        what: The meaning of the vector, in words.
         signals: Names and units of its entries.
-        default: What it is where nobody says otherwise, shape (k,); None if there is no such thing.
+        default: The default values, shape (k,); None for none.
     """
 
     what: str
@@ -34,8 +34,8 @@ class CFunction:
     """A function of the C code.
 
     Attributes:
-        function: What it computes.
-        inputs, outputs: What its arguments are called in C, in the order of the function's.
+        function: The traced function.
+        inputs, outputs: The C names of its arguments and results, in order.
     """
 
     function: TracedFunction
@@ -44,18 +44,18 @@ class CFunction:
 
     @property
     def signature(self) -> str:
-        """The arguments as C declares them."""
+        """The list of parameters in the C declaration."""
         inputs = [f"const double *{name}" for name in self.inputs]
         return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
 
 
 def generated(functions: Mapping[str, ca.Function]) -> str:
-    """The C of functions as static ones, of which several files may be linked together.
+    """Returns C code of functions, all static, so that several such files can be linked together.
 
     Args:
-        functions: What each is called -> the function.
+        functions: C name -> function.
     """
-    source = generate(*(renamed(each, symbol) for symbol, each in functions.items()))
+    source = generate(*(renamed(function, symbol) for symbol, function in functions.items()))
     kept, is_left_out = list[str](), False
     for line in source.splitlines():
         is_helper = (
@@ -63,7 +63,7 @@ def generated(functions: Mapping[str, ca.Function]) -> str:
         )
         if not (is_helper or is_left_out or line.startswith("static const casadi_int casadi_s")):
             kept.append(line)
-        # A helper ends in its line, or at the first brace that begins one.
+        # A helper ends on its first line, or at the next line that is "}".
         is_left_out = (is_helper and not line.endswith("}")) or (is_left_out and line != "}")
     text = "\n".join([*kept, ""]).replace("CASADI_SYMBOL_EXPORT int", "static int")
     text = re.sub(r"^casadi_real casadi_", "static casadi_real casadi_", text, flags=re.MULTILINE)
@@ -71,7 +71,7 @@ def generated(functions: Mapping[str, ca.Function]) -> str:
 
 
 def braced(items: Sequence[str]) -> str:
-    """A list of C, in lines that are not long."""
+    """A C initializer list, wrapped to short lines."""
     lines, last = [], ""
     for item in items:
         if last and len(last) + len(item) > 96:
@@ -82,13 +82,22 @@ def braced(items: Sequence[str]) -> str:
     return f"{{{text}}}"
 
 
+def entry_lines(signals: Sequence[Signal]) -> list[str]:
+    """For each entry of a vector a line for a C comment: index, name and unit."""
+    width = max((len(comment(signal.name)) for signal in signals), default=0)
+    return [
+        f"{i:3d}  {comment(signal.name).ljust(width)}  {comment(signal.unit)}".rstrip()
+        for i, signal in enumerate(signals)
+    ]
+
+
 def comment(text: str) -> str:
-    """Text in a comment of C, in which nothing ends it."""
+    """Text for a C comment, without characters that could end the comment."""
     return re.sub(r"[^\w .,:;()\[\]'/^+-]|/(?=[/*])", "_", text, flags=re.ASCII)
 
 
 def string(text: str) -> str:
-    """A string of C: bytes that are no plain letters, and what makes trigraphs, are numbers."""
+    """A C string literal; special characters, and "?" because of trigraphs, are octal escapes."""
     plain = (
         chr(byte) if 32 <= byte < 127 and chr(byte) not in '"?\\' else f"\\{byte:03o}"
         for byte in text.encode()
@@ -99,13 +108,13 @@ def string(text: str) -> str:
 def written(
     templates: Path, folder: str | Path, names: Mapping[str, str], words: Mapping[str, str]
 ) -> list[Path]:
-    """Writes files from templates; returns them.
+    """Writes files from templates, and returns their paths.
 
     Args:
         templates: The folder of the templates.
-        folder: Where to write; made if there is none.
-        names: Name of a template -> that of the file.
-        words: What stands for its names in the templates.
+        folder: The folder to write to; created if it does not exist.
+        names: Name of a template -> name of the file.
+        words: Name of a placeholder in the templates -> its text.
 
     Raises:
         OSError: A file cannot be written.

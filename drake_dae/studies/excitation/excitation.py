@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_dae.analysis.tables import count_of
+from drake_dae.analysis.tables import Table, count_of
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.scenario.scenario import Scenario
@@ -22,17 +22,17 @@ _MEANING: Mapping[Criterion, str] = {
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """A motion and a force that determine parameters of a plant, and what they promise.
+    """The best motion and force to determine parameters of a plant, with predicted uncertainty.
 
     Attributes:
-        scenario: The scenario with the values that were found, with all that was left out.
-        choice: Dotted key -> value; empty if the scenario as it was is best.
-        before: What the record of the scenario as it was says.
-        after: What that of the found one says.
+        scenario: The scenario with the best values, with all defaults filled in.
+        choice: Dotted key -> best value; empty if the unchanged scenario is best.
+        before: The predicted uncertainty of the parameters with the unchanged scenario.
+        after: The predicted uncertainty with the best values.
         criterion: "D" or "A".
-        runs: How many runs were made.
-        refused: What was wrong with a run -> with how many.
-        problems: What is wrong with the scenario as it was, in words.
+        runs: The number of runs.
+        refused: Kind of problem -> number of runs that were refused.
+        problems: The problems of the unchanged scenario, in words.
         interrupted: The signal that ended the search early; None if there was none.
     """
 
@@ -48,16 +48,17 @@ class Excitation:
 
     @property
     def gain(self) -> float:
-        """By what factor the criterion is smaller."""
+        """The criterion before, divided by the criterion after."""
         return self.before.size(self.criterion) / self.after.size(self.criterion)
 
     def text(self) -> str:
         """The result as lines of text."""
-        rows: list[tuple[str, ...]] = [("parameter", "value", "95 % before", "95 % after", "unit")]
+        head = ("parameter", "value", "95 % before", "95 % after", "unit")
+        rows = []
         for i, unknown in enumerate(self.after.unknowns):
-            around = [_around(each.halves[i]) for each in (self.before, self.after)]
+            around = [_around(result.halves[i]) for result in (self.before, self.after)]
             rows.append((unknown.name, f"{self.after.values[i]:.6g}", *around, unknown.unit))
-        lines = [*_table(rows), ""]
+        lines = [*Table(head, rows, left=len(head)).lines(), ""]
         if self.choice:
             width = max(map(len, self.choice))
             lines += [f"{key.ljust(width)}  {value:.6g}" for key, value in self.choice.items()]
@@ -67,36 +68,36 @@ class Excitation:
         return "\n".join([*lines, *self.remarks()])
 
     def remarks(self) -> list[str]:
-        """What is to be known about the choice."""
-        found = [
+        """Sentences on the criteria, the runs and undetermined parameters."""
+        remarks = [
             f"{meaning}: {self.before.size(kind):.3g} before, {self.after.size(kind):.3g} after"
             + (" (this one is made small)." if kind == self.criterion else ".")
             for kind, meaning in _MEANING.items()
         ]
         made = f"{count_of(self.runs, 'run')} made"
         counts = [f"{kind} ({count})" for kind, count in self.refused.items()]
-        found.append(f"{made}; refused: {', '.join(counts)}." if counts else f"{made}.")
-        found += [f"The scenario as it was is refused: {text}." for text in self.problems]
-        found += [
+        remarks.append(f"{made}; refused: {', '.join(counts)}." if counts else f"{made}.")
+        remarks += [f"The scenario as it was is refused: {text}." for text in self.problems]
+        remarks += [
             f"Not determined: {', '.join(names)}. Other keys must vary, or fewer be free."
             for names in self.after.undetermined
         ]
         if self.interrupted is not None:
-            found.append("The search was interrupted; this is the best so far.")
-        return found
+            remarks.append("The search was interrupted; this is the best so far.")
+        return remarks
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values."""
 
-        def promised(one: Promised) -> dict[str, Any]:
+        def promised(result: Promised) -> dict[str, Any]:
             return {
-                "D": one.d_size,
-                "A": one.a_size,
+                "D": result.d_size,
+                "A": result.a_size,
                 "half_intervals": {
                     unknown.name: float(half) if np.isfinite(half) else None
-                    for unknown, half in zip(one.unknowns, one.halves, strict=True)
+                    for unknown, half in zip(result.unknowns, result.halves, strict=True)
                 },
-                "undetermined": [list(names) for names in one.undetermined],
+                "undetermined": [list(names) for names in result.undetermined],
             }
 
         return {
@@ -112,11 +113,3 @@ class Excitation:
 
 def _around(half: float) -> str:
     return f"+- {half:.2g}" if np.isfinite(half) else "not determined"
-
-
-def _table(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]

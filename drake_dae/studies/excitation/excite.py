@@ -1,4 +1,4 @@
-"""Motions and forces that determine parameters best."""
+"""Optimal excitation: motions and forces whose records determine parameters best."""
 
 import sys
 from collections import Counter
@@ -21,23 +21,23 @@ from drake_dae.studies.excitation.excitation import Excitation
 from drake_dae.studies.excitation.promised import Criterion, ScenarioRun, ScenarioRuns
 
 SPREAD = 0.4
-"""This part of the runs is spread over the ranges; the others go on from the best of them."""
+"""The fraction of runs that are spread over the ranges; a local search uses the other runs."""
 
 FIRST_STEP = 0.25
-"""The first steps from there, relative to the ranges."""
+"""The first steps of the local search, relative to the ranges."""
 
 CLOSE = 1e-2
-"""A search with steps shorter than this, relative to the ranges, begins again with longer ones."""
+"""The local search restarts when its steps are shorter than this, relative to the ranges."""
 
 REFUSED = 1e3
-"""What a run with a problem costs, and for each further one: more than any good one."""
+"""The cost of a run for each of its problems, larger than the cost of any run without problems."""
 
 NOISY = ("position", "force")
-"""What a noise may be given for."""
+"""The measurements whose noise can be set."""
 
 
 class _SearchEnded(Exception):
-    """The runs are spent, or a signal asks for the end."""
+    """All runs were made, or a signal ends the search."""
 
 
 @checked(ModelError)
@@ -52,39 +52,41 @@ def excite(
     seed: int = 0,
     progress: bool = False,
 ) -> Excitation:
-    """A motion and a force within limits that determine parameters of a plant best.
+    """Searches for a motion and a force, within limits, that determine parameters of a plant best.
 
-    Each choice of the values is a rollout of the scenario. What its record would say of the
-    parameters theta is the Fisher information of `identify`, with the initial state unknown:
+    The values of each trial are simulated by a rollout of the scenario. The information of its
+    record about the parameters theta is the Fisher information of `identify`, with an unknown
+    initial state:
 
         F = sum T^T T,    T = d(computed - measured)/dtheta / noise,
 
-    with exact derivatives along the motion. The covariance of the parameters over their sizes is
-    C = S^-1 F^-1 S^-1, and the least det(C) (D) or tr(C) (A) is searched: first among values that
-    are spread over the ranges, then from the best of these by the simplex of Nelder and Mead. Runs
-    beyond a limit of a joint or a drive, that lose a contact, have a link behind a surface or in
-    another one, or do not come to their end, are refused.
+    with exact derivatives along the motion. With the diagonal matrix S of the parameters' sizes,
+    the covariance of the relative parameters is C = S^-1 F^-1 S^-1. The search minimizes det(C)
+    ("D") or tr(C) ("A"): first over values that are spread over the ranges, then by the simplex
+    method of Nelder and Mead from the best of these. A run is refused if it exceeds a limit of a
+    joint or actuator, loses a contact, has a link behind a surface or in another link, or ends
+    early.
 
     Args:
-        scenario: What `load_scenario` returns. Its plant has the values that the parameters are
-            expected to have. Drake's own point contact is taken as !CompliantContact.
-        ranges: Dotted key -> least and largest value, such as
+        scenario: A scenario from `load_scenario`. Its plant has the expected values of the
+            parameters. Drake's own point contact is replaced by !CompliantContact.
+        ranges: Dotted key -> (least, largest) value, such as
             {"references.tool.z.amplitudes.0": (0.1, 0.3)}.
-        free: As of `identify`.
-        noise: "position" (rad or m) and "force" (N) -> the deviation of each row, in place of what
-            encoders and force sensor state.
+        free: The names of the parameters, as in `identify`.
+        noise: "position" (rad or m) and "force" (N) -> the standard deviation of each row. It
+            replaces the noise in the settings of encoders and force sensor.
         criterion: "D" for the volume of the ellipsoid, "A" for the sum of squared deviations.
-        runs: How many runs are made beside that of the scenario as it is.
-        seed: The seed of the values that are spread.
+        runs: The number of runs, in addition to the run of the unchanged scenario.
+        seed: The seed of the spread values.
         progress: Shows a bar if stderr is a terminal.
 
     Returns:
-        The best choice. After Ctrl-C it is the best so far, and `interrupted` names the signal.
+        The best choice. After Ctrl-C it is the best so far, and `interrupted` is the signal.
 
     Raises:
-        ModelError: A parameter is not one, a range is empty, a noise is not stated, or no run keeps
+        ModelError: A name is no parameter, a range is empty, a noise is unknown, or no run keeps
             the limits.
-        ScenarioError: A key or a value is none of a scenario.
+        ScenarioError: The scenario has no such key, or the key does not accept the value.
 
     Source: Atkinson, Donev and Tobias, Optimum Experimental Designs, with SAS, 2007; Swevers et
     al., Optimal robot excitation and identification, IEEE Trans. Robotics and Automation 13, 1997.
@@ -93,7 +95,7 @@ def excite(
     check_whole_number("seed", seed, 0)
     low, high = _ends(ranges)
     completed = complete_scenario(scenario).scenario
-    trials = ScenarioRuns(completed, free, _noise(noise or {}))
+    trials = ScenarioRuns(completed, free, _checked_noise(noise or {}))
     keys = list(ranges)
     for ends in (low, high):
         trials.check(dict(zip(keys, ends.tolist(), strict=True)))
@@ -104,7 +106,7 @@ def excite(
     best = _BestRuns(trials, criterion, keys, (low, high), runs, before)
     bar = tqdm(total=runs, unit="run", disable=not (progress and sys.stderr.isatty()))
     with bar, ending_signals(best.interruption), suppress(_SearchEnded):
-        _search(lambda place: best.cost(place, bar), len(keys), runs, seed)
+        _search(lambda point: best.cost(point, bar), len(keys), runs, seed)
     if best.trial.problems or best.trial.promised is None:
         raise ModelError(
             f"no run of {best.made} keeps all limits ({_most(best.refused)}); give other "
@@ -124,22 +126,22 @@ def excite(
 
 
 class _BestRuns:
-    """The best of some runs.
+    """The trials of a search, and the best of them.
 
     Attributes:
         trial: The best run.
-        choice: Its values; empty for the scenario as it is.
-        made: How many runs were made.
-        refused: What was wrong with a run -> with how many.
+        choice: The values of the best run; empty for the unchanged scenario.
+        made: The number of runs so far.
+        refused: Kind of problem -> number of runs.
         interruption: The signal that ends the search.
 
     Args:
-        trials: The scenario.
+        trials: The runs of the scenario.
         criterion: "D" or "A".
         keys: The keys that vary.
-        ends: Their least and largest values.
-        runs: How many runs may be made.
-        before: The run of the scenario as it is.
+        ends: The least and the largest values of the keys.
+        runs: The largest number of runs.
+        before: The run of the unchanged scenario.
     """
 
     def __init__(
@@ -157,47 +159,47 @@ class _BestRuns:
         self._least = _cost(before, criterion)
         self.made, self.refused, self.interruption = 0, Counter[str](), Interruption()
 
-    def cost(self, place: FloatArray, bar: Any) -> float:
-        """What is to be small, at a place in the unit cube.
+    def cost(self, point: FloatArray, bar: Any) -> float:
+        """The cost of the run at a point of the unit cube.
 
         Raises:
-            _Enough: The runs are spent, or a signal asks for the end.
+            _SearchEnded: All runs were made, or a signal ends the search.
         """
         if self.made >= self._runs or self.interruption.signal is not None:
             raise _SearchEnded
         low, high = self._ends
-        values = np.clip(low + place * (high - low), low, high)
+        values = np.clip(low + point * (high - low), low, high)
         changes = dict(zip(self._keys, values.tolist(), strict=True))
         trial = self._trials.run(changes)
         self.made += 1
         bar.update()
         self.refused.update(trial.problems.keys())
-        found = _cost(trial, self._criterion)
-        if found < self._least:
-            self.trial, self.choice, self._least = trial, changes, found
-        return found
+        cost = _cost(trial, self._criterion)
+        if cost < self._least:
+            self.trial, self.choice, self._least = trial, changes, cost
+        return cost
 
 
 def _search(cost: Callable[[FloatArray], float], count: int, runs: int, seed: int) -> None:
-    """Looks for the least cost in the unit cube until the cost has enough."""
+    """Minimizes a cost over the unit cube until the cost raises `_SearchEnded`."""
     random = np.random.default_rng(seed)
     first = max(1, round(SPREAD * runs))
     # A Latin hypercube: each coordinate has one value in each of as many even intervals.
     order = np.array([random.permutation(first) for _ in range(count)]).T
-    places = (order + random.random((first, count))) / first
-    costs = [cost(place) for place in places]
-    place, step = places[int(np.argmin(costs))], FIRST_STEP
+    points = (order + random.random((first, count))) / first
+    costs = [cost(point) for point in points]
+    point, step = points[int(np.argmin(costs))], FIRST_STEP
     while True:
-        inward = np.where(place < 0.5, step, -step)
-        simplex = np.vstack([place, place + np.diag(inward)])
+        inward = np.where(point < 0.5, step, -step)
+        simplex = np.vstack([point, point + np.diag(inward)])
         options = {"initial_simplex": simplex, "xatol": CLOSE, "fatol": np.inf, "maxfev": 10**6}
         bounds = count * [(0.0, 1.0)]
-        found = minimize(cost, place, method="Nelder-Mead", bounds=bounds, options=options)
-        place, step = found.x, FIRST_STEP * random.uniform(0.2, 1.0)
+        best = minimize(cost, point, method="Nelder-Mead", bounds=bounds, options=options)
+        point, step = best.x, FIRST_STEP * random.uniform(0.2, 1.0)
 
 
 def _cost(trial: ScenarioRun, criterion: Criterion) -> float:
-    """What is to be small: the logarithm of the criterion, and more with problems."""
+    """The logarithm of the criterion, or a larger number for a run with problems."""
     if trial.problems or trial.promised is None:
         return REFUSED * (1 + len(trial.problems))
     return float(np.log(trial.promised.size(criterion)))
@@ -207,23 +209,23 @@ def _ends(ranges: Mapping[str, tuple[float, float]]) -> tuple[FloatArray, FloatA
     """The lower and the upper ends of ranges."""
     if not ranges:
         raise ModelError("ranges must have at least one key, such as start.errors.tool.z")
-    for key, given in ranges.items():
-        low, high = vector(f"the range of {key}", given, 2)
+    for key, ends in ranges.items():
+        low, high = vector(f"the range of {key}", ends, 2)
         if not (low < high and np.isfinite(high - low)):
             raise ModelError(
                 f"the range of {key} must be a lower and a larger number, got {low:g} and {high:g}"
             )
-    found = np.array([*ranges.values()], dtype=float)
-    return found[:, 0], found[:, 1]
+    lows, highs = np.array([*ranges.values()], dtype=float).T
+    return lows, highs
 
 
-def _noise(given: Mapping[str, float]) -> Mapping[str, float]:
-    for name, deviation in given.items():
+def _checked_noise(noise: Mapping[str, float]) -> Mapping[str, float]:
+    for name, deviation in noise.items():
         if name not in NOISY:
             raise ModelError(unknown_name("noise of", name, NOISY))
         if not deviation > 0.0:
             raise ModelError(f"the noise of {name} must be positive, got {deviation:g}")
-    return given
+    return noise
 
 
 def _most(refused: Counter[str]) -> str:

@@ -1,4 +1,4 @@
-"""What a run of a scenario would determine of its plant, before it is made on a robot."""
+"""Predicted uncertainty of identified parameters, before a run is made on a robot."""
 
 import json
 import warnings
@@ -24,7 +24,8 @@ from drake_dae.studies.identification.driven import DrivenPlant
 from drake_dae.studies.identification.fit import ParameterFit
 from drake_dae.studies.identification.identified import (
     NORMAL,
-    known_covariance,
+    check_shapes,
+    fisher_covariance,
     undetermined_names,
 )
 from drake_dae.studies.identification.identify import pieces_of, stated_noise
@@ -34,28 +35,30 @@ from drake_dae.studies.runs import Runner
 from drake_dae.studies.structures import study_data
 
 LEAST = 1e-24
-"""The least information about a direction of the unknowns over their sizes: with less it counts as
-this, so that designs without any information can be compared."""
+"""The lower bound of eigenvalues of the relative information, so that designs without information
+in some direction can be compared."""
 
 Criterion = Literal["D", "A"]
-"""What is to be small: the volume of the ellipsoid of relative errors, or their sum of squares."""
+"""The minimized quantity: the volume of the ellipsoid of relative errors, or their sum of
+squares."""
 
 _FREE_OF_PLANT = ("description", "duration", "references", "tolerances", "write")
-"""Keys of a scenario that change nothing in its plant and sensors."""
+"""Keys of a scenario without effect on its plant and sensors."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Promised:
-    """What a record would say of parameters.
+    """The predicted uncertainty of parameters that would be identified from a record.
 
     Attributes:
         unknowns: The parameters.
         values: Their values in the run, shape (p,).
-        covariance: F^-1 of their Fisher information F, shape (p, p); nan for what is not
-            determined.
+        covariance: The inverse of their Fisher information F, shape (p, p); nan for undetermined
+            parameters.
         undetermined: The parameters of each combination that is not determined.
-        strengths: The eigenvalues of S F S with the sizes S of the parameters, shape (p,).
+        strengths: The eigenvalues of S F S with the diagonal matrix S of the parameters' sizes,
+            shape (p,).
     """
 
     unknowns: tuple[Unknown, ...]
@@ -65,18 +68,11 @@ class Promised:
     strengths: FloatArray
 
     def __post_init__(self) -> None:
-        p = len(self.unknowns)
-        sizes = {"values": (p,), "covariance": (p, p), "strengths": (p,)}
-        for name, shape in sizes.items():
-            if np.shape(getattr(self, name)) != shape:
-                raise ModelError(
-                    f"{name} of {p} parameters must have shape {shape}, got "
-                    f"{np.shape(getattr(self, name))}"
-                )
+        check_shapes(self, len(self.unknowns), values=1, covariance=2, strengths=1)
 
     @property
     def deviations(self) -> FloatArray:
-        """The standard deviations, nan for what is not determined, shape (p,)."""
+        """The standard deviations, shape (p,); nan for undetermined parameters."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
@@ -86,30 +82,30 @@ class Promised:
 
     @property
     def d_size(self) -> float:
-        """det(C)^(1 / 2p) of the covariance C of the parameters over their sizes.
+        """det(C)^(1 / 2p) with the covariance C of parameters / sizes.
 
-        It is the geometric mean of the deviations along the axes of the ellipsoid.
+        This is the geometric mean of the deviations along the axes of the ellipsoid.
         """
         return float(np.exp(-0.5 * np.mean(np.log(self.strengths))))
 
     @property
     def a_size(self) -> float:
-        """(tr(C) / p)^(1/2): the root mean square of the deviations over the sizes."""
+        """(tr(C) / p)^(1/2), the root mean square of deviations / sizes."""
         return float(np.sqrt(np.mean(1.0 / self.strengths)))
 
     def size(self, criterion: Criterion) -> float:
-        """The number that is to be small, by the name of a criterion."""
+        """The value of a criterion: `d_size` or `a_size`."""
         return self.d_size if criterion == "D" else self.a_size
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """A run of a scenario with some values.
+    """The result of a run of a scenario.
 
     Attributes:
-        problems: Kind -> what is wrong with the run, in words; empty if it is good.
-        promised: What it would determine; None if it does not come to its end, or is not good and
-            nobody asked.
+        problems: Kind of problem -> its description; empty for a run that keeps all limits.
+        promised: The predicted uncertainty; None if the run fails, or if it has problems and
+            `judge_all` is false.
     """
 
     problems: Mapping[str, str]
@@ -117,37 +113,37 @@ class ScenarioRun:
 
 
 class ScenarioRuns:
-    """Runs of a scenario with other values at some keys, by rollout.
+    """Rollouts of a scenario with other values of some keys.
 
     Args:
-        scenario: The scenario; its plant has the values that the parameters are expected to have.
-        free: As of `identify`.
-        noise: "position" or "force" -> its deviation, in place of what sensors state.
+        scenario: The scenario; its plant has the expected values of the parameters.
+        free: The names of the parameters, as in `identify`.
+        noise: "position" or "force" -> standard deviation, instead of the sensors' settings.
     """
 
     def __init__(self, scenario: Scenario, free: Sequence[str], noise: Mapping[str, float]) -> None:
         self._base, self._free, self._noise = scenario_data(scenario), free, noise
         self._runner = Runner(self._base, scenario.duration)
-        self._key, self._known = "", dict[str, tuple[DrivenPlant, Unknowns]]()
+        self._plants = dict[str, tuple[DrivenPlant, Unknowns]]()
 
     def check(self, changes: Mapping[str, Any]) -> None:
-        """Reads the scenario with some values.
+        """Checks keys and values.
 
         Raises:
-            ScenarioError: There is no such key, or it cannot have this value.
+            ScenarioError: There is no such key, or it does not accept the value.
         """
         read_scenario(study_data(self._base, dict(changes), True))
 
     def run(self, changes: Mapping[str, Any], judge_all: bool = False) -> ScenarioRun:
-        """Runs the scenario with some values.
+        """Runs the scenario with changed values.
 
         Args:
             changes: Dotted key -> value.
-            judge_all: Whether the information of a run with problems is of interest.
+            judge_all: Whether the information of a run with problems is computed, too.
 
         Raises:
-            ModelError: With `judge_all` alone: a parameter is not one, or the noise of a
-                measurement is not stated.
+            ModelError: `judge_all` is true, and a name is no parameter, or the noise of a
+                measurement is unknown.
         """
         try:
             data = study_data(self._base, dict(changes), True)
@@ -155,16 +151,16 @@ class ScenarioRuns:
                 warnings.simplefilter("ignore")  # Each run would report the same.
                 scenario, loop = read_scenario(data), self._runner.loop(data)
                 context = start_scenario(scenario, loop)
-                found = roll_scenario(scenario, loop, context)
+                rollout = roll_scenario(scenario, loop, context)
         except DrakeDaeError as error:
             return ScenarioRun({"does not start": str(error)})
-        if found.failure is not None:
-            return ScenarioRun({"ends early": str(found.failure)})
-        problems = _problems(loop, found.record, context)
+        if rollout.failure is not None:
+            return ScenarioRun({"ends early": str(rollout.failure)})
+        problems = _problems(loop, rollout.record, context)
         if problems and not judge_all:
             return ScenarioRun(problems)
         try:
-            return ScenarioRun(problems, self._promised(data, loop, context, found.record))
+            return ScenarioRun(problems, self._promised(data, loop, context, rollout.record))
         except (ModelError, np.linalg.LinAlgError) as error:
             if judge_all and isinstance(error, ModelError):
                 raise
@@ -181,56 +177,55 @@ class ScenarioRuns:
         noise = np.array([self._deviation(loop, channel) for channel in channels])
         fitted = ParameterFit(
             [pieces], values, sizes, np.full(p, -np.inf), np.zeros(p, bool)
-        ).known([noise])
+        ).at_start([noise])
         information = fitted.information[:, :, :p].sum(axis=0)
-        parts = fitted.determined, fitted.undetermined
         strengths = np.linalg.eigvalsh(sizes[:, None] * information * sizes)
         return Promised(
             unknowns.all,
             values,
-            known_covariance(information, *parts, sizes),
-            undetermined_names(fitted.undetermined, [one.name for one in unknowns.all]),
+            fisher_covariance(fitted, sizes),
+            undetermined_names(fitted, unknowns.all),
             np.maximum(strengths, LEAST),
         )
 
     def _driven(
         self, data: Mapping[str, Any], loop: ClosedLoop, context: Context
     ) -> tuple[DrivenPlant, Unknowns]:
-        """The plant alone, which is traced again only where it is another one."""
-        own = {key: value for key, value in data.items() if key not in _FREE_OF_PLANT}
-        key = json.dumps(own, sort_keys=True)
-        if key not in self._known:
+        """The plant and its unknowns; a plant with equal data is not traced again."""
+        of_plant = {key: value for key, value in data.items() if key not in _FREE_OF_PLANT}
+        key = json.dumps(of_plant, sort_keys=True)
+        if key not in self._plants:
             unknowns = Unknowns.of(loop, self._free)
             driven = DrivenPlant(loop, context, measured_ports(loop), unknowns.places)
-            self._known = {key: (driven, unknowns)}
-        return self._known[key]
+            self._plants = {key: (driven, unknowns)}
+        return self._plants[key]
 
     def _deviation(self, loop: ClosedLoop, channel: Channel) -> float:
-        """The deviation of a measured column."""
+        """The standard deviation of a measured column."""
         kind = "position" if channel.port == "state" else "force"
-        found = self._noise.get(kind) or stated_noise(loop, channel)
-        if not found:
+        deviation = self._noise.get(kind) or stated_noise(loop, channel)
+        if not deviation:
             raise ModelError(
                 f"the scenario states no noise of '{channel.name}', without which no interval can "
                 f"be promised; state it, as noise {kind}=0.001, or give the scenario a sensor with "
                 "noise"
             )
-        return found
+        return deviation
 
 
 def _problems(loop: ClosedLoop, record: Record, context: Context) -> dict[str, str]:
-    """What a run violates: limits of joints and drives, contacts, and the clearance of links."""
-    found, limits = dict[str, str](), Limits.of(loop.plant.robot("an excitation"))
+    """The violated limits, lost contacts and collisions of a run: kind -> description."""
+    problems, limits = dict[str, str](), Limits.of(loop.plant.robot("an excitation"))
     if texts := shortfalls(record, limits):
-        found["exceeds a limit"] = "; ".join(texts)
+        problems["exceeds a limit"] = "; ".join(texts)
     forces = record.signals["constraint_force"]
     for signal, values in zip(forces.signals, forces.values.T, strict=True):
-        touches = np.flatnonzero(values > 0.0)
         if limits.can_pull(signal):
             continue
+        in_contact = np.flatnonzero(values > 0.0)
         # The last row of a discrete plant may lack the force.
-        if not touches.size or (values[touches[0] : -1] == 0.0).any():
-            found["opens a contact"] = f"{signal.name} is zero"
+        if not in_contact.size or (values[in_contact[0] : -1] == 0.0).any():
+            problems["opens a contact"] = f"{signal.name} is zero"
     if ways := links_in_the_way(loop, record, context):
-        found["has a link in the way"] = "; ".join(map(str, ways))
-    return found
+        problems["has a link in the way"] = "; ".join(map(str, ways))
+    return problems

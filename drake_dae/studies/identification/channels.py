@@ -1,4 +1,4 @@
-"""The measured columns of a record, and what a plant has for them."""
+"""The measured columns of a record, and the plant's outputs that they measure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,22 +12,22 @@ from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 
 SAME = 1e-3
-"""Times that differ by less than this part of a period are one."""
+"""Times that differ by less than this fraction of a period count as equal."""
 
 LARGEST = 1e9
-"""A larger number in a record is that of a run that has diverged."""
+"""A run with a larger number in its record has diverged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """A measured column, and what the plant has for it.
+    """A measured column of a record, and the entry of an output port that it measures.
 
     Attributes:
         signal: The name of the signal in the record.
         entry: Name and unit of the column.
-        port: The name of the output that it measures.
-        place: Its place in that output.
-        bias: What the sensor adds, where it is not unknown.
+        port: The name of the output port.
+        place: The index of the entry in that port.
+        bias: The bias of the sensor, where it is no unknown of the identification.
     """
 
     signal: str
@@ -38,19 +38,19 @@ class Channel:
 
     @property
     def name(self) -> str:
-        """Its name in reports."""
+        """The name of the column in reports."""
         return f"{self.signal}.{self.entry.name}"
 
     @property
     def group(self) -> tuple[str, str]:
-        """Columns of one group have the same noise."""
+        """Columns with an equal group have the same noise level."""
         return self.signal, self.entry.unit
 
 
 def columns_of(
     record: Record, name: str, expected: Sequence[Signal], title: str
 ) -> dict[str, FloatArray]:
-    """The columns of a signal by the plant's names.
+    """Returns the columns of a signal by the plant's names; none if it was not recorded.
 
     Raises:
         ModelError: The record has other names or units, or values that are not finite.
@@ -58,7 +58,7 @@ def columns_of(
     if name not in record.signals:
         return {}
     units = {signal.name: signal.unit for signal in expected}
-    found, recorded = {}, record.signals[name]
+    columns, recorded = {}, record.signals[name]
     for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
         if signal.name not in units:
             raise ModelError(
@@ -82,31 +82,30 @@ def columns_of(
                 f"{title}: '{name}.{signal.name}' is {values[row]:.2g} at {record.time[row]:g} s: "
                 "the run has failed there; leave out the rows shortly before and from there on"
             )
-        found[signal.name] = values
-    return found
+        columns[signal.name] = values
+    return columns
 
 
 def is_position(signal: Signal) -> bool:
-    """Whether a state is measured: all but those that are per second, such as velocities."""
+    """Whether a state is a position: its unit has no "/s"."""
     return "/s" not in signal.unit
 
 
 def channels_of(
     record: Record, loop: ClosedLoop, title: str
 ) -> tuple[list[Channel], list[FloatArray]]:
-    """The measured columns, and their values: nan where there is no measurement.
+    """Returns the measured columns and their values; nan where there is no measurement.
 
     Raises:
         ModelError: A column has no measurement, since rows are too far apart.
     """
     plant, channels, values = loop.plant, list[Channel](), list[FloatArray]()
-    # Positions, as encoders show them or as they are.
+    # Positions: of the encoders, or exact ones.
     name, biases = "state", np.zeros(plant.dae.num_states)
     if loop.encoders is not None:
         name = "measured_state" if "measured_state" in loop.signals else "estimated_state"
-        given = np.asarray(loop.encoders.sensor.encoders.position_bias, dtype=float)
         count = plant.robot("an encoder").links.q.numel()
-        biases[:count] = given
+        biases[:count] = loop.encoders.sensor.encoders.position_bias
     if name not in record.signals:
         name, biases = "state", 0.0 * biases
     columns = columns_of(record, name, plant.dae.state_signals, title)
@@ -134,7 +133,7 @@ def channels_of(
                 later = int(plant.time_step > 0.0 and not sensor.time_constant)
                 column = _sampled(record.time, column, sensor.sample_period, later)
             elif loop.noise is not None:
-                # It is drawn anew after each time constant, and rows between have the same one.
+                # Noise is drawn anew after each time constant; rows between have equal noise.
                 drawn = np.ceil(record.time / sensor.time_constant - SAME)
                 column = np.where(np.diff(drawn, append=np.inf) > 0.0, column, np.nan)
         channels.append(Channel(name, signal, port, place, bias))
@@ -151,27 +150,27 @@ def channels_of(
 
 
 def _at_samples(times: FloatArray, column: FloatArray, period: float) -> FloatArray:
-    """A column at the samples, and nan between them."""
+    """A column with nan between the samples."""
     is_sample = np.abs(times - period * np.round(times / period)) < SAME * period
     return np.where(is_sample, column, np.nan)
 
 
 def _sampled(times: FloatArray, column: FloatArray, period: float, later: int) -> FloatArray:
-    """What a sensor that samples has measured, at the rows of these samples; nan elsewhere.
+    """Moves the values of a sampling sensor to the rows at which it sampled; nan elsewhere.
 
-    A row has the last sample before it.
+    A recorded row contains the last sample before it.
 
     Args:
         times: The times of the rows in s.
-        column: What the rows have.
-        period: The time between samples in s.
-        later: How many rows after the time of a sample its force is found.
+        column: The recorded values.
+        period: The sample period in s.
+        later: The number of rows from the time of a sample to the row with its force.
     """
-    found = np.full_like(column, np.nan)
+    sampled = np.full_like(column, np.nan)
     taken = (np.ceil((times - SAME * period) / period) - 1.0) * period
     rows = np.searchsorted(times, taken - SAME * period)
     is_there = np.abs(times[np.minimum(rows, times.size - 1)] - taken) < SAME * period
     good = is_there & (rows + later < times.size)
-    # Of the rows with one sample the first one: the last row of a record may have the next.
-    found[rows[good][::-1] + later] = column[good][::-1]
-    return found
+    # The first of the rows with the same sample: the last row of a record may have the next one.
+    sampled[rows[good][::-1] + later] = column[good][::-1]
+    return sampled

@@ -1,4 +1,4 @@
-"""The plant of a loop alone, driven by recorded controls, with exact derivatives."""
+"""The plant of a loop, driven by recorded controls, with exact derivatives."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from drake_dae.running.rollout.stepping.many import VectorizedFunction
 from drake_dae.systems.plants.contract import Plant
 
 HALVES = (0.0, 0.5, 0.5, 1.0)
-"""When the stages of the fourth-order Runge-Kutta method are, in steps."""
+"""The times of the stages of the fourth-order Runge-Kutta method, in steps."""
 
 WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 
 
 class MovedPieces(NamedTuple):
-    """Values at one moment of many pieces, and how they depend on where these begin.
+    """Values of many pieces at one time, and their derivatives.
 
     Attributes:
-        values: Shape (j, k).
-        slopes: Their derivatives with respect to the state at the beginning and to the unknown
-            parameters, shape (j, k, n + p); None where nobody asks for them.
+        values: The values, shape (j, k).
+        slopes: Their derivatives with respect to the initial state and to the unknown parameters,
+            shape (j, k, n + p); None if they are not computed.
     """
 
     values: FloatArray
@@ -41,16 +41,15 @@ class MovedPieces(NamedTuple):
 class DrivenPlant:
     """The plant of a loop as functions of its state, its control and some of its parameters.
 
-    A continuous plant takes steps of the classical Runge-Kutta method of fourth order, a discrete
-    one its own. The state of a discrete plant is all that it holds. A plant whose contacts open
-    takes for each of them 1 or 0 as a further entry of its control: whether it is closed, which
-    stays as it is while the plant moves.
+    A continuous plant is integrated by the classical Runge-Kutta method of fourth order, a discrete
+    plant by its own steps; its state is the whole discrete state. A plant with unilateral contacts
+    has one further control for each of them, the mode: 1 closed, 0 open, constant during a step.
 
     Attributes:
         loop: The loop.
         context: A context of its diagram, with the values of all parameters.
-        outputs: Name -> the output port whose values are of interest.
-        places: The places of the unknown parameters in numeric parameter 0 of the plant.
+        outputs: Name -> output port that is evaluated.
+        places: The indices of the unknown parameters in numeric parameter 0 of the plant.
     """
 
     loop: ClosedLoop
@@ -65,9 +64,9 @@ class DrivenPlant:
                 f"{plant.dae.name} is stepped by Drake's own contact, which has no derivatives; "
                 "take point contact as !CompliantContact"
             )
-        own = sum(part.stop - part.start for system, part in compiled.held if system is plant)
-        is_known = bool(plant.contacts) or not (own and compiled.sizes["state"])
-        if own != compiled.sizes["held"] or not is_known or compiled.watched:
+        size = sum(part.stop - part.start for system, part in compiled.held if system is plant)
+        is_mixed = bool(size and compiled.sizes["state"])  # Contacts keep their mode beside x.
+        if size != compiled.sizes["held"] or (is_mixed and not plant.contacts) or compiled.watched:
             raise ModelError(f"{plant.dae.name}: a plant that samples cannot be identified")
 
     @cached_property
@@ -88,34 +87,33 @@ class DrivenPlant:
 
     @cached_property
     def felt(self) -> slice:
-        """The states of the force sensor, which come last; empty without a lag."""
+        """The indices of the force sensor's states, the last ones; empty without a lag."""
         size = len(self.loop.sensor.bias) if self.lag and self.loop.sensor is not None else 0
         first = int(self._compiled.sizes["held" if self.period else "state"])
         return slice(first, first + size)
 
     @property
     def num_states(self) -> int:
-        """n, those of the plant and then those of a force sensor with a lag."""
+        """n, the number of states of the plant and of a force sensor with a lag."""
         return self.felt.stop
 
     @cached_property
     def state_of_plant(self) -> slice:
-        """Where the state of the plant stands."""
+        """The indices of the plant's state."""
         places = self._compiled.held if self.period else self._compiled.states
         return dict(places)[self.loop.plant]
 
     @cached_property
     def scale(self) -> FloatArray:
         """The sizes of the states, shape (n,)."""
-        found = np.ones(self.num_states)
-        x = self.loop.plant.dae.scale
+        scale, of_plant = np.ones(self.num_states), self.loop.plant.dae.scale
         first = self.state_of_plant.start
-        found[first : first + x.size] = x
-        return found
+        scale[first : first + of_plant.size] = of_plant
+        return scale
 
     @cached_property
     def base(self) -> FloatArray:
-        """All parameters of the functions, with the values of the context."""
+        """The values of all parameters of the functions in the context."""
         compiled, context = self._compiled, self.context.Clone()
         for system, name, _ in compiled.fixed:
             port = system.GetInputPort(name)
@@ -134,32 +132,38 @@ class DrivenPlant:
 
     @cached_property
     def hold(self) -> System | None:
-        """The block that holds the control between samples; None if there is none."""
+        """The zero-order hold of the control; None if there is none."""
         return control_hold(self.loop.plant, Wires.of(self.loop.diagram))
 
     @cached_property
     def names(self) -> Sequence[str]:
-        """The outputs in the order of `seen`; last "felt_force" of a sensor with a lag."""
-        own = ("felt_force",) if self.lag else ()
-        return (*self._compiled.outputs, *own)
+        """The names of the `evaluated` outputs; a lag of the force sensor adds "felt_force"."""
+        return (*self._compiled.outputs, *(("felt_force",) if self.lag else ()))
 
     @cached_property
-    def sizes(self) -> Sequence[int]:
-        """The number of entries of each output."""
-        own = [self.felt.stop - self.felt.start] if self.lag else []
-        return [*(self.outputs[name].size() for name in self._compiled.outputs), *own]
+    def output_places(self) -> dict[str, slice]:
+        """Name of an output -> its entries in `evaluated`."""
+        sizes = [self.outputs[name].size() for name in self._compiled.outputs]
+        ends = np.cumsum([*sizes, self.felt.stop - self.felt.start]).tolist()
+        return {
+            name: slice(first, end)
+            for name, first, end in zip(self.names, [0, *ends], ends, strict=False)
+        }
 
     @cached_property
     def _symbols(self) -> list[ca.SX]:
-        sizes = self._compiled.sizes
         plant = self.loop.plant
-        control = plant.GetInputPort("control").size() + len(plant.contacts)
-        given = {"time": 1, "state": self.num_states, "unknown": len(self.places)}
-        given |= {"control": control, "base": sizes["parameters"]}
-        return [ca.SX.sym(name, size) for name, size in given.items()]
+        sizes = {
+            "time": 1,
+            "state": self.num_states,
+            "unknown": len(self.places),
+            "control": plant.GetInputPort("control").size() + len(plant.contacts),
+            "base": self._compiled.sizes["parameters"],
+        }
+        return [ca.SX.sym(name, size) for name, size in sizes.items()]
 
     def _arguments(self) -> list[ca.SX]:
-        """What the functions of the diagram take."""
+        """The arguments of the diagram's functions, as expressions of the symbols."""
         time, state, unknown, control, base = self._symbols
         compiled, values = self._compiled, ca.SX(base)
         if self.places:
@@ -167,25 +171,22 @@ class DrivenPlant:
         for system, name, part in compiled.fixed:
             if name == "control" and system is self.loop.plant:
                 values[part] = control[: part.stop - part.start]
-        return self._given(time, state[: self.felt.start], values)
+        return self._arguments_at(time, state[: self.felt.start], values)
 
-    def _given(self, time: ca.SX, state: ca.SX, values: ca.SX) -> list[ca.SX]:
+    def _arguments_at(self, time: ca.SX, state: ca.SX, values: ca.SX) -> list[ca.SX]:
         control = self._symbols[3]
         mode = control[control.numel() - len(self.loop.plant.contacts) :]
         return [time, *((ca.SX(0, 1), state) if self.period else (state, mode)), values]
 
-    def _force(self, given: Sequence[ca.SX]) -> ca.SX:
-        """What a force sensor feels: the multipliers."""
-        names = list(self._compiled.outputs)
-        sizes = [self.outputs[name].size() for name in names]
-        first = sum(sizes[: names.index("constraint_force")])
-        size = self.felt.stop - self.felt.start
-        return self._compiled.row.call(list(given))[0][first : first + size]
+    def _force(self, arguments: list[ca.SX]) -> ca.SX:
+        """The input of the force sensor: the multipliers."""
+        first, size = self.output_places["constraint_force"].start, self.felt.stop - self.felt.start
+        return self._compiled.row.call(arguments)[0][first : first + size]
 
     def _functions(
         self, value: ca.SX, valid: ca.SX
     ) -> tuple[VectorizedFunction, VectorizedFunction]:
-        """A function, and one with its derivatives with respect to state and unknown parameters."""
+        """The function of a value, and one with derivatives by state and unknown parameters too."""
         by = ca.vertcat(self._symbols[1], self._symbols[2])
         shown = ca.densify(value) + 0.0 * valid
         slopes = ca.densify(ca.vec(ca.jacobian(value, by).T))
@@ -198,27 +199,28 @@ class DrivenPlant:
     @cached_property
     def _moves(self) -> tuple[VectorizedFunction, VectorizedFunction]:
         """The derivative of the state, or the next state of a discrete plant."""
-        compiled, given = self._compiled, self._arguments()
+        compiled, arguments = self._compiled, self._arguments()
         felt = self._symbols[1][self.felt]
         if not self.period:
-            rate, valid = compiled.rate.call(given)
+            rate, valid = compiled.rate.call(arguments)
             if self.lag:
-                rate = ca.vertcat(rate, (self._force(given) - felt) / self.lag)
+                rate = ca.vertcat(rate, (self._force(arguments) - felt) / self.lag)
             return self._functions(rate, valid)
         (update,) = compiled.rates
         noise = ca.SX.zeros(compiled.sizes["noise"])
-        values, valid = update.function.call([*given, noise])
+        values, valid = update.function.call([*arguments, noise])
         state = ca.SX(self._symbols[1][: self.felt.start])
         state[list(update.places)] = values
         if self.lag:
             # The force of a step acts on the sensor during the next one.
-            force = self._force(self._given(given[0] + self.period, state, given[-1]))
-            share = float(np.exp(-self.period / self.lag))
-            state = ca.vertcat(state, force + share * (felt - force))
+            time, parameters = arguments[0], arguments[-1]
+            force = self._force(self._arguments_at(time + self.period, state, parameters))
+            decay = float(np.exp(-self.period / self.lag))
+            state = ca.vertcat(state, force + decay * (felt - force))
         return self._functions(state, valid)
 
     @cached_property
-    def _shows(self) -> tuple[VectorizedFunction, VectorizedFunction]:
+    def _outputs(self) -> tuple[VectorizedFunction, VectorizedFunction]:
         row, valid = self._compiled.row.call(self._arguments())
         return self._functions(ca.vertcat(row, self._symbols[1][self.felt]), valid)
 
@@ -230,37 +232,37 @@ class DrivenPlant:
         unknown: FloatArray,
         control: FloatArray,
     ) -> MovedPieces:
-        """A function at many moments, with derivatives along those of the state."""
+        """Evaluates a function at many states, with derivatives by the chain rule."""
         plain, full = functions
-        given = time[:, None], moved.values, unknown, control, self.base
+        arguments = time[:, None], moved.values, unknown, control, self.base
         if moved.slopes is None:
-            return MovedPieces(plain(*given)[0])
-        (count, n), (values, flat) = moved.values.shape, full(*given)
+            return MovedPieces(plain(*arguments)[0])
+        (count, n), (values, flat) = moved.values.shape, full(*arguments)
         local = flat.reshape(count, -1, n + unknown.size)
-        with np.errstate(all="ignore"):  # The caller sees what is not finite.
+        with np.errstate(all="ignore"):  # The caller checks that values are finite.
             slopes = np.matmul(local[:, :, :n], moved.slopes)
         slopes[:, :, n:] += local[:, :, n:]
         return MovedPieces(values, slopes)
 
-    def begun(self, states: FloatArray) -> MovedPieces:
-        """The states at the beginning of pieces, shape (j, n), as values of themselves."""
+    def initial(self, states: FloatArray) -> MovedPieces:
+        """The initial states of pieces, shape (j, n), with the identity as derivatives."""
         count, n = states.shape
         slopes = np.zeros((count, n, n + len(self.places)))
         slopes[:] = np.eye(n, n + len(self.places))
         return MovedPieces(states, slopes)
 
-    def seen(
+    def evaluated(
         self, time: FloatArray, moved: MovedPieces, unknown: FloatArray, control: FloatArray
     ) -> MovedPieces:
-        """The outputs at times in s, shape (j,), below each other.
+        """The outputs `names`, stacked.
 
         Args:
-            time: The times.
+            time: The times in s, shape (j,).
             moved: The states.
             unknown: The unknown parameters, shape (p,).
-            control: The controls, and then which contacts are closed, shape (j, q).
+            control: The controls, followed by the modes of the contacts, shape (j, q).
         """
-        return self._called(self._shows, time, moved, unknown, control)
+        return self._called(self._outputs, time, moved, unknown, control)
 
     def step(
         self,
@@ -270,15 +272,14 @@ class DrivenPlant:
         unknown: FloatArray,
         controls: Sequence[FloatArray],
     ) -> MovedPieces:
-        """The states at later times.
+        """Integrates the states from `time` to `after`.
 
         Args:
-            time, after: From when to when, in s, shape (j,).
-            moved: The states at the former.
+            time, after: The initial and final times in s, shape (j,).
+            moved: The states at `time`.
             unknown: The unknown parameters, shape (p,).
-            controls: Of a continuous plant those at the beginning, in the middle and at the end of
-                each of its equal steps; of a discrete plant that of each step. Each of shape
-                (j, q).
+            controls: Arrays of shape (j, q). A discrete plant has one for each step; a continuous
+                plant has one for each end and each middle of its equal steps.
         """
         if self.period:
             for index, control in enumerate(controls):
@@ -289,11 +290,11 @@ class DrivenPlant:
         count = len(controls) // 2
         h = (after - time) / count
         for index in range(count):
-            given = controls[2 * index : 2 * index + 3]
-            moved = self._stages(time + index * h, h, moved, unknown, given)
+            own = controls[2 * index : 2 * index + 3]
+            moved = self._runge_kutta(time + index * h, h, moved, unknown, own)
         return moved
 
-    def _stages(
+    def _runge_kutta(
         self,
         time: FloatArray,
         h: FloatArray,
@@ -313,7 +314,7 @@ class DrivenPlant:
 def _ahead(
     moved: MovedPieces, h: FloatArray, rates: Sequence[MovedPieces], weights: Sequence[float]
 ) -> MovedPieces:
-    """What a step along the weighted sum of rates leads to."""
+    """Adds h times the weighted sum of the rates."""
     values, slopes = moved
     for weight, rate in zip(weights, rates, strict=True):
         values = values + (weight * h)[:, None] * rate.values
@@ -323,7 +324,7 @@ def _ahead(
 
 
 def control_hold(plant: Plant, wires: Wires) -> System | None:
-    """The block that holds the control of a plant between samples; None if there is none."""
+    """Returns the zero-order hold of a plant's control; None if there is none."""
     port = plant, int(plant.GetInputPort("control").get_index())
     while (source := wires.sources.get(port)) is not None:
         system, index = source

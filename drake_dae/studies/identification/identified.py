@@ -7,54 +7,56 @@ from typing import Any
 
 import numpy as np
 
+from drake_dae.analysis.tables import Table
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, unknown_name
 from drake_dae.errors import ModelError
+from drake_dae.studies.identification.fit import FitResult
 from drake_dae.studies.identification.unknowns import Unknown
 
 NORMAL = 1.96
-"""An interval of 95 % has so many deviations to each side."""
+"""Half the length of an interval of 95 %, in deviations."""
 
 RESAMPLED = 400
-"""So many times the bootstrap draws pieces of the records."""
+"""The number of draws of the bootstrap."""
 
 SHARE = 0.1
-"""An unknown with a larger part than this in a direction that is not determined is not either."""
+"""An unknown with a larger component than this in an undetermined direction is undetermined."""
 
 WHITE = 3.0
-"""Errors whose correlation with the next ones is above this, in deviations of that of white noise,
-are not white."""
+"""Errors are white if their autocorrelation at lag 1 is below this, in deviations of the
+autocorrelation of white noise."""
 
 LARGER = 1.5
-"""A deviation of the bootstrap that is larger by this factor is remarked."""
+"""A deviation of the bootstrap that is larger than the Fisher one by this factor is reported."""
 
 ALIKE = 1.25
-"""What is left is called other than the stated noise where it differs by more than this factor."""
+"""Errors that differ from the stated noise by more than this factor are reported."""
 
 LARGE = 0.3
-"""If so large a part of how much a measurement varies is left, and not white, the record does not
-fit."""
+"""A record does not fit if its errors, relative to the spread of the measurement, exceed this and
+are not white."""
 
 CONVERGED = 0.1
-"""A last step below this, in deviations, is small beside the intervals."""
+"""A fit has converged if its last step is below this, in deviations."""
 
 STRONG = 0.95
-"""Correlations of two unknowns above this are printed."""
+"""Correlations of two parameters above this are reported."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class Noise:
-    """What is left of some measured columns.
+    """The errors, measured minus computed, of a group of measured columns.
 
     Attributes:
-        unit: Its unit.
-        deviation: Its deviation.
-        stated: The deviation that the sensor is said to have; None if nobody said.
-        correlation: The largest correlation of an error with the next one, by its absolute value.
-        is_white: Whether that is what white noise has.
-        is_least: Whether there is no noise, and what is left is that of computing.
-        share: The deviation relative to how much the columns vary.
+        unit: The unit of the columns.
+        deviation: The root mean square of the errors.
+        stated: The standard deviation in the settings of the sensor; None if there is none.
+        correlation: The autocorrelation at lag 1 with the largest absolute value.
+        is_white: Whether `correlation` agrees with white noise.
+        is_least: Whether the errors are only numerical, without any noise.
+        share: `deviation` relative to the spread of the columns.
     """
 
     unit: str
@@ -69,28 +71,29 @@ class Noise:
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Parameters with their uncertainty, from records.
+    """Identified parameters with their uncertainty.
 
-    The information of the data about the parameters is F = sum T^T T, with the derivatives T of the
-    errors over their noise along the motions that fit best; their covariance is F^-1 (Fisher). It
-    holds for white noise of the deviation that the errors have. The bootstrap draws whole pieces of
-    the records with repetition, so that it knows errors that are correlated within a piece.
+    The Fisher information is F = sum T^T T, with the derivatives T of the weighted errors by the
+    parameters at the best fit; the covariance is F^-1. It is valid for white noise with the
+    deviation of the errors. The bootstrap draws whole pieces of the records with replacement, so it
+    includes the effect of errors that are correlated within a piece.
 
     Attributes:
         unknowns: The parameters.
         values: Their values, shape (p,).
-        start: The values at the beginning, shape (p,).
-        covariance: F^-1, shape (p, p); nan for what is not determined.
-        bootstrap: The deviations by the bootstrap, shape (p,).
+        start: Their initial guess, shape (p,).
+        covariance: F^-1, shape (p, p); nan for undetermined parameters.
+        bootstrap: The standard deviations by the bootstrap, shape (p,).
         undetermined: The parameters of each combination that the data do not determine.
-        noise: Name of a measured signal, with its unit if it has several -> what is left of it.
-        errors: For each record the measured minus the computed columns, shape (k, c); nan where
-            none is used.
-        last_step: How far it has converged: in the last step no parameter moved by more of its
+        noise: Name of a measured signal, with its unit if it has several -> its errors.
+        errors: Measured minus computed columns of each record, shape (k, c); nan where a value is
+            not used.
+        last_step: The length of the last step; each parameter moved by at most this many
             deviations.
-        left_out: How many steps between rows are not used, of how many: those in which a contact
-            opens, closes or is struck, a control that is not held jumps as a phase of a task ends,
-            or friction at rest needs far shorter steps than the rest of the record.
+        left_out: The number of steps between rows that are not used, and the number of all. Steps
+            are left out in which a contact opens, closes or has an impact, a control without a hold
+            jumps at the end of a phase of a task, or static friction needs far shorter steps than
+            the rest of the record.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -105,14 +108,7 @@ class Identified:
     left_out: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
-        p = len(self.unknowns)
-        sizes = {"values": (p,), "start": (p,), "covariance": (p, p), "bootstrap": (p,)}
-        for name, shape in sizes.items():
-            if np.shape(getattr(self, name)) != shape:
-                raise ModelError(
-                    f"{name} of {p} parameters must have shape {shape}, got "
-                    f"{np.shape(getattr(self, name))}"
-                )
+        check_shapes(self, len(self.unknowns), values=1, start=1, covariance=2, bootstrap=1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -123,7 +119,7 @@ class Identified:
         """The value of a parameter.
 
         Raises:
-            ModelError: It was not asked for.
+            ModelError: No parameter of this name was identified.
         """
         if name not in self.names:
             raise ModelError(unknown_name("identified parameter", name, self.names))
@@ -136,7 +132,7 @@ class Identified:
 
     @property
     def intervals(self) -> FloatArray:
-        """The intervals of 95 %, lowest and highest value, shape (p, 2)."""
+        """The intervals of 95 %, [lowest, highest] value, shape (p, 2)."""
         half = NORMAL * self.deviations
         return np.column_stack([self.values - half, self.values + half])
 
@@ -147,8 +143,8 @@ class Identified:
 
     def text(self) -> str:
         """The result as lines of text."""
-        rows = [("parameter", "value", "95 % interval", "bootstrap", "before", "unit")]
-        half = NORMAL * self.deviations
+        head = ("parameter", "value", "95 % interval", "bootstrap", "before", "unit")
+        rows, half = list[Sequence[str]](), NORMAL * self.deviations
         for i, unknown in enumerate(self.unknowns):
             if np.isfinite(half[i]):
                 shown = f"{self.values[i]:.{_digits(self.values[i], half[i])}g}"
@@ -156,29 +152,24 @@ class Identified:
             else:
                 shown, around = "not determined", ("", "")
             rows.append((unknown.name, shown, *around, f"{self.start[i]:.6g}", unknown.unit))
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
-        return "\n".join([*lines, "", *self.remarks()])
+        return "\n".join([*Table(head, rows, left=len(head)).lines(), "", *self.remarks()])
 
     def remarks(self) -> list[str]:
-        """What is to be known about the values."""
-        found = [
-            f"What is left of {name} is {noise.share:.2g} times as large as how much it varies: "
-            "the record does not fit this robot. Look for a wrong sign, a wrong unit, a column of "
-            "another joint, or something that the plant lacks."
+        """Sentences on convergence, fit, noise and undetermined parameters."""
+        remarks = [
+            f"The errors of {name} are {noise.share:.2g} times its spread: the record does not fit "
+            "this robot. Look for a wrong sign, a wrong unit, a column of another joint, or "
+            "something that the plant lacks."
             for name, noise in self.noise.items()
             if noise.share > LARGE and not noise.is_white
         ]
         if self.undetermined:
             names = listed((" with ".join(each) for each in self.undetermined), 20)[1:-1]
-            found.append(
+            remarks.append(
                 f"Not determined by the records, and left as before: {names}. A motion or a force "
                 "that depends on them is needed, or fewer free parameters."
             )
-        found.append(
+        remarks.append(
             f"Converged: the last step moved no parameter by more than {self.last_step:.2g} of its "
             "deviation."
             if self.last_step <= CONVERGED
@@ -187,7 +178,7 @@ class Identified:
         )
         count, total = self.left_out
         if count:
-            found.append(
+            remarks.append(
                 f"Left out are {count} of {total} steps between rows, in which a contact opens, "
                 "closes or is struck, a phase of a task ends, or friction at rest needs far "
                 "shorter steps."
@@ -198,9 +189,9 @@ class Identified:
             if unknown.lowest is not None and value <= unknown.lowest
         ]
         if at_bound:
-            found.append(f"At the lower bound: {listed(at_bound)[1:-1]}.")
+            remarks.append(f"At the lower bound: {listed(at_bound)[1:-1]}.")
         strong = np.abs(np.triu(self.correlations, 1)) > STRONG
-        found += [
+        remarks += [
             f"{self.names[i]} and {self.names[j]} are hard to tell apart: their correlation is "
             f"{self.correlations[i, j]:.3f}."
             for i, j in np.argwhere(strong)
@@ -209,20 +200,20 @@ class Identified:
             stated = "" if noise.stated is None else f" ({noise.stated:.2g} is stated)"
             ratio = noise.deviation / noise.stated if noise.stated else 1.0
             if not (1.0 / ALIKE < ratio < ALIKE or noise.is_least):
-                found.append(
-                    f"What is left of {name} is {ratio:.2g} times the noise that is stated: "
+                remarks.append(
+                    f"The errors of {name} are {ratio:.2g} times the stated noise: "
                     + ("the model lacks something." if ratio > 1.0 else "the sensor is better.")
                 )
             kind = f"{'' if noise.is_white else 'not '}white"
-            kind += f" (correlation with the next one {noise.correlation:.2g})"
+            kind += f" (autocorrelation {noise.correlation:.2g})"
             if noise.is_least:
-                kind = "what computing leaves: there is no noise"
-            found.append(
-                f"Left of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
+                kind = "only numerical, without noise"
+            remarks.append(
+                f"Errors of {name}: {noise.deviation:.2g} {noise.unit}".rstrip()
                 + f"{stated}, {kind}."
             )
         if any(not (noise.is_white or noise.is_least) for noise in self.noise.values()):
-            found.append(
+            remarks.append(
                 "Where errors are not white the intervals are too short, by the bootstrap less so: "
                 "the model lacks something (a free parameter, friction, a bias), the "
                 "noise of a sensor passes a filter, or it rounds."
@@ -233,8 +224,8 @@ class Identified:
             if b > LARGER * d
         ]
         if larger:
-            found.append(f"By the bootstrap the intervals of {listed(larger)[1:-1]} are longer.")
-        return found
+            remarks.append(f"By the bootstrap the intervals of {listed(larger)[1:-1]} are longer.")
+        return remarks
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values."""
@@ -257,53 +248,61 @@ class Identified:
 
 
 def _digits(value: float, half: float) -> int:
-    """How many digits of a value its interval determines, and one more."""
+    """The number of digits of a value that its interval determines, plus one."""
     if not value or not half:
         return 6
     return int(np.clip(np.ceil(np.log10(abs(value) / half)) + 2, 2, 12))
 
 
-def known_covariance(
-    information: FloatArray, determined: FloatArray, undetermined: FloatArray, sizes: FloatArray
-) -> FloatArray:
-    """The covariance of the unknowns, nan for those that are not determined, shape (p, p).
+def check_shapes(result: Any, p: int, **dimensions: int) -> None:
+    """Checks that attributes of a result for p parameters have the shape (p,) or (p, p).
+
+    Raises:
+        ModelError: An attribute has another shape.
+    """
+    for name, dimension in dimensions.items():
+        shape, actual = (p,) * dimension, np.shape(getattr(result, name))
+        if actual != shape:
+            raise ModelError(f"{name} of {p} parameters must have shape {shape}, got {actual}")
+
+
+def fisher_covariance(fitted: FitResult, sizes: FloatArray) -> FloatArray:
+    """The covariance of the unknowns, shape (p, p); nan for undetermined ones.
 
     Args:
-        information: F, shape (p, p).
-        determined: As of `Fitted`.
-        undetermined: As of `Fitted`.
-        sizes: The sizes of the unknowns.
+        fitted: The fit.
+        sizes: The sizes of the unknowns, shape (p,).
     """
-    basis = sizes[:, None] * determined
-    found: FloatArray = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
-    is_open = np.square(undetermined).sum(axis=1) > SHARE**2
-    found[is_open] = found[:, is_open] = np.nan
-    return found
+    information = fitted.information[:, :, : len(sizes)].sum(axis=0)
+    basis = sizes[:, None] * fitted.determined
+    covariance: FloatArray = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
+    is_open = np.square(fitted.undetermined).sum(axis=1) > SHARE**2
+    covariance[is_open] = covariance[:, is_open] = np.nan
+    return covariance
 
 
 def undetermined_names(
-    undetermined: FloatArray, names: Sequence[str]
+    fitted: FitResult, unknowns: Sequence[Unknown]
 ) -> tuple[tuple[str, ...], ...]:
-    """The parameters of each direction that is not determined, by name."""
+    """The names of the parameters in each undetermined direction."""
     return tuple(
-        tuple(names[i] for i in np.flatnonzero(np.abs(column) > SHARE).tolist())
-        for column in undetermined.T
+        tuple(unknowns[i].name for i in np.flatnonzero(np.abs(column) > SHARE).tolist())
+        for column in fitted.undetermined.T
     )
 
 
-def resampled(information: FloatArray, determined: FloatArray, sizes: FloatArray) -> FloatArray:
-    """The deviations of the unknowns by the bootstrap, shape (p,).
+def bootstrap_deviations(fitted: FitResult, sizes: FloatArray) -> FloatArray:
+    """The standard deviations of the unknowns by the bootstrap, shape (p,).
 
     Args:
-        information: As of `Fitted`.
-        determined: As of `Fitted`.
-        sizes: The sizes of the unknowns.
+        fitted: The fit.
+        sizes: The sizes of the unknowns, shape (p,).
     """
     p, random = len(sizes), np.random.default_rng(0)
-    basis = sizes[:, None] * determined
-    count = len(information)
+    basis = sizes[:, None] * fitted.determined
+    count = len(fitted.information)
     drawn = random.multinomial(count, np.full(count, 1.0 / count), RESAMPLED)
-    sums = np.tensordot(drawn.astype(float), information, axes=1)
+    sums = np.tensordot(drawn.astype(float), fitted.information, axes=1)
     left = np.einsum("ia,kij,jb->kab", basis, sums[:, :, :p], basis)
     right = np.einsum("ia,ki->ka", basis, sums[:, :, p])
     # A draw may leave out the only pieces that determine something.

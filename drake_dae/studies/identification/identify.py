@@ -1,4 +1,4 @@
-"""Parameters of a plant from records of it."""
+"""Identification of the parameters of a plant from its records."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -18,8 +18,8 @@ from drake_dae.studies.identification.identified import (
     WHITE,
     Identified,
     Noise,
-    known_covariance,
-    resampled,
+    bootstrap_deviations,
+    fisher_covariance,
     undetermined_names,
 )
 from drake_dae.studies.identification.measured import measured, measured_ports
@@ -27,10 +27,10 @@ from drake_dae.studies.identification.pieces import RecordPieces
 from drake_dae.studies.identification.unknowns import Unknowns
 
 ROUNDED = 10.0
-"""What is left is called that of computing if it is less than so many times the least noise."""
+"""Errors below this multiple of the least noise are only numerical."""
 
 BRIEF, LONG = 2000, 4000
-"""Of a record with more rows than the latter, so many are used for a first estimate."""
+"""If a record has more than `LONG` rows, a first estimate uses the first `BRIEF` ones."""
 
 
 @checked(ModelError)
@@ -40,36 +40,35 @@ def identify(
     records: Sequence[Record] | Mapping[str, Record],
     free: Sequence[str],
 ) -> Identified:
-    """Parameters of the plant of a loop, with their uncertainty, from records of it.
+    """Identifies parameters of the plant of a loop, with their uncertainty, from its records.
 
-    The plant alone is driven by the recorded controls; the law plays no part. Records are cut into
-    short pieces, each from a state of its own, and the unknowns, all these states among them,
-    minimize
+    The recorded controls drive the plant; the law is not used. Records are cut into short pieces.
+    The parameters and the initial states of all pieces minimize
 
         sum |measured - computed|^2 / noise^2
 
-    under the condition that a piece begins where the one before ends, and on N*: multiple shooting
-    with steps of Gauss-Newton and exact derivatives. The noise of each kind of measurement is that
-    of what is left.
+    such that each piece starts at the final state of the piece before it, and on N*. The method is
+    multiple shooting with Gauss-Newton steps and exact derivatives. The noise of each kind of
+    measurement is estimated from its errors.
 
-    Measured are the positions of the state, as the loop's encoders show them if it has any, and the
-    constraint forces, of its sensor if it has one. Velocities are not: they are estimated.
+    The measurements are positions, from the encoders if the loop has any, and constraint forces,
+    from the force sensor if the loop has one. Velocities are not used as measurements.
 
     Args:
         loop: The closed loop. Its plant is continuous, or a discrete `CompliantPlant`. Steps in
-            which an ideal contact opens, closes or is struck are left out, and pieces on both sides
-            are not joined; "mode" of the records says when contacts are closed.
-        context: A context of its diagram; parameters begin with its values, and all others have
-            them.
-        records: The records, by name or in a list: of this plant under any law, with the signals
+            which an ideal contact opens, closes or has an impact are left out, and the pieces
+            before and after them are not joined; the records need the signal "mode" for this.
+        context: A context of its diagram, with the values of all other parameters and the initial
+            guess of the free ones.
+        records: The records of this plant under any law, by name or in a list, with the signals
             "control" and "state" (or the encoders'), and "constraint_force" or "measured_force".
         free: Names of the plant's parameters, such as "tool.mass", "wall.position[0]" or
-            "plant.stiffness"; "force.bias" and "position.bias" are what sensors add, "force.delay"
-            and "position.delay" by how much later they measure, in s.
+            "plant.stiffness"; "force.bias" and "position.bias" for the biases of the sensors;
+            "force.delay" and "position.delay" for their delays in s.
 
     Raises:
         ModelError: There is no such parameter, a record does not fit the plant, the plant is of
-            another kind, or no values are found.
+            another kind, or the fit does not converge.
 
     Source: Bock, Randwertproblemmethoden zur Parameteridentifizierung, 1987 (multiple shooting);
     Bierman, Factorization Methods for Discrete Sequential Estimation, 1977.
@@ -84,30 +83,44 @@ def identify(
     start = unknowns.start(driven.nominal, pieces[0].data.channels)
     sizes = np.where(start != 0.0, np.abs(start), 1.0)
     lowest = np.array([-np.inf if u.lowest is None else u.lowest for u in unknowns.all])
-    given = sizes, lowest, np.array([unknown.strict for unknown in unknowns.all])
-    fitted = _fitted(pieces, start, given)
-    return _identified(loop, unknowns, start, sizes, pieces, fitted)
+    limits = sizes, lowest, np.array([unknown.strict for unknown in unknowns.all])
+    fitted = _fitted(pieces, start, limits)
+    covariance, bootstrap = fisher_covariance(fitted, sizes), bootstrap_deviations(fitted, sizes)
+    bootstrap[np.isnan(np.diagonal(covariance))] = np.nan
+    return Identified(
+        unknowns.all,
+        fitted.values,
+        start,
+        covariance,
+        bootstrap,
+        undetermined_names(fitted, unknowns.all),
+        _noise(loop, pieces, fitted),
+        fitted.errors,
+        fitted.last_step,
+        fitted.left_out,
+    )
 
 
 def _fitted(
     pieces: Sequence[RecordPieces],
     start: FloatArray,
-    given: tuple[FloatArray, FloatArray, np.ndarray],
+    limits: tuple[FloatArray, FloatArray, np.ndarray],
 ) -> FitResult:
-    """The fit, of long records from a first estimate by their first rows."""
-    if all(each.data.times.size <= LONG for each in pieces):
-        return ParameterFit(pieces, start, *given).run()
-    first = ParameterFit([each.first(BRIEF) for each in pieces], start, *given).run(COUPLINGS[:-1])
-    with suppress(ModelError):  # From nearby, pieces need not be loose at first.
-        return ParameterFit(pieces, first.values, *given, first.noise).run(COUPLINGS[-1:])
-    return ParameterFit(pieces, first.values, *given).run()
+    """Fits the records; long records first with some of their rows, for a better initial guess."""
+    if all(record.data.times.size <= LONG for record in pieces):
+        return ParameterFit(pieces, start, *limits).run()
+    shortened = [record.first(BRIEF) for record in pieces]
+    first = ParameterFit(shortened, start, *limits).run(COUPLINGS[:-1])
+    with suppress(ModelError):  # A good initial guess needs no loose coupling.
+        return ParameterFit(pieces, first.values, *limits, first.noise).run(COUPLINGS[-1:])
+    return ParameterFit(pieces, first.values, *limits).run()
 
 
 def pieces_of(record: Record, driven: DrivenPlant, unknowns: Unknowns, title: str) -> RecordPieces:
-    """A record in pieces.
+    """Cuts a record into pieces.
 
     Raises:
-        ModelError: It does not fit the plant or the unknowns.
+        ModelError: The record does not fit the plant or the unknowns.
     """
     data = measured(record, driven, title)
     biases, delays = unknowns.of_sensors(data.channels)
@@ -118,11 +131,11 @@ def pieces_of(record: Record, driven: DrivenPlant, unknowns: Unknowns, title: st
                 f"contacts of {title} open or close, or phases of its task end, and a delay is not "
                 "found across these; leave the delay out, or take a record between two of them"
             )
-    return RecordPieces(driven, data, biases, unknowns.num_sensed, delays=delays)
+    return RecordPieces(driven, data, biases, delays, unknowns.num_sensed)
 
 
 def _check_differ(records: Mapping[str, Record]) -> None:
-    """Refuses one run under two names, whose noise would be taken for that of two."""
+    """Checks that no run is given twice; its noise would count as independent noise."""
     named = list(records.items())
     for i, (title, record) in enumerate(named):
         for before, other in named[:i]:
@@ -130,12 +143,12 @@ def _check_differ(records: Mapping[str, Record]) -> None:
                 (record.time, other.time),
                 *((r.values, other[n]) for n, r in record.signals.items() if n in other.signals),
             ]
-            if all(np.array_equal(one, two) for one, two in pairs):
+            if all(np.array_equal(a, b) for a, b in pairs):
                 raise ModelError(f"{before} and {title} are the same run; name it once")
 
 
 def _check_even(times: FloatArray, title: str) -> None:
-    """Refuses rows that are not equally far from each other, for delays."""
+    """Checks that rows are equally spaced, as delays need."""
     steps = np.diff(times)
     if np.ptp(steps[:-1]) > SAME * np.median(steps):
         raise ModelError(
@@ -150,72 +163,38 @@ def _numbered(records: Sequence[Record]) -> dict[str, Record]:
     return {f"record {number}": record for number, record in enumerate(records, 1)}
 
 
-def _identified(
-    loop: ClosedLoop,
-    unknowns: Unknowns,
-    start: FloatArray,
-    sizes: FloatArray,
-    pieces: Sequence[RecordPieces],
-    fitted: FitResult,
-) -> Identified:
-    names, p = [unknown.name for unknown in unknowns.all], start.size
-    parts = fitted.determined, fitted.undetermined
-    covariance = known_covariance(fitted.information[:, :, :p].sum(axis=0), *parts, sizes)
-    bootstrap = resampled(fitted.information, fitted.determined, sizes)
-    bootstrap[np.isnan(np.diagonal(covariance))] = np.nan
-    undetermined = undetermined_names(fitted.undetermined, names)
-    noise = _noise(loop, pieces, fitted)
-    return Identified(
-        unknowns.all,
-        fitted.values,
-        start,
-        covariance,
-        bootstrap,
-        undetermined,
-        noise,
-        fitted.errors,
-        fitted.last_step,
-        fitted.left_out,
-    )
-
-
 def _noise(loop: ClosedLoop, pieces: Sequence[RecordPieces], fitted: FitResult) -> dict[str, Noise]:
-    """What is left of each group of measured columns, over all records."""
-    groups = dict[tuple[str, str], list[FloatArray]]()
-    one_of = dict[tuple[str, str], Channel]()
-    spreads = dict[tuple[str, str], float]()
-    for each, errors in zip(pieces, fitted.errors, strict=True):
-        for channel, column, spread in zip(each.data.channels, errors.T, each.spread, strict=True):
-            own = column[np.isfinite(column)]
-            groups.setdefault(channel.group, []).append(own)
-            one_of[channel.group] = channel
-            spreads[channel.group] = max(float(spread), spreads.get(channel.group, 0.0))
-    found, signals = {}, [signal for signal, _ in groups]
-    for (signal, unit), columns in groups.items():
-        correlations = [_correlation(column) for column in columns]
-        largest = max(correlations, key=abs)
+    """The errors of each group of measured columns, over all records."""
+    groups = dict[tuple[str, str], list[tuple[Channel, FloatArray, float]]]()
+    for record, errors in zip(pieces, fitted.errors, strict=True):
+        measured_columns = zip(record.data.channels, errors.T, record.spread, strict=True)
+        for channel, column, spread in measured_columns:
+            finite = column[np.isfinite(column)]
+            groups.setdefault(channel.group, []).append((channel, finite, float(spread)))
+    noise, signals = {}, [signal for signal, _ in groups]
+    for (signal, unit), group in groups.items():
+        channels, columns, spreads = zip(*group, strict=True)
+        largest = max(map(_correlation, columns), key=abs)
         deviation = float(np.sqrt(np.mean(np.square(np.concatenate(columns)))))
         limit = max(WHITE / np.sqrt(max(column.size, 1)) for column in columns)
         name = signal if signals.count(signal) == 1 else f"{signal} [{unit}]"
-        stated = stated_noise(loop, one_of[signal, unit])
-        share = deviation / spreads[signal, unit]
+        stated, share = stated_noise(loop, channels[-1]), deviation / max(spreads)
         is_white, is_least = bool(abs(largest) < limit), share < ROUNDED * SMALLEST
-        found[name] = Noise(unit, deviation, stated, largest, is_white, is_least, share)
-    return found
+        noise[name] = Noise(unit, deviation, stated, largest, is_white, is_least, share)
+    return noise
 
 
 def _correlation(errors: FloatArray) -> float:
-    """The correlation of errors with the next ones."""
-    own = errors - errors.mean()
-    power = float(own @ own)
-    return float(own[1:] @ own[:-1]) / power if power else 0.0
+    """The autocorrelation of errors at lag 1."""
+    centered = errors - errors.mean()
+    power = float(centered @ centered)
+    return float(centered[1:] @ centered[:-1]) / power if power else 0.0
 
 
 def stated_noise(loop: ClosedLoop, channel: Channel) -> float | None:
-    """The deviation that a sensor is said to have."""
+    """The standard deviation in a sensor's settings; None if the loop has no such sensor."""
     if channel.signal == "measured_force" and loop.sensor is not None:
         return float(loop.sensor.noise_deviation[channel.place])
     if channel.signal != "state" and channel.port == "state" and loop.encoders is not None:
-        deviation = loop.encoders.sensor.encoders.position_deviation
-        return float(np.max(deviation))
+        return float(np.max(loop.encoders.sensor.encoders.position_deviation))
     return None

@@ -1,4 +1,4 @@
-"""What a record says of a plant: controls, measured outputs, and a first guess of the states."""
+"""The data of a record: controls, measured outputs, and an initial guess of the states."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from drake_dae.studies.identification.openings import cuts, modes
 from drake_dae.systems.blocks.traced import Traced
 
 FEWEST = 20
-"""A record needs at least so many rows."""
+"""The least number of rows of a record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,15 @@ class Measured:
 
     Attributes:
         times: The times in s, shape (k,).
-        acting: u at the times, or just after them where the force is sampled then, and for each
-            contact that opens 1 where it is closed, else 0, shape (k, q).
-        controls: The same or, of a held control, that of the step from a row to the next one.
-        states: A first guess of the states, shape (k, n).
+        acting: u at the times, or just after them if the force is sampled then, followed by the
+            mode of each unilateral contact (1 closed, 0 open), shape (k, q).
+        controls: Like `acting`, with u during the step from a row to the next if u has a zero-order
+            hold, shape (k, q).
+        states: An initial guess of the states, shape (k, n).
         values: The measured columns, shape (k, c); nan where there is no measurement.
-        channels: What they measure.
-        cut: Between which rows a contact opens, closes or is struck, or a control jumps, shape
-            (k - 1,).
+        channels: The measured entries, one for each column.
+        cut: Whether a contact changes or has an impact, or a control jumps, between a row and the
+            next, shape (k - 1,).
     """
 
     times: FloatArray
@@ -51,42 +52,44 @@ class Measured:
     cut: np.ndarray
 
     def first(self, count: int) -> Self:
-        """The first rows alone."""
-        return replace(
-            self,
-            times=self.times[:count],
-            acting=self.acting[:count],
-            controls=self.controls[:count],
-            states=self.states[:count],
-            values=self.values[:count],
-            cut=self.cut[: count - 1],
-        )
+        """A copy with only the first rows."""
+        names = ("times", "acting", "controls", "states", "values")
+        rows = {name: getattr(self, name)[:count] for name in names}
+        return replace(self, **rows, cut=self.cut[: count - 1])
+
+    @property
+    def groups(self) -> list[list[int]]:
+        """The indices of the columns of each group, see `Channel.group`."""
+        groups: dict[tuple[str, str], list[int]] = {}
+        for index, channel in enumerate(self.channels):
+            groups.setdefault(channel.group, []).append(index)
+        return list(groups.values())
 
 
 def measured_ports(loop: ClosedLoop) -> dict[str, OutputPort]:
-    """Name -> an output port of the plant that a record may measure.
+    """Returns the output ports of the plant that identification uses: name -> port.
 
-    With "constraint_residual", which is zero where constraints are ideal.
+    Ideal constraints add "constraint_residual", which must be zero.
     """
     plant = loop.plant
-    found = {name: plant.GetOutputPort(name) for name in ("state", "constraint_force")}
+    names = ["state", "constraint_force"]
     if plant.is_ideal and plant.dae.num_constraints:
-        found["constraint_residual"] = plant.GetOutputPort("constraint_residual")
-    return found
+        names.append("constraint_residual")
+    return {name: plant.GetOutputPort(name) for name in names}
 
 
 def measured(record: Record, driven: DrivenPlant, title: str) -> Measured:
-    """The data of a record.
+    """Returns the data of a record.
 
     Args:
         record: The record.
         driven: The plant.
-        title: What messages call the record.
+        title: The name of the record in messages.
 
     Raises:
-        ModelError: The record has too few rows, no controls, nothing that is measured, columns of
-            another robot or in other units, values that are not finite, or steps that do not fit
-            those of the plant.
+        ModelError: The record has too few rows, no controls, no measurements, columns of another
+            robot or in other units, values that are not finite, or steps that do not fit those of
+            the plant.
     """
     loop, plant = driven.loop, driven.loop.plant
     if record.time.size < FEWEST:
@@ -104,7 +107,7 @@ def measured(record: Record, driven: DrivenPlant, title: str) -> Measured:
         )
     controls = np.column_stack([columns[s.name] for s in plant.dae.control_signals])
     acting, after = controls, np.vstack([controls[1:], controls[-1:]])
-    if driven.hold is not None:  # A row of a continuous plant has what led to it.
+    if driven.hold is not None:  # A row of a continuous plant has the control before it.
         is_after = _acts_before(driven.hold, record.time, driven.period) | (not driven.period)
         controls = np.where(is_after[:, None], after, acting)
     channels, values = channels_of(record, loop, title)
@@ -114,7 +117,7 @@ def measured(record: Record, driven: DrivenPlant, title: str) -> Measured:
             f"('constraint_force' or 'measured_force'); it has {listed(record.signals)}"
         )
     if driven.hold is not None and any(each.signal == "measured_force" for each in channels):
-        acting = controls  # A sensor samples what the control makes that has just been set.
+        acting = controls  # The sensor samples the force of the control that was just set.
     states = _first_states(record, driven, channels, values, title)
     mode = modes(record, plant, title)
     acting, controls = np.hstack([acting, mode]), np.hstack([controls, mode])
@@ -124,16 +127,16 @@ def measured(record: Record, driven: DrivenPlant, title: str) -> Measured:
             f"{title} has a contact that opens, closes or is struck between all of its rows; "
             "record more rows"
         )
-    given = np.column_stack(values), channels, cut
-    found = Measured(record.time, acting, controls, states, *given)
-    # The last row has the control and the sample of its instant, others those before it.
+    measurements = np.column_stack(values)
+    data = Measured(record.time, acting, controls, states, measurements, channels, cut)
+    # The last row has the control and the sample of its own instant, other rows earlier ones.
     steps = float(np.diff(record.time)[-1]) / driven.period if driven.period else 1.0
     is_last = abs(steps - round(steps)) > SAME or (driven.hold is not None and not driven.period)
-    return found.first(record.time.size - 1) if is_last else found
+    return data.first(record.time.size - 1) if is_last else data
 
 
 def _check_steps(record: Record, period: float, title: str) -> None:
-    """Refuses a record whose rows are not those of the steps of a discrete plant."""
+    """Checks that the rows of a record are at steps of a discrete plant."""
     if not period:
         return
     steps = np.diff(record.time)[:-1]  # A run may end within a step.
@@ -147,19 +150,19 @@ def _check_steps(record: Record, period: float, title: str) -> None:
 
 
 def _acts_before(hold: System, times: FloatArray, period: float) -> np.ndarray:
-    """At which rows a hold acts just before the step of a discrete plant, by round-off of the time.
+    """At which rows a hold updates just before the step of a discrete plant, due to round-off.
 
-    As in Drake, two updates are of one instant if their times are the same to the last bit.
+    As in Drake, two updates are simultaneous if their times are equal to the last bit.
     """
-    found = np.zeros(times.size, dtype=bool)
+    is_before = np.zeros(times.size, dtype=bool)
     if not (period and isinstance(hold, Traced)):
-        return found
+        return is_before
     steps = period * np.round(times / period)
     for update in hold.traced().updates:
         count = np.round((steps - update.offset) / update.period)
         moments = update.offset + count * update.period
-        found |= (moments < steps) & (moments > steps - SAME * period)
-    return found
+        is_before |= (moments < steps) & (moments > steps - SAME * period)
+    return is_before
 
 
 def _first_states(
@@ -169,9 +172,9 @@ def _first_states(
     values: Sequence[FloatArray],
     title: str,
 ) -> FloatArray:
-    """States from the record, velocities from differences of positions where it has none."""
+    """The recorded states; missing velocities are differences of positions."""
     plant = driven.loop.plant
-    found = np.zeros((record.time.size, driven.num_states))
+    states = np.zeros((record.time.size, driven.num_states))
     signals, first = plant.dae.state_signals, driven.state_of_plant.start
     known = dict[str, FloatArray]()
     for name in ("estimated_state", "measured_state", "state"):
@@ -184,20 +187,20 @@ def _first_states(
         raise ModelError(f"{title} lacks the positions {listed(missing)}")
     known |= _rates(driven, known, record.time)
     for place, signal in enumerate(signals):
-        found[:, first + place] = known[signal.name]
+        states[:, first + place] = known[signal.name]
     size = len(signals)
     if driven.period and "contact_force" in record.signals:
         force = record["contact_force"]
-        found[:, first + size : first + size + force.shape[1]] = force
+        states[:, first + size : first + size + force.shape[1]] = force
     for channel, column in zip(channels, values, strict=True):
         if channel.port == "felt_force":
             felt = _filled(record.time, column) - channel.bias
-            found[:, driven.felt.start + channel.place] = felt
-    return found
+            states[:, driven.felt.start + channel.place] = felt
+    return states
 
 
 def _filled(times: FloatArray, column: FloatArray) -> FloatArray:
-    """A column with straight lines where it has no values."""
+    """A column whose missing values are interpolated linearly."""
     known = np.isfinite(column)
     return np.interp(times, times[known], column[known])
 
@@ -205,7 +208,7 @@ def _filled(times: FloatArray, column: FloatArray) -> FloatArray:
 def _rates(
     driven: DrivenPlant, known: Mapping[str, FloatArray], times: FloatArray
 ) -> dict[str, FloatArray]:
-    """Differences of positions, for velocities that a record lacks."""
+    """The velocities that a record lacks, as differences of positions."""
     signals = driven.loop.plant.dae.state_signals
     positions = [signal for signal in signals if is_position(signal)]
     velocities = [signal for signal in signals if not is_position(signal)]

@@ -1,4 +1,4 @@
-"""Identification for a scenario: from records to a scenario with the values that were found."""
+"""Identification for a scenario: from records to a scenario with the identified values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,10 +23,10 @@ from drake_dae.studies.identification.unknowns import (
 
 
 def recorded_scenario(records: Mapping[str, Record]) -> Scenario:
-    """The scenario of the first of some records.
+    """Returns the scenario of the first record.
 
     Raises:
-        ModelError: It has none.
+        ModelError: The first record contains no scenario, or there is no record.
     """
     for title, record in records.items():
         data = record.about.get("scenario")
@@ -42,59 +42,58 @@ def recorded_scenario(records: Mapping[str, Record]) -> Scenario:
 def identify_scenario(
     scenario: Scenario, records: Mapping[str, Record], free: Sequence[str]
 ) -> tuple[Identified, Scenario]:
-    """Parameters of a scenario's plant from records, and the scenario with their values.
+    """Identifies parameters of a scenario's plant, and returns the scenario with their values.
 
-    The parameters begin with the values of the law's model: what `plant_parameters` says of them is
-    not used. Biases of sensors begin at 0.
+    The initial guess of a parameter is its value in the law's model; its value in
+    `plant_parameters` is not used. The initial guess of a sensor's bias is 0.
 
     Args:
-        scenario: The scenario. Drake's own point contact is taken as !CompliantContact.
+        scenario: The scenario. Drake's own point contact is replaced by !CompliantContact.
         records: The records by name.
         free: As of `identify`.
 
     Returns:
-        The result, and the scenario whose law, plant and sensors have the values that were found
-        (for the law of a cascade its plant alone), except for those that are not determined,
-        delays, and biases of sensors that it does not have.
+        The result, and the scenario whose law, plant and sensors have the identified values. The
+        law of a cascade keeps its values. Undetermined parameters, delays, and biases of sensors
+        that the scenario lacks are not set.
 
     Raises:
         ModelError: As of `identify`.
         ScenarioError: The scenario cannot be built; the message names its key.
     """
     names = {name.partition("[")[0] for name in free}
-    own = {n: v for n, v in scenario.plant_parameters.items() if n not in names}
+    others = {n: v for n, v in scenario.plant_parameters.items() if n not in names}
     changes = dict[str, Any]()
     if FORCE_BIAS in names and scenario.force_feedback.is_measured:
         changes["force_feedback.bias"] = 0.0
     if POSITION_BIAS in names and scenario.encoders is not None:
         changes["encoders.position_bias"] = 0.0
-    begun = _changed(replace(scenario, plant_parameters=own), changes)
-    loop, context = build_scenario(for_rollout(begun)[0])
-    found = identify(loop, context, records, free)
-    return found, _with_values(begun, found)
+    initial = _changed(replace(scenario, plant_parameters=others), changes)
+    loop, context = build_scenario(for_rollout(initial)[0])
+    identified = identify(loop, context, records, free)
+    return identified, _with_values(initial, identified)
 
 
-def _with_values(scenario: Scenario, found: Identified) -> Scenario:
-    """A scenario with the values that were found."""
-    payloads = {f"{one.name}.mass": i for i, one in enumerate(scenario.plant_payloads)}
+def _with_values(scenario: Scenario, identified: Identified) -> Scenario:
+    payloads = {f"{load.name}.mass": i for i, load in enumerate(scenario.plant_payloads)}
     changes = dict[str, Any]()
     values = dict[str, dict[int, float]]()
     for unknown, value, deviation in zip(
-        found.unknowns, found.values, found.deviations, strict=True
+        identified.unknowns, identified.values, identified.deviations, strict=True
     ):
         if np.isfinite(deviation):
             values.setdefault(unknown.parameter, {})[unknown.entry] = float(value)
-    # A cascade does not know `parameters`.
+    # A cascade has no key `parameters`.
     key = "plant_parameters" if scenario.is_cascade else "parameters"
     numbers = dict(getattr(scenario, key))
-    # No sensor of a scenario has a delay, and there may be none.
+    # No sensor of a scenario has a delay; the scenario may also lack the sensor.
     left_out = {FORCE_DELAY, POSITION_DELAY}
     left_out |= set() if scenario.force_feedback.is_measured else {FORCE_BIAS}
     left_out |= set() if scenario.encoders is not None else {POSITION_BIAS}
     for name, entries in values.items():
         all_entries = [
             entries.get(unknown.entry, float(start))
-            for unknown, start in zip(found.unknowns, found.start, strict=True)
+            for unknown, start in zip(identified.unknowns, identified.start, strict=True)
             if unknown.parameter == name
         ]
         value = all_entries[0] if len(all_entries) == 1 else all_entries
@@ -114,5 +113,4 @@ def _with_values(scenario: Scenario, found: Identified) -> Scenario:
 
 
 def _changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
-    """A scenario with other values at dotted keys."""
     return read_scenario(varied_data(scenario_data(scenario), changes))

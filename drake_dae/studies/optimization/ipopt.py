@@ -1,4 +1,4 @@
-"""IPOPT, with the values and derivatives of functions of Python."""
+"""IPOPT for functions that Python evaluates, with their derivatives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
 
 TOLERANCE = 1e-6
-"""Of optimality and of limits, in variables, cost and limits over their sizes."""
+"""The tolerance of optimality and of limits, for scaled variables, cost and limits."""
 
 PUSHED = 1e-2
-"""A variable that begins at a bound is moved by as much of its range, others by less or not."""
+"""The largest distance that IPOPT moves the initial guess away from a bound, in ranges."""
 
 LEAST_PUSHED = 1e-6
-"""A variable is moved by as much at least where it begins closer to a bound."""
+"""The least distance that IPOPT moves an initial guess that is closer to a bound."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class IpoptProblem:
     """min f(x) with low <= x <= high and lowest <= g(x) <= highest.
 
     Attributes:
-        values: x -> f and g below each other, shape (1 + m,).
-        slopes: x -> their derivatives, shape (1 + m, n).
-        low, high: Shape (n,).
-        lowest, highest: Shape (m,).
-        is_over: Whether the search is to end.
+        values: x -> [f, g], shape (1 + m,).
+        slopes: x -> the derivatives of [f, g], shape (1 + m, n).
+        low, high: The bounds of x, shape (n,).
+        lowest, highest: The bounds of g, shape (m,).
+        is_over: Returns whether the search must end.
     """
 
     values: Callable[[FloatArray], FloatArray]
@@ -43,13 +43,13 @@ class IpoptProblem:
 
 @dataclass(frozen=True)
 class IpoptResult:
-    """How IPOPT ended.
+    """The result of IPOPT.
 
     Attributes:
-        x: Where, shape (n,).
-        status: What it says.
-        converged: Whether it converged.
-        iterations: How many iterations it made.
+        x: The last x, shape (n,).
+        status: IPOPT's return status.
+        converged: Whether IPOPT converged.
+        iterations: The number of iterations.
     """
 
     x: FloatArray
@@ -59,15 +59,15 @@ class IpoptResult:
 
 
 def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> IpoptResult:
-    """Runs IPOPT (Waechter and Biegler, 2006), whose second derivatives are those of BFGS.
+    """Runs IPOPT (Waechter and Biegler, 2006) with second derivatives by BFGS.
 
-    A function that raises an error of this library has no value there, and IPOPT takes a shorter
-    step; any other exception ends the search and is raised.
+    If a function raises an error of this library, its value is nan, and IPOPT takes a shorter step.
+    Any other exception ends the search and is raised again.
 
     Args:
         problem: The problem.
-        start: x at the beginning.
-        iterations: At most so many iterations.
+        start: The initial x, shape (n,).
+        iterations: The largest number of iterations.
     """
     functions = _Values(problem)
     room = np.minimum(start - problem.low, problem.high - start)
@@ -93,14 +93,14 @@ def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> IpoptRes
         },
     }
     solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": both[0], "g": both[1:]}, options)
-    found = solver(
+    solution = solver(
         x0=start, lbx=problem.low, ubx=problem.high, lbg=problem.lowest, ubg=problem.highest
     )
     if functions.errors:
         raise functions.errors[0]
     stats = solver.stats()
     return IpoptResult(
-        found["x"].full()[:, 0],
+        solution["x"].full()[:, 0],
         str(stats["return_status"]),
         bool(stats["success"]),
         int(stats["iter_count"]),
@@ -108,68 +108,58 @@ def solve(problem: IpoptProblem, start: FloatArray, iterations: int) -> IpoptRes
 
 
 class _PythonFunction(ca.Callback):
-    """A function of Python for CasADi, which loses exceptions: they are kept in `errors`."""
+    """A Python function for CasADi, with one result; CasADi loses exceptions, `errors` has them."""
 
-    def __init__(self, name: str, problem: IpoptProblem, errors: list[BaseException]) -> None:
+    def __init__(
+        self,
+        name: str,
+        problem: IpoptProblem,
+        errors: list[BaseException],
+        function: Callable[[FloatArray], FloatArray],
+        inputs: list[int],
+        columns: int,
+    ) -> None:
         super().__init__()
-        self._problem, self._size, self.errors = problem, problem.low.size, errors
-        self._count = 1 + problem.lowest.size
+        self._problem, self.errors, self._function = problem, errors, function
+        self._inputs, self._shape = inputs, (1 + problem.lowest.size, columns)
         self.construct(name, {})
 
     def get_n_in(self) -> int:
-        return 1
+        return len(self._inputs)
 
     def get_n_out(self) -> int:
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(self._size, 1)
+        return ca.Sparsity.dense(self._inputs[i], 1)
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(*self._shape())
-
-    def _shape(self) -> tuple[int, int]:
-        return self._count, 1
-
-    def _value(self, x: FloatArray) -> FloatArray:
-        return self._problem.values(x)
+        return ca.Sparsity.dense(*self._shape)
 
     def eval(self, arguments: Any) -> list[ca.DM]:
-        """The value; nan where there is none."""
-        nothing = np.full(self._shape(), np.nan)
-        if self.errors or self._problem.is_over():
-            return [ca.DM(nothing)]
-        try:
-            return [ca.DM(self._value(arguments[0].full()[:, 0]).reshape(self._shape()))]
-        except DrakeDaeError:
-            return [ca.DM(nothing)]
-        except BaseException as error:
-            self.errors.append(error)
-            return [ca.DM(nothing)]
-
-
-class _Slopes(_PythonFunction):
-    def get_n_in(self) -> int:
-        return 2
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(self._count if i else self._size, 1)
-
-    def _shape(self) -> tuple[int, int]:
-        return self._count, self._size
-
-    def _value(self, x: FloatArray) -> FloatArray:
-        return self._problem.slopes(x)
+        """The value of the function; nan if it fails or the search is over."""
+        if not (self.errors or self._problem.is_over()):
+            try:
+                return [ca.DM(self._function(arguments[0].full()[:, 0]).reshape(self._shape))]
+            except DrakeDaeError:
+                pass
+            except BaseException as error:
+                self.errors.append(error)
+        return [ca.DM(np.full(self._shape, np.nan))]
 
 
 class _Values(_PythonFunction):
-    def __init__(self, problem: IpoptProblem) -> None:
-        super().__init__("values", problem, [])
-        self._slopes: _Slopes | None = None  # CasADi does not keep it.
+    """x -> [f, g], with the Jacobian of the problem."""
 
-    def has_jacobian(self, *given: Any) -> bool:
+    def __init__(self, problem: IpoptProblem) -> None:
+        super().__init__("values", problem, [], problem.values, [problem.low.size], 1)
+        self._slopes: _PythonFunction | None = None  # CasADi keeps no reference to it.
+
+    def has_jacobian(self, *_: Any) -> bool:
         return True
 
-    def get_jacobian(self, name: str, *given: Any) -> ca.Function:
-        self._slopes = _Slopes(name, self._problem, self.errors)
+    def get_jacobian(self, name: str, *_: Any) -> ca.Function:
+        problem, n = self._problem, self._problem.low.size
+        inputs = [n, 1 + problem.lowest.size]  # x, and the value at x, which is not needed.
+        self._slopes = _PythonFunction(name, problem, self.errors, problem.slopes, inputs, n)
         return self._slopes

@@ -1,4 +1,4 @@
-"""Runs of a loop with some values of its variables, and their exact derivatives."""
+"""Runs of a loop for given values of its variables, and their exact derivatives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,19 +19,19 @@ from drake_dae.studies.optimization.variables import Variable
 
 @dataclass(eq=False)
 class LoopRuns:
-    """Runs of a loop over the same times.
+    """Runs of a loop over the same times, for given values of its variables.
 
-    A start that is off N*, as where a variable moves it or the wall, is brought to N* as each step
-    of a run is; the derivatives are those of that, too.
+    If the variables move the initial state or a surface, the initial state is projected onto N*,
+    like the state after each step. The derivatives include this projection.
 
     Attributes:
         loop: The loop.
-        start, parameters: As of `start_values`, before.
-        variables: What changes.
-        times: When rows are written, in s.
+        start, parameters: The initial state and the parameters before, from `start_values`.
+        variables: The variables.
+        times: The times of the recorded rows, in s.
         config: Drake's settings.
         seed: The seed of the noise.
-        made: How many runs were made.
+        made: The number of runs so far.
     """
 
     loop: ClosedLoop | Diagram
@@ -44,74 +44,73 @@ class LoopRuns:
     made: int = field(default=0, init=False)
 
     def run(self, values: FloatArray) -> Rollout:
-        """The run with some values of the variables.
-
-        Raises:
-            InconsistentStateError: There is no start on N*.
-        """
-        self.made += 1
-        start, parameters, _ = self._begun(values)
-        (found,) = run_loop(
-            self.loop, start, parameters, self.times, config=self.config, seeds=self._seeds
-        )
-        return found
-
-    def changes(self, values: FloatArray, names: Sequence[str]) -> dict[str, FloatArray]:
-        """How signals of the run change with each variable.
+        """Simulates the loop.
 
         Args:
-            values: The values of the variables.
+            values: The values of the variables, shape (n,).
+
+        Raises:
+            InconsistentStateError: The initial state cannot be projected onto N*.
+        """
+        self.made += 1
+        start, parameters, _ = self._initial(values)
+        seeds = None if self.seed is None else [self.seed]
+        (rollout,) = run_loop(
+            self.loop, start, parameters, self.times, config=self.config, seeds=seeds
+        )
+        return rollout
+
+    def changes(self, values: FloatArray, names: Sequence[str]) -> dict[str, FloatArray]:
+        """The derivatives of signals of the run by each variable.
+
+        Args:
+            values: The values of the variables, shape (n,).
             names: The names of the signals.
 
         Returns:
-            Name -> changes, shape (n, j, k).
+            Name -> derivatives, shape (n, j, k).
 
         Raises:
             ModelError: The run has no derivatives.
-            InconsistentStateError: There is no start on N*.
+            InconsistentStateError: The initial state cannot be projected onto N*.
             SimulationError: The run fails.
         """
-        start, parameters, before = self._begun(values)
-        given = start, parameters, self.times, self.config, self.seed
-        chain = FunctionChain.of(self.loop, *given)
-        chain = replace(chain, links=[*before, *chain.links])
+        start, parameters, links = self._initial(values)
+        chain = FunctionChain.of(self.loop, start, parameters, self.times, self.config, self.seed)
+        chain = replace(chain, links=[*links, *chain.links])
         count = len(self.variables)
         of_start, of_parameters = np.zeros((count, start.size)), np.zeros((count, parameters.size))
-        for i, one in enumerate(self.variables):
-            if one.state >= 0:
-                of_start[i, one.state] = 1.0
-            of_parameters[i, list(one.places)] = 1.0
+        for i, variable in enumerate(self.variables):
+            if variable.state >= 0:
+                of_start[i, variable.state] = 1.0
+            of_parameters[i, list(variable.places)] = 1.0
         rows = chain.forward(of_start, of_parameters)
         return {name: rows[:, :, chain.part(name)] for name in names}
 
-    def shown(self, values: FloatArray) -> FloatArray:
-        """The values of the variables at the start on N*, shape (n,)."""
-        start, _, _ = self._begun(values)
-        places = [one.state for one in self.variables]
-        return np.where(np.array(places) >= 0, start[places], values)
+    def projected_values(self, values: FloatArray) -> FloatArray:
+        """The values of the variables after the projection of the initial state, shape (n,)."""
+        start, _, _ = self._initial(values)
+        states = np.array([variable.state for variable in self.variables])
+        return np.where(states >= 0, start[states], values)
 
-    def put(self, values: FloatArray, context: Context) -> Context:
-        """A context of the loop with some values of the variables."""
+    def context_with(self, values: FloatArray, context: Context) -> Context:
+        """A copy of a context of the loop, with the given values of the variables."""
         program = program_of(self.loop)
-        start, parameters, _ = self._begun(values)
-        found, size = context.Clone(), program.size
-        _, held = program.compiled.start(found)
+        start, parameters, _ = self._initial(values)
+        changed, size = context.Clone(), program.size
+        _, held = program.compiled.start(changed)
         held[program.kept_places] = start[size:]
-        program.compiled.set_context(found, context.get_time(), start[:size], held, parameters)
-        return found
+        program.compiled.set_context(changed, context.get_time(), start[:size], held, parameters)
+        return changed
 
-    @property
-    def _seeds(self) -> list[Seed] | None:
-        return None if self.seed is None else [self.seed]
-
-    def _begun(self, values: FloatArray) -> tuple[FloatArray, FloatArray, list[ComputedFunction]]:
-        """Start and parameters, and the functions that brought the start onto N*."""
+    def _initial(self, values: FloatArray) -> tuple[FloatArray, FloatArray, list[ComputedFunction]]:
+        """The projected initial state, the parameters, and the functions of the projection."""
         program = program_of(self.loop)
         start, parameters = self.start.copy(), self.parameters.copy()
-        for one, value in zip(self.variables, values.tolist(), strict=True):
-            if one.state >= 0:
-                start[one.state] = value
-            parameters[list(one.places)] = value
+        for variable, value in zip(self.variables, values.tolist(), strict=True):
+            if variable.state >= 0:
+                start[variable.state] = value
+            parameters[list(variable.places)] = value
         held = np.zeros(program.compiled.sizes["held"])
         held[program.kept_places] = start[program.size :]
         state = start[: program.size]

@@ -1,4 +1,4 @@
-"""Numbers of a loop with the least cost within limits, by the exact gradient of its run."""
+"""Optimization of parameters and initial states of a loop, by exact gradients of its run."""
 
 import signal
 from collections.abc import Callable, Mapping
@@ -39,10 +39,10 @@ def optimize(
     seed: Seed | None = None,
     iterations: int = 200,
 ) -> Optimum:
-    """The numbers of a loop with the least cost of its run, within limits.
+    """Minimizes the cost of a loop's run over its parameters and initial state, within limits.
 
-    It solves min J(p, record(p)) subject to low <= p <= high and the limits, by IPOPT, where the
-    record is that of `rollout`. Derivatives of the record are exact: those of the steps taken.
+    IPOPT solves min J(p, record(p)) subject to low <= p <= high and the limits. The record is the
+    one of `rollout`, and its derivatives are exact: they are the derivatives of the steps.
     Cost and limits are CasADi expressions of the record:
 
         found = optimize(
@@ -53,220 +53,210 @@ def optimize(
         )
 
     Args:
-        loop: The closed loop, or any diagram that `rollout` takes.
-        context: Its context at the start, with the values to begin with.
-        times: When the record has rows, in s, from the start to the end, shape (j,). Cost and
-            limits see these rows alone.
-        free: Name -> least and largest value, None for no bound, of parameters of the context:
+        loop: The closed loop, or any diagram that `rollout` supports.
+        context: Its context at the start time, with the initial guess.
+        times: The times of the rows of the record, in s, from the start to the end, shape (j,).
+            Cost and limits use only these rows.
+        free: Name -> (least, largest) value, None for no bound. Names are those of parameters:
             "link1.mass", "wall.position[0]" for one entry, "gains.tool.z" for the gains of an
-            output, parameters of references by their names, and "start.joint1" for an entry of the
-            plant's state. A number that plant and law both have is changed in both;
-            "plant.link1.mass" and "law.link1.mass" change it in one. A start is brought to N*,
-            after which its entries may be slightly beyond their bounds.
-        cost: Takes the run as `RunSymbols`, returns the cost, one number.
-        limits: Takes it likewise, returns name -> (least value, expression, largest value), None
-            for no bound; an expression may have many entries. None for no limits.
-        more: Name -> first value of variables that cost and limits have beside the loop, such as a
-            peak to be made small.
+            output, and names of parameters of references; and "start.joint1" for an entry of the
+            plant's initial state. A parameter of both plant and law is changed in both;
+            "plant.link1.mass" and "law.link1.mass" change it in one of them. The initial state is
+            projected onto N*, after which its entries may be slightly beyond their bounds.
+        cost: Function of the run, as `RunSymbols`, that returns the cost, one number.
+        limits: Function of the run that returns name -> (least value, expression, largest value),
+            with None for no bound; an expression may have many entries. None for no limits.
+        more: Name -> initial guess of further variables of cost and limits, such as a peak that is
+            minimized.
         config: Drake's settings, with fixed steps.
-        seed: The seed of the noise, as of `rollout`.
-        iterations: At most so many iterations.
+        seed: The seed of the noise, as in `rollout`.
+        iterations: The largest number of iterations.
 
     Returns:
-        The best numbers, whether they are a local optimum, and a context with them. After Ctrl-C it
-        is the best so far, and `interrupted` names the signal.
+        The best values, whether they are a local optimum, and a context with them. After Ctrl-C
+        they are the best so far, and `interrupted` is the signal.
 
     Raises:
-        ModelError: A name is unknown, bounds or limits make no sense, the cost is no expression or
-            depends on no variable, or the run has no derivatives, as with error control, impacts
-            and openings.
-        InconsistentStateError: The start is not on N* and cannot be brought there.
-        SimulationError: The run with the values to begin with fails.
+        ModelError: A name is unknown, bounds or limits contradict each other, the cost is no
+            expression or depends on no variable, or the run has no derivatives, as with error
+            control, impacts and openings.
+        InconsistentStateError: The initial state cannot be projected onto N*.
+        SimulationError: The run with the initial guess fails.
     """
     check_whole_number("iterations", iterations, 1)
     program, moments = program_of(loop), checked_times(times)
     start, parameters = start_values(loop, context)
     variables = chosen_variables(program.compiled, start, parameters, free)
     extra = {name: number(f"'{name}' of more", value) for name, value in (more or {}).items()}
-    names = [one.name for one in variables]
+    names = [variable.name for variable in variables]
     if doubles := set(names) & set(extra):
         raise ModelError(f"'{min(doubles)}' of more is a number of the loop; give it another name")
     layout = None
     if not isinstance(loop, Diagram) and loop.generator is not None:
         layout = loop.controller.law.layout
     run = RunSymbols(moments, program.signals, [*names, *extra], layout)
-    asked = Objective.of(run, cost, limits)
+    objective = Objective.of(run, cost, limits)
     trials = LoopRuns(loop, start, parameters, variables, moments, config, seed)
-    search = _Search(trials, asked, variables, extra)
-    with ending_signals(search.hear, in_callbacks=True):
-        ended = solve(search.problem, search.start, iterations)
-    return search.optimum(context, ended)
+    search = _Search(trials, objective, variables, extra)
+    with ending_signals(search.interrupt, in_callbacks=True):
+        solution = solve(search.problem, search.start, iterations)
+    return search.optimum(context, solution)
 
 
 class _Search:
-    """The values, derivatives and the best of the runs of an optimization.
+    """The runs of an optimization: their values, their derivatives, and the best run.
 
-    IPOPT has variables, cost and limits over their sizes.
+    IPOPT's variables, cost and limits are scaled by their sizes.
 
     Attributes:
-        start: The variables over their sizes to begin with, shape (n,).
+        start: The scaled initial guess, shape (n,).
+        problem: The scaled problem for IPOPT.
         interrupted: The signal that ends the search.
 
     Args:
         trials: The runs.
-        asked: Cost and limits.
+        objective: Cost and limits.
         variables: The variables of the loop.
-        extra: Those of cost and limits alone.
+        extra: Name -> initial guess of the further variables of cost and limits.
     """
 
     def __init__(
         self,
         trials: LoopRuns,
-        asked: Objective,
+        objective: Objective,
         variables: list[Variable],
         extra: Mapping[str, float],
     ) -> None:
-        self._trials, self._asked, self._variables = trials, asked, variables
-        self._extra = dict(extra)
-        more = [Variable(name, start=value) for name, value in extra.items()]
-        both = [*variables, *more]
-        self._sizes = np.array([one.size for one in both])
-        self._bounds = [np.array([getattr(one, n) for one in both]) for n in ("low", "high")]
-        self._limit_sizes = limit_sizes(asked.low, asked.high)
-        self._tangents = asked.tangents(len(both))
+        self._trials, self._objective, self._variables = trials, objective, variables
+        self._extra = list(extra)
+        every = [*variables, *(Variable(name, start=value) for name, value in extra.items())]
+        self._sizes = np.array([variable.size for variable in every])
+        self._bounds = [np.array([getattr(v, name) for v in every]) for name in ("low", "high")]
+        self._limit_sizes = limit_sizes(objective.low, objective.high)
+        self._tangents = objective.tangents(len(every))
         self.interrupted: signal.Signals | None = None
-        self._known: tuple[bytes, FloatArray, Rollout] | None = None
-        self._last: tuple[bytes, FloatArray] | None = None
-        begin = np.array([one.start for one in both])
+        self._last_run: tuple[bytes, FloatArray, Rollout] | None = None
+        self._last_slopes: tuple[bytes, FloatArray] | None = None
         self._best: tuple[float, float, FloatArray] | None = None
-        self._cost_size = 1.0
-        values = self._begin(begin)
-        self._first = values[0]
-        slopes, self._idle = self._check(begin)
-        largest = np.abs(slopes[0] * self._sizes).max()
-        self._cost_size = largest if largest > 0.0 else 1.0
-        self.start = begin / self._sizes
-        low, high = (each / self._sizes for each in self._bounds)
-        for place in self._idle:
-            low[place] = high[place] = self.start[place]
+        guess = np.array([variable.start for variable in every])
+        self._first_cost = self._checked_values(guess)[0]
+        slopes, self._idle = self._checked_slopes(guess)
+        cost_size = np.abs(slopes[0] * self._sizes).max() or 1.0
+        self._scales = np.concatenate([[cost_size], self._limit_sizes])
+        self.start = guess / self._sizes
+        low, high = (bounds / self._sizes for bounds in self._bounds)
+        low[self._idle] = high[self._idle] = self.start[self._idle]
         self.problem = IpoptProblem(
-            self._values,
-            self._slopes,
+            self._scaled_values,
+            self._scaled_slopes,
             low,
             high,
-            asked.low / self._limit_sizes,
-            asked.high / self._limit_sizes,
+            objective.low / self._limit_sizes,
+            objective.high / self._limit_sizes,
             lambda: self.interrupted is not None,
         )
 
-    def hear(self, number: signal.Signals) -> None:
-        """Remembers the signal that ends the search."""
+    def interrupt(self, number: signal.Signals) -> None:
+        """Stores the first signal, which ends the search."""
         self.interrupted = self.interrupted or number
 
-    def _begin(self, begin: FloatArray) -> FloatArray:
-        values, run = self._asked_at(begin)
+    def _checked_values(self, guess: FloatArray) -> FloatArray:
+        """Cost and limits of the initial guess; raises if they are not finite."""
+        values, run = self._evaluated(guess)
         if run.failure is not None:
             raise run.failure
         if not np.isfinite(values).all():
-            names = ["the cost", *np.repeat(self._asked.names, self._asked.sizes)]
-            wrong = names[int(np.argmin(np.isfinite(values)))]
-            what = wrong if wrong == "the cost" else f"limit '{wrong}'"
-            raise ModelError(f"{what} is not finite with the values to begin with")
+            names = np.repeat(self._objective.names, self._objective.sizes)
+            labels = ["the cost", *(f"limit '{name}'" for name in names)]
+            wrong = labels[int(np.argmin(np.isfinite(values)))]
+            raise ModelError(f"{wrong} is not finite at the initial guess")
         return values
 
-    def _check(self, begin: FloatArray) -> tuple[FloatArray, list[int]]:
-        """The derivatives at the beginning, and the variables without effect."""
-        changes = self._changes(begin)
-        if not any(self._asked.reads(changes, only_cost=True)):
-            names = listed([one.name for one in self._variables] + [*self._extra])[1:-1]
+    def _checked_slopes(self, guess: FloatArray) -> tuple[FloatArray, list[int]]:
+        """The derivatives at the initial guess, and the indices of variables without effect."""
+        changes = self._changes(guess)
+        if not any(self._objective.reads(changes, only_cost=True)):
+            names = listed([variable.name for variable in self._variables] + self._extra)[1:-1]
             raise ModelError(f"the cost does not depend on what is free: {names}")
-        reads = self._asked.reads(changes, only_cost=False)
-        slopes = self._slopes_from(begin, changes)
+        reads = self._objective.reads(changes, only_cost=False)
+        slopes = self._slopes_from(guess, changes)
         if not np.isfinite(slopes).all():
             raise ModelError(
-                "cost or limits have no finite derivatives with the values to begin with, as of "
-                "the root of a number that is 0"
+                "cost or limits have no finite derivatives at the initial guess, for example a "
+                "square root at 0"
             )
         return slopes, [i for i, read in enumerate(reads) if not read]
 
-    def _asked_at(self, values: FloatArray) -> tuple[FloatArray, Rollout]:
-        """Cost and limits, not finite where the run fails."""
+    def _evaluated(self, values: FloatArray) -> tuple[FloatArray, Rollout]:
+        """Cost and limits, nan if the run fails, and the run."""
         key = values.tobytes()
-        if self._known is None or self._known[0] != key:
+        if self._last_run is None or self._last_run[0] != key:
             run = self._trials.run(values[: len(self._variables)])
-            found = np.full(1 + self._asked.values.numel(), np.nan)
+            results = np.full(1 + self._objective.values.numel(), np.nan)
             if run.failure is None:
-                signals = [run.record[name] for name in self._asked.signals]
-                found = self._asked.evaluate(values, *signals).full()[:, 0]
-            self._known = key, found, run
-            self._remember(values, found)
-        return self._known[1], self._known[2]
+                signals = [run.record[name] for name in self._objective.signals]
+                results = self._objective.evaluate(values, *signals).full()[:, 0]
+            self._last_run = key, results, run
+            self._update_best(values, results)
+        return self._last_run[1:]
 
-    def _remember(self, values: FloatArray, found: FloatArray) -> None:
-        """Keeps the best: the least cost where limits are met, or else the least violation."""
-        if not np.isfinite(found).all():
+    def _update_best(self, values: FloatArray, results: FloatArray) -> None:
+        """The best run has the least cost if it meets all limits, otherwise the least violation."""
+        if not np.isfinite(results).all():
             return
-        asked = self._asked
-        beyond = np.maximum(asked.low - found[1:], found[1:] - asked.high) / self._limit_sizes
+        objective, limited = self._objective, results[1:]
+        beyond = np.maximum(objective.low - limited, limited - objective.high) / self._limit_sizes
         worst = max(0.0, float(beyond.max(initial=0.0)))
-        rank = (worst if worst > MET else 0.0), float(found[0])
+        rank = (worst if worst > MET else 0.0), float(results[0])
         if self._best is None or rank < self._best[:2]:
             self._best = *rank, values.copy()
 
     def _changes(self, values: FloatArray) -> dict[str, FloatArray]:
-        """How the signals change with all variables, shapes (n, j, k)."""
-        count = len(self._variables)
-        found = self._trials.changes(values[:count], self._asked.signals)
-        none = len(self._extra)
+        """The derivatives of the signals by all variables, shapes (n, j, k)."""
+        changes = self._trials.changes(values[: len(self._variables)], self._objective.signals)
         return {
-            name: np.concatenate([each, np.zeros((none, *each.shape[1:]))])
-            for name, each in found.items()
+            name: np.concatenate([of_loop, np.zeros((len(self._extra), *of_loop.shape[1:]))])
+            for name, of_loop in changes.items()
         }
 
     def _slopes_from(self, values: FloatArray, changes: Mapping[str, FloatArray]) -> FloatArray:
-        _, run = self._asked_at(values)
-        signals = [run.record[name] for name in self._asked.signals]
-        stacked = [np.hstack([*changes[name]]) for name in self._asked.signals]
+        """The derivatives of cost and limits, from those of the signals."""
+        _, run = self._evaluated(values)
+        signals = [run.record[name] for name in self._objective.signals]
+        stacked = [np.hstack([*changes[name]]) for name in self._objective.signals]
         return self._tangents(values, *signals, np.eye(values.size), *stacked).full()
 
-    def _values(self, x: FloatArray) -> FloatArray:
-        found, _ = self._asked_at(x * self._sizes)
-        return found / self._scales
+    def _scaled_values(self, x: FloatArray) -> FloatArray:
+        return self._evaluated(x * self._sizes)[0] / self._scales
 
-    def _slopes(self, x: FloatArray) -> FloatArray:
-        # IPOPT asks for those of cost and limits one after the other.
-        if self._last is None or self._last[0] != x.tobytes():
+    def _scaled_slopes(self, x: FloatArray) -> FloatArray:
+        # IPOPT requests the derivatives of the cost and of the limits in two calls.
+        if self._last_slopes is None or self._last_slopes[0] != x.tobytes():
             values = x * self._sizes
-            found = self._slopes_from(values, self._changes(values))
-            self._last = x.tobytes(), found * self._sizes / self._scales[:, None]
-        return self._last[1]
+            slopes = self._slopes_from(values, self._changes(values))
+            self._last_slopes = x.tobytes(), slopes * self._sizes / self._scales[:, None]
+        return self._last_slopes[1]
 
-    @property
-    def _scales(self) -> FloatArray:
-        return np.concatenate([[self._cost_size], self._limit_sizes])
-
-    def optimum(self, context: Context, ended: IpoptResult) -> Optimum:
-        """The result."""
+    def optimum(self, context: Context, solution: IpoptResult) -> Optimum:
+        """The result of the search: IPOPT's solution if it converged, otherwise the best run."""
         assert self._best is not None
-        values = np.clip(ended.x * self._sizes, *self._bounds)
-        converged = ended.converged and self.interrupted is None
-        if not converged:
-            values = self._best[2]
-        found, run = self._asked_at(values)
-        count, asked = len(self._variables), self._asked
+        converged = solution.converged and self.interrupted is None
+        values = np.clip(solution.x * self._sizes, *self._bounds) if converged else self._best[2]
+        results, run = self._evaluated(values)
+        count, objective = len(self._variables), self._objective
         return Optimum(
-            self._trials.put(values[:count], context),
+            self._trials.context_with(values[:count], context),
             run,
             tuple(self._variables),
-            self._trials.shown(values[:count]),
+            self._trials.projected_values(values[:count]),
             dict(zip(self._extra, values[count:].tolist(), strict=True)),
-            float(self._first),
-            float(found[0]),
-            limit_states(asked.names, asked.sizes, found[1:], asked.low, asked.high),
-            ended.iterations,
+            float(self._first_cost),
+            float(results[0]),
+            limit_states(objective, results[1:]),
+            solution.iterations,
             self._trials.made,
             converged,
-            ended.status,
+            solution.status,
             tuple(self._variables[i].name for i in self._idle if i < count),
             self.interrupted,
         )

@@ -1,34 +1,39 @@
 """The result of an optimization, as values and as text."""
 
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis.tables import count_of
+from drake_dae.analysis.tables import Table, count_of
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.rollout import Rollout
+from drake_dae.studies.optimization.expressions import Objective
 from drake_dae.studies.optimization.variables import Variable
 
 ACTIVE = 1e-4
-"""A limit that is closer to its bound than this, relative to the bound, is active."""
+"""A limit is active if it is closer to its bound than this, relative to the bound."""
+
+MET = 1e-6
+"""A limit is met if it is beyond its bound by at most this, relative to the bound."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class LimitState:
-    """How a limit stands in a run.
+    """The state of a limit in a run: met, active or violated.
 
     Attributes:
-        name: Its name.
-        violation: By how much its worst entry is beyond its bound, in its unit; 0 if none is.
-        active: How many entries are at a bound.
-        entries: How many there are.
+        name: The name of the limit.
+        violation: The largest distance of an entry beyond its bound, in the unit of the limit; 0 if
+            all entries are within their bounds.
+        active: The number of entries at a bound.
+        entries: The number of all entries.
     """
 
     name: str
@@ -40,21 +45,21 @@ class LimitState:
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The best numbers of a loop that were found.
+    """The result of an optimization.
 
     Attributes:
-        context: The context with these numbers, at the start.
-        run: The run with them.
-        variables: What was free, with the values before.
-        values: The values that were found, shape (n,).
-        more: Name -> value of the variables of cost and limits alone.
-        cost_before, cost: The cost before and after.
-        limits: How each limit stands after.
-        iterations: How many iterations IPOPT made.
-        runs: How many runs were made.
+        context: A context of the loop with the best values, at the start time.
+        run: The run with the best values.
+        variables: The free variables, with their initial guess.
+        values: The best values, shape (n,).
+        more: Name -> best value of the further variables of cost and limits.
+        cost_before, cost: The cost with the initial guess and with the best values.
+        limits: The state of each limit with the best values.
+        iterations: The number of IPOPT's iterations.
+        runs: The number of runs.
         converged: Whether IPOPT converged: the values are a local optimum that meets all limits.
-        status: What IPOPT says, such as "Solve_Succeeded".
-        without_effect: The variables that neither cost nor limits depend on.
+        status: IPOPT's return status, such as "Solve_Succeeded".
+        without_effect: The variables without effect on cost and limits.
         interrupted: The signal that ended the search early; None if there was none.
     """
 
@@ -77,13 +82,13 @@ class Optimum:
         """The value of a variable.
 
         Raises:
-            ModelError: There is none of this name.
+            ModelError: There is no variable of this name.
         """
-        found = {v.name: float(x) for v, x in zip(self.variables, self.values, strict=True)}
-        found |= self.more
-        if name not in found:
-            raise ModelError(unknown_name("variable", name, found))
-        return found[name]
+        values = {v.name: float(x) for v, x in zip(self.variables, self.values, strict=True)}
+        values |= self.more
+        if name not in values:
+            raise ModelError(unknown_name("variable", name, values))
+        return values[name]
 
     @property
     def violated(self) -> tuple[str, ...]:
@@ -92,56 +97,56 @@ class Optimum:
 
     @property
     def active(self) -> tuple[str, ...]:
-        """The names of the limits that are active, and then of the variables at a bound."""
-        found = [limit.name for limit in self.limits if limit.active]
-        for one, value in zip(self.variables, self.values.tolist(), strict=True):
-            if min(value - one.low, one.high - value) <= ACTIVE * one.size:
-                found.append(one.name)
-        return tuple(found)
+        """The names of the active limits, followed by those of the variables at a bound."""
+        pairs = zip(self.variables, self.values.tolist(), strict=True)
+        at_bound = [
+            variable.name
+            for variable, value in pairs
+            if min(value - variable.low, variable.high - value) <= ACTIVE * variable.size
+        ]
+        return (*(limit.name for limit in self.limits if limit.active), *at_bound)
 
     def text(self) -> str:
         """The result as lines of text."""
-        rows: list[Sequence[str]] = [("variable", "before", "after", "from", "to", "unit")]
-        for one, value in zip(self.variables, self.values, strict=True):
-            numbers = (f"{x:.6g}" for x in (one.start, value, one.low, one.high))
-            rows.append((one.name, *numbers, one.unit))
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
-        return "\n".join([*lines, "", *self.remarks()])
+        head = ("variable", "before", "after", "from", "to", "unit")
+        rows = []
+        for variable, value in zip(self.variables, self.values, strict=True):
+            numbers = (variable.start, value, variable.low, variable.high)
+            rows.append((variable.name, *(f"{number:.6g}" for number in numbers), variable.unit))
+        return "\n".join([*Table(head, rows, left=len(head)).lines(), "", *self.remarks()])
 
     def remarks(self) -> list[str]:
-        """What is to be known about the values."""
+        """Sentences on cost, convergence, limits and variables without effect."""
         made = f"{count_of(self.iterations, 'iteration')}, {count_of(self.runs, 'run')}"
-        found = [f"Cost: {self.cost_before:.6g} before, {self.cost:.6g} after ({made})."]
+        remarks = [f"Cost: {self.cost_before:.6g} before, {self.cost:.6g} after ({made})."]
         if self.interrupted is not None:
-            found.append("The search was interrupted; this is the best so far.")
+            remarks.append("The search was interrupted; this is the best so far.")
         elif not self.converged:
-            found.append(f"IPOPT did not converge ({self.status}); this is the best so far.")
+            remarks.append(f"IPOPT did not converge ({self.status}); this is the best so far.")
         for limit in self.limits:
             if limit.violation > 0.0:
-                found.append(f"Limit {limit.name} is not met: beyond it by {limit.violation:.3g}.")
+                remarks.append(
+                    f"Limit {limit.name} is not met: beyond it by {limit.violation:.3g}."
+                )
         if self.violated and self.status == "Infeasible_Problem_Detected":
-            found.append(
+            remarks.append(
                 "No numbers near these meet all limits: give wider limits or bounds, or more free "
                 "variables."
             )
         if self.active:
-            found.append(f"Active: {listed(self.active, 20)[1:-1]}.")
+            remarks.append(f"Active: {listed(self.active, 20)[1:-1]}.")
         if self.without_effect:
             names = listed(self.without_effect, 20)[1:-1]
-            found.append(f"Without effect on cost and limits, left as before: {names}.")
-        return found
+            remarks.append(f"Without effect on cost and limits, left as before: {names}.")
+        return remarks
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values."""
         pairs = zip(self.variables, self.values.tolist(), strict=True)
         return {
             "variables": {
-                one.name: {"before": one.start, "after": value, "unit": one.unit}
-                for one, value in pairs
+                variable.name: {"before": variable.start, "after": value, "unit": variable.unit}
+                for variable, value in pairs
             },
             "more": dict(self.more),
             "cost": {"before": self.cost_before, "after": self.cost},
@@ -156,39 +161,28 @@ class Optimum:
         }
 
 
-def limit_states(
-    names: Sequence[str],
-    sizes: Sequence[int],
-    values: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-) -> tuple[LimitState, ...]:
-    """How limits stand.
+def limit_states(objective: Objective, values: FloatArray) -> tuple[LimitState, ...]:
+    """The states of all limits.
 
     Args:
-        names, sizes: As of `Objective`.
-        values, low, high: Their entries and bounds, shape (m,).
+        objective: The limits with their bounds.
+        values: The entries of all limits, shape (m,).
     """
-    found, first = [], 0
-    scale = limit_sizes(low, high)
+    low, high = objective.low, objective.high
     beyond = np.maximum(low - values, values - high)
-    for name, size in zip(names, sizes, strict=True):
-        own = slice(first, first + size)
+    relative = beyond / limit_sizes(low, high)
+    states, first = [], 0
+    for name, size in zip(objective.names, objective.sizes, strict=True):
+        worst = first + int(np.argmax(relative[first : first + size]))
+        violation = float(beyond[worst]) if relative[worst] > MET else 0.0
+        active = int(np.count_nonzero(relative[first : first + size] > -ACTIVE))
+        states.append(LimitState(name, violation, active, size))
         first += size
-        relative = beyond[own] / scale[own]
-        worst = int(np.argmax(relative))
-        violation = float(beyond[own][worst]) if relative[worst] > MET else 0.0
-        active = int(np.count_nonzero(relative > -ACTIVE))
-        found.append(LimitState(name, violation, active, size))
-    return tuple(found)
-
-
-MET = 1e-6
-"""A limit that is beyond its bound by less than this, relative to the bound, is met."""
+    return tuple(states)
 
 
 def limit_sizes(low: FloatArray, high: FloatArray) -> FloatArray:
-    """How large the entries of limits are: their larger bound, or 1 where it is 0."""
-    bounds = [np.where(np.isfinite(each), np.abs(each), 0.0) for each in (low, high)]
-    found = np.maximum(*bounds)
-    return np.where(found > 0.0, found, 1.0)
+    """The sizes of the entries of limits: the larger absolute bound, or 1 if that is 0."""
+    bounds = [np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (low, high)]
+    sizes = np.maximum(*bounds)
+    return np.where(sizes > 0.0, sizes, 1.0)

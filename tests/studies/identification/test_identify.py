@@ -80,7 +80,8 @@ def test_derivatives_are_those_of_differences(kind):
     driven = DrivenPlant(loop, context, measured_ports(loop), places)
     data = measured(record, driven, "record")
     biases = np.array([-1] * (len(data.channels) - 1) + [0])
-    pieces = RecordPieces(driven, data, biases, 1, parts).first(40)
+    delays = np.full(len(data.channels), -1)
+    pieces = RecordPieces(driven, data, biases, delays, 1, parts).first(40)
     x, theta = pieces.first_states, np.append(driven.nominal, 0.3)
     found = pieces.slopes(x, theta)
     n = x.shape[1]
@@ -227,15 +228,15 @@ def test_what_a_record_does_not_determine_is_told_by_name():
     assert found.to_dict()["parameters"]["wall.position[1]"]["interval"] is None
 
 
-def test_what_is_left_is_compared_with_the_noise_that_is_stated():
+def test_errors_are_compared_with_the_stated_noise():
     settings = (*SAMPLED, "encoders={position_noise: 1e-4}")
     loop, context, record = run_of((), *settings)
     text = identify(loop, context, [record], ["link2.mass"]).text()
-    assert "times the noise that is stated" not in text
+    assert "times the stated noise" not in text
     less = noisy(record, 3, [("estimated_state", slice(0, 2), 2e-4)])
     text = identify(loop, context, [less], ["link2.mass"]).text()
     # sqrt(1 + 4) = 2.24 times, from 800 values within 2.5 %
-    found = re.search(r"What is left of estimated_state is (\S+) times the noise", text)
+    found = re.search(r"The errors of estimated_state are (\S+) times the stated noise", text)
     assert found is not None
     assert float(found[1]) == pytest.approx(2.24, rel=0.1)
 

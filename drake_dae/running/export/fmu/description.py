@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 from drake_dae.dae.system.signals import Signal
+from drake_dae.running.export.steps.cuts import CONTROL
 from drake_dae.running.export.steps.parts import CONTROLLER, WrittenPart
 from drake_dae.running.export.steps.words import distinct, identifiers
 
 NEVER, AT_FIRST, ALWAYS = "NEVER", "AT_FIRST", "ALWAYS"
-"""When a variable may be set: the names of fmi3.c."""
+"""The times at which a variable may be set, as constants of fmi3.c."""
 
 BASES = {
     "kg": {"kg": 1},
@@ -25,7 +26,7 @@ BASES = {
     "H": {"kg": 1, "m": 2, "s": -2, "A": -2},
     "1": {},
 }
-"""Units of signals in those of SI."""
+"""Unit of a signal -> exponents of SI base units."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,10 @@ class FmuVariable:
     """A variable of an FMU.
 
     Attributes:
-        signal: Its name and unit.
-        causality, variability: As FMI 3.0 has them.
-        start: Its start value; None for what is computed.
-        text: What it is, where its name does not say so.
+        signal: Name and unit.
+        causality, variability: The attributes of FMI 3.0.
+        start: The start value; None for computed variables.
+        text: A description; empty if the name suffices.
     """
 
     signal: Signal
@@ -48,12 +49,12 @@ class FmuVariable:
 
 @dataclass(frozen=True)
 class FmuVariableGroup:
-    """Variables that follow each other in the memory of an FMU.
+    """Variables that are adjacent in the memory of an FMU.
 
     Attributes:
-        variables: They.
-        place: Where the first one is in Data of fmi3.c, an expression of C.
-        when: When they may be set.
+        variables: The variables, in memory order.
+        place: The C expression of the first variable's offset in the struct Data of fmi3.c.
+        when: NEVER, AT_FIRST or ALWAYS: when they may be set.
         kind: "Float64" or "Int32".
     """
 
@@ -65,78 +66,55 @@ class FmuVariableGroup:
 
 def groups_of(written: WrittenPart) -> list[FmuVariableGroup]:
     """The variables of a controller or a plant."""
-    own = f"own.{written.kind}"
-    is_controller = written.kind == CONTROLLER
-
-    def group(
-        place: str, when: str, variables: Iterable[FmuVariable], kind: str = "Float64"
-    ) -> FmuVariableGroup:
-        return FmuVariableGroup(list(variables), place, when, kind)
-
-    values = zip(written.parameters, written.values.tolist(), strict=True)
-    parameters = [FmuVariable(signal, "parameter", "tunable", value) for signal, value in values]
-    starts = written.inputs.tolist()
-    inputs = [
-        FmuVariable(signal, "input", "continuous", start)
-        for signal, start in zip(_named(written.part.inputs), starts, strict=True)
-    ]
-    kind = "discrete" if is_controller else "continuous"
-    outputs = [FmuVariable(signal, "output", kind) for signal in _named(written.part.outputs)]
-    found = [group(_at(f"{own}.parameters"), ALWAYS, parameters)]
+    own, is_controller = f"own.{written.kind}", written.kind == CONTROLLER
+    starts = zip(_named(written.part.inputs), written.inputs.tolist(), strict=True)
+    inputs = [FmuVariable(signal, "input", "continuous", start) for signal, start in starts]
+    variability = "discrete" if is_controller else "continuous"
+    outputs = [FmuVariable(s, "output", variability) for s in _named(written.part.outputs)]
+    parameters = _tunable(written.parameters, written.values.tolist())
+    groups = [FmuVariableGroup(parameters, _at(f"{own}.parameters"), ALWAYS)]
     if is_controller:
-        controls = [
-            Signal(f"stop_{s.name}", s.unit) for s in _named({"control": _control(written)})
-        ]
-        settings = {"stop_time": ("s", 0.1), "max_age": ("s", 1.5 * written.part.ticks.period)}
-        age = Signal("measurement_age", "s")
-        patience = FmuVariable(
-            Signal("patience"), "parameter", "tunable", 10, "bad steps until it stops"
-        )
-        found += [
-            group(
-                _at(f"{own}.stop_control"),
-                ALWAYS,
-                [FmuVariable(signal, "parameter", "tunable", 0.0) for signal in controls],
-            ),
-            *(
-                group(
-                    _at(f"{own}.{name}"),
-                    ALWAYS,
-                    [FmuVariable(Signal(name, unit), "parameter", "tunable", value)],
-                )
-                for name, (unit, value) in settings.items()
-            ),
-            group(f"{_at('own.in.measured_at')} + sizeof(double)", ALWAYS, inputs),
-            group(_at("own.age"), ALWAYS, [FmuVariable(age, "input", "continuous", 0.0)]),
-            group(_at("own.out"), NEVER, outputs),
-            group(_at(f"{own}.patience"), ALWAYS, [patience], "Int32"),
-            group(_at("own.out.status"), NEVER, _told(), "Int32"),
+        controls = _named({CONTROL: written.part.outputs[CONTROL]})
+        stop = _tunable([Signal(f"stop_{s.name}", s.unit) for s in controls], [0.0] * len(controls))
+        stop_time = _tunable([Signal("stop_time", "s")], [0.1])
+        max_age = _tunable([Signal("max_age", "s")], [1.5 * written.part.ticks.period])
+        age = FmuVariable(Signal("measurement_age", "s"), "input", "continuous", 0.0)
+        text = "bad steps until it stops"
+        patience = FmuVariable(Signal("patience"), "parameter", "tunable", 10, text)
+        groups += [
+            FmuVariableGroup(stop, _at(f"{own}.stop_control"), ALWAYS),
+            FmuVariableGroup(stop_time, _at(f"{own}.stop_time"), ALWAYS),
+            FmuVariableGroup(max_age, _at(f"{own}.max_age"), ALWAYS),
+            FmuVariableGroup(inputs, f"{_at('own.in.measured_at')} + sizeof(double)", ALWAYS),
+            FmuVariableGroup([age], _at("own.age"), ALWAYS),
+            FmuVariableGroup(outputs, _at("own.out"), NEVER),
+            FmuVariableGroup([patience], _at(f"{own}.patience"), ALWAYS, "Int32"),
+            FmuVariableGroup(_reports(), _at("own.out.status"), NEVER, "Int32"),
         ]
     else:
         states = zip(written.states, written.start.tolist(), strict=True)
-        size = f"sizeof(double) * {len(parameters)}"
-        found += [
-            group(f"{_at(f'{own}.parameters')} + {size}", ALWAYS, inputs),
-            group(
-                _at("own.start"),
-                AT_FIRST,
-                [
-                    FmuVariable(Signal(f"start.{s.name}", s.unit), "parameter", "fixed", value)
-                    for s, value in states
-                ],
-            ),
-            group(
-                _at(f"{own}.longest"),
-                ALWAYS,
-                [FmuVariable(Signal("step", "s"), "parameter", "tunable", written.longest)],
-            ),
-            group(_at(f"{own}.row"), NEVER, outputs),
+        start = [
+            FmuVariable(Signal(f"start.{s.name}", s.unit), "parameter", "fixed", value)
+            for s, value in states
         ]
-    return _distinct([each for each in found if each.variables])
+        behind = f"{_at(f'{own}.parameters')} + sizeof(double) * {len(parameters)}"
+        step = _tunable([Signal("step", "s")], [written.longest])
+        groups += [
+            FmuVariableGroup(inputs, behind, ALWAYS),
+            FmuVariableGroup(start, _at("own.start"), AT_FIRST),
+            FmuVariableGroup(step, _at(f"{own}.longest"), ALWAYS),
+            FmuVariableGroup(outputs, _at(f"{own}.row"), NEVER),
+        ]
+    return _distinct([group for group in groups if group.variables])
+
+
+def _tunable(signals: Iterable[Signal], values: Iterable[float]) -> list[FmuVariable]:
+    pairs = zip(signals, values, strict=True)
+    return [FmuVariable(signal, "parameter", "tunable", value) for signal, value in pairs]
 
 
 def ranges(groups: Sequence[FmuVariableGroup], kind: str) -> str:
-    """The rows of a table of fmi3.c. Value references count all variables, 0 is the time."""
+    """C code of a table of fmi3.c. Value references number all variables; 0 is the time."""
     first, rows = 1, []
     for group in groups:
         if group.kind == kind:
@@ -154,17 +132,17 @@ def model_description(
     step: float,
     about: str,
 ) -> str:
-    """modelDescription.xml.
+    """Returns the text of modelDescription.xml.
 
     Args:
         groups: The variables.
-        name: Of the model.
-        identifier: The same in C.
-        token: By which the description and the binary know each other.
-        step: Of the FMU, in s.
-        about: What it is.
+        name: The name of the model.
+        identifier: The name of the model as a C identifier.
+        token: The instantiation token, equal in the description and in the binary.
+        step: The internal step of the FMU, in s.
+        about: A description of the model.
     """
-    variables = [(each, group) for group in groups for each in group.variables]
+    variables = [(variable, group) for group in groups for variable in group.variables]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<fmiModelDescription fmiVersion="3.0" modelName={quoteattr(name)} '
@@ -175,7 +153,7 @@ def model_description(
         'canSerializeFMUState="true" providesIntermediateUpdate="false" hasEventMode="false"'
         f' fixedInternalStepSize="{step!r}"/>',
         "  <UnitDefinitions>",
-        *_units({each.signal.unit for each, _ in variables} | {"s"}),
+        *_units({variable.signal.unit for variable, _ in variables} | {"s"}),
         "  </UnitDefinitions>",
         '  <LogCategories><Category name="logStatusError"/></LogCategories>',
         f'  <DefaultExperiment stepSize="{step!r}"/>',
@@ -184,19 +162,20 @@ def model_description(
         'variability="continuous" unit="s"/>',
     ]
     outputs = []
-    for reference, (each, group) in enumerate(variables, 1):
+    for reference, (variable, group) in enumerate(variables, 1):
+        signal, causality = variable.signal, variable.causality
         initial = {"input": "", "output": ' initial="calculated"'}.get(
-            each.causality, ' initial="exact"'
+            causality, ' initial="exact"'
         )
-        unit = f" unit={quoteattr(each.signal.unit)}" if each.signal.unit else ""
-        text = f" description={quoteattr(each.text)}" if each.text else ""
-        start = "" if each.start is None else f' start="{each.start!r}"'
+        unit = f" unit={quoteattr(signal.unit)}" if signal.unit else ""
+        text = f" description={quoteattr(variable.text)}" if variable.text else ""
+        start = "" if variable.start is None else f' start="{variable.start!r}"'
         lines.append(
-            f'    <{group.kind} name={quoteattr(each.signal.name)} valueReference="{reference}" '
-            f'causality="{each.causality}" variability="{each.variability}"{initial}{unit}'
+            f'    <{group.kind} name={quoteattr(signal.name)} valueReference="{reference}" '
+            f'causality="{causality}" variability="{variable.variability}"{initial}{unit}'
             f"{start}{text}/>"
         )
-        if each.causality == "output":
+        if causality == "output":
             outputs.append(reference)
     lines += [
         "  </ModelVariables>",
@@ -211,8 +190,8 @@ def model_description(
 
 
 def exponents(unit: str) -> dict[str, int] | None:
-    """A unit such as "N m/s^2" or "m/(N s)" in those of SI; None for what it does not know."""
-    found = dict[str, int]()
+    """The SI exponents of a unit such as "N m/s^2" or "m/(N s)"; None for an unknown unit."""
+    total = dict[str, int]()
     for index, side in enumerate(unit.split("/")):
         for word in side.strip("()").split():
             base, _, power = word.partition("^")
@@ -220,16 +199,16 @@ def exponents(unit: str) -> dict[str, int] | None:
                 return None
             for key, exponent in BASES[base].items():
                 sign = -1 if index else 1
-                found[key] = found.get(key, 0) + sign * exponent * int(power or 1)
-    return {key: exponent for key, exponent in found.items() if exponent}
+                total[key] = total.get(key, 0) + sign * exponent * int(power or 1)
+    return {key: exponent for key, exponent in total.items() if exponent}
 
 
 def _units(units: Iterable[str]) -> list[str]:
     lines = []
     for unit in sorted(set(units) - {""}):
-        known = exponents(unit)
-        base = "".join(f' {key}="{value}"' for key, value in (known or {}).items())
-        inner = "" if known is None else f"<BaseUnit{base}/>"
+        powers = exponents(unit)
+        base = "".join(f' {key}="{value}"' for key, value in (powers or {}).items())
+        inner = "" if powers is None else f"<BaseUnit{base}/>"
         lines.append(f"    <Unit name={quoteattr(unit)}>{inner}</Unit>")
     return lines
 
@@ -239,20 +218,17 @@ def _at(member: str) -> str:
 
 
 def _named(vectors: Mapping[str, Sequence[Signal]]) -> list[Signal]:
-    """The entries of vectors as `vector.entry`, in the order of C."""
-    given = {name: tuple(signals) for name, signals in vectors.items()}
+    """The entries of vectors with the names "vector.entry", in memory order."""
+    tuples = {name: tuple(signals) for name, signals in vectors.items()}
     return [
         Signal(f"{name}.{signal.name}", signal.unit)
-        for name, signals in identifiers(given).items()
+        for name, signals in identifiers(tuples).items()
         for signal in signals
     ]
 
 
-def _control(written: WrittenPart) -> Sequence[Signal]:
-    return written.part.outputs["control"]
-
-
-def _told() -> list[FmuVariable]:
+def _reports() -> list[FmuVariable]:
+    """The outputs of a controller about its inputs."""
     texts = {
         "status": "0 running, 1 holding, 2 stopped, 3 waiting for the first good inputs",
         "fault": "0 none, 1 no number, 2 stale, 3 late, 4 clock, 5 the law has no value",
@@ -264,10 +240,10 @@ def _told() -> list[FmuVariable]:
 
 
 def _distinct(groups: Sequence[FmuVariableGroup]) -> list[FmuVariableGroup]:
-    """The same groups, in which no name comes twice."""
-    signals = [Signal("time"), *(each.signal for group in groups for each in group.variables)]
-    names = iter(distinct(signals)[1:])
+    """Returns the groups with unique names of variables."""
+    signals = [variable.signal for group in groups for variable in group.variables]
+    names = iter(distinct([Signal("time"), *signals])[1:])
     return [
-        replace(group, variables=[replace(each, signal=next(names)) for each in group.variables])
+        replace(group, variables=[replace(old, signal=next(names)) for old in group.variables])
         for group in groups
     ]

@@ -4,11 +4,9 @@ import platform
 import tempfile
 import uuid
 import zipfile
-from importlib.metadata import version
 from pathlib import Path
 from string import Template
 
-import casadi as ca
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
@@ -25,14 +23,14 @@ from drake_dae.running.export.steps.parts import (
     WrittenPart,
     parts_of_loop,
 )
-from drake_dae.running.export.steps.words import file_of, prefix_of
-from drake_dae.running.export.text import comment, written
+from drake_dae.running.export.steps.words import common_words, file_of, prefix_of
+from drake_dae.running.export.text import written
 from drake_dae.trace.compiler import find_compiler
 
 TEMPLATES = Path(__file__).parent / "c99"
 
 LEVEL, PATIENCE = "-O1", 600.0
-"""How the binary is compiled, and how long at most, in s."""
+"""The optimization level of the binary, and the longest time to compile it, in s."""
 
 ABOUT = {
     PLANT: "A plant with its sensors, in fixed steps. Its outputs do not follow its inputs before "
@@ -52,17 +50,17 @@ def export_fmu(
 ) -> Export:
     """Writes name_controller.fmu and name_plant.fmu, for co-simulation by FMI 3.0.
 
-    They have names, units and start values of all variables, their sources in C99, and a binary for
-    this machine. Outputs of the plant have the names of the controller's inputs. A part that cannot
-    be exported is left out, and without a C compiler the binary.
+    The FMUs contain names, units and start values of all variables, sources in C99, and a binary
+    for this machine. The controller's inputs have the names of the plant's outputs. A part that
+    cannot be exported is left out; without a C compiler, the binaries are left out.
 
     Args:
         loop: The closed loop, or any diagram with one `Plant`.
         context: Its context at the start; not changed.
-        name: What the files are called.
-        folder: Where to write; made if there is none.
-        config: Drake's settings, whose fixed steps the plant takes; where they have error control,
-            and for None, steps of at most 1 ms by `runge_kutta5`.
+        name: The name of the files.
+        folder: The folder to write to; created if it does not exist.
+        config: Drake's settings with the fixed steps of the plant. If they have error control, or
+            for None, the steps are at most 1 ms by `runge_kutta5`.
 
     Raises:
         ModelError: No part can be exported, or the fixed steps are of an implicit method.
@@ -71,36 +69,31 @@ def export_fmu(
     parts, left_out = parts_of_loop(loop, context, (CONTROLLER, PLANT))
     files, folder = [], Path(folder)
     for kind, part in parts.items():
-        with tempfile.TemporaryDirectory() as place:
-            sources = Path(place) / "sources"
+        with tempfile.TemporaryDirectory() as temporary:
+            content = Path(temporary)
+            sources = content / "sources"
             if kind == CONTROLLER:
-                found = write_controller(part, context, name, sources)
+                source = write_controller(part, context, name, sources)
             else:
-                found = write_integrated(part, kind, context, name, sources, config)
-            _write_fmu(found, name, Path(place))
+                source = write_integrated(part, kind, context, name, sources, config)
+            _write_fmu(source, name, content)
             try:
-                _compile(found, name, Path(place))
+                _compile(source, name, content)
             except MachineCodeError as error:
                 left_out.append(f"a binary of the {kind}, of which there are sources: {error}")
             folder.mkdir(parents=True, exist_ok=True)
-            files.append(_packed(Path(place), folder / f"{file_of(name)}_{kind}.fmu"))
+            files.append(_packed(content, folder / f"{file_of(name)}_{kind}.fmu"))
     return Export(files, left_out)
 
 
-def _write_fmu(found: WrittenPart, name: str, place: Path) -> None:
-    """Writes the glue, both descriptions and the terms."""
-    prefix, file, kind = prefix_of(name), file_of(name), found.kind
-    groups, identifier = groups_of(found), f"{prefix}_{found.kind}"
-    text = found.files[1].read_text(encoding="utf-8")
+def _write_fmu(part: WrittenPart, name: str, content: Path) -> None:
+    """Writes fmi3.c, both descriptions and the license."""
+    kind, groups = part.kind, groups_of(part)
+    identifier = f"{prefix_of(name)}_{kind}"
+    text = part.files[1].read_text(encoding="utf-8")
     token = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{groups}{text}"))
-    words = {
-        "title": comment(name),
-        "name": file,
+    words = common_words(name) | {
         "kind": kind,
-        "version": version("drake_dae"),
-        "casadi": ca.__version__,
-        "prefix": prefix,
-        "guard": prefix.upper(),
         "token": token,
         "floats": ranges(groups, "Float64"),
         "integers": ranges(groups, "Int32"),
@@ -108,22 +101,22 @@ def _write_fmu(found: WrittenPart, name: str, place: Path) -> None:
         "identifier": identifier,
     }
     for key, template in (("own", f"{kind}.c"), ("functions", f"{kind}_functions.c")):
-        given = Template((TEMPLATES / template).read_text(encoding="utf-8"))
-        words[key] = given.substitute(words)
-    written(TEMPLATES, place / "sources", {"fmi3.c": _glue(name, kind)}, words)
+        template_text = Template((TEMPLATES / template).read_text(encoding="utf-8"))
+        words[key] = template_text.substitute(words)
+    written(TEMPLATES, content / "sources", {"fmi3.c": _glue(name, kind)}, words)
     names = {"buildDescription.xml": "buildDescription.xml"}
-    words["source"] = found.files[1].name
+    words["source"] = part.files[1].name
     words["glue"] = _glue(name, kind)
-    written(TEMPLATES, place / "sources", names, words)
-    terms = place / "documentation" / "licenses"
+    written(TEMPLATES, content / "sources", names, words)
+    terms = content / "documentation" / "licenses"
     written(COMMON, terms, {"LICENSE.txt": "license.txt"}, words)
-    step = found.longest or found.part.ticks.period
+    step = part.longest or part.part.ticks.period
     about = model_description(groups, f"{name}_{kind}", identifier, token, step, ABOUT[kind])
-    (place / "modelDescription.xml").write_text(about, encoding="utf-8")
+    (content / "modelDescription.xml").write_text(about, encoding="utf-8")
 
 
-def _compile(found: WrittenPart, name: str, place: Path) -> None:
-    """Makes the binary for this machine.
+def _compile(part: WrittenPart, name: str, content: Path) -> None:
+    """Compiles the binary for this machine.
 
     Raises:
         MachineCodeError: There is no compiler, or it fails.
@@ -133,18 +126,18 @@ def _compile(found: WrittenPart, name: str, place: Path) -> None:
     suffix = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}.get(system or "")
     if suffix is None:
         raise MachineCodeError(f"FMI has no name for binaries of {platform.system()}")
-    folder = place / "binaries" / f"{machine}-{system}"
+    folder = content / "binaries" / f"{machine}-{system}"
     folder.mkdir(parents=True)
-    sources = [found.files[1], place / "sources" / _glue(name, found.kind)]
-    library = folder / f"{prefix_of(name)}_{found.kind}{suffix}"
+    sources = [part.files[1], content / "sources" / _glue(name, part.kind)]
+    library = folder / f"{prefix_of(name)}_{part.kind}{suffix}"
     find_compiler().link(sources, library, LEVEL, PATIENCE)
 
 
-def _packed(place: Path, target: Path) -> Path:
-    """All files of a folder as a zip file, to the bit the same for the same files."""
+def _packed(content: Path, target: Path) -> Path:
+    """Packs a folder into a zip file; equal files give equal bytes."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(path for path in place.rglob("*") if path.is_file()):
-            entry = zipfile.ZipInfo(path.relative_to(place).as_posix())
+        for path in sorted(path for path in content.rglob("*") if path.is_file()):
+            entry = zipfile.ZipInfo(path.relative_to(content).as_posix())
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(entry, path.read_bytes())
     return target

@@ -1,8 +1,7 @@
-"""The parts of a loop that are exported by themselves: controller, plant, and all of it."""
+"""The parts of a loop that can be exported: the controller, the plant, and the whole loop."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from pydrake.systems.framework import Context, Diagram, OutputPort
 
@@ -26,19 +25,19 @@ from drake_dae.running.rollout.program import program_of
 from drake_dae.systems.plants.contract import Plant
 
 NEVER = Ticks(0.0)
-"""Of a part that steps whenever it is asked to."""
+"""The ticks of a part without sample instants."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedPart:
-    """A part of a loop that is exported by itself.
+    """A part of a loop for an export.
 
     Attributes:
-        compiled: Its functions; its inputs are the last of the parameters.
-        inputs, outputs: Names and units of what it reads and shows.
-        ticks: When a controller steps.
-        acts_at_once: Whether its control depends on what is measured in the same instant; else it
-            is held, and changes by the updates of an instant.
+        compiled: The functions of the part; its inputs are the last entries of the parameters.
+        inputs, outputs: Name of a port -> names and units of its entries.
+        ticks: The sample instants of a controller.
+        acts_at_once: Whether the control has direct feedthrough from the measurements. Otherwise
+            the control is a discrete state, which changes only by updates.
     """
 
     compiled: CompiledDiagram
@@ -49,17 +48,17 @@ class ExportedPart:
 
 
 def controller_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPart:
-    """All that leads from what a plant and its sensors show to the plant's control.
+    """Returns the controller: all blocks between measurements and the plant's control.
 
-    That is the law, the references, observers, integrals, samples, delays, limits, and any block of
-    a user between. Sensors are parts of the machine: what they show are inputs.
+    These are the law, references, observers, integrals, samplers, delays, limits, and any user
+    blocks between them. Sensors belong to the machine: their outputs are inputs of the controller.
 
     Args:
         loop: The loop, or any diagram with one `Plant`.
         context: Its context at the start.
 
     Raises:
-        ModelError: There is not one plant, or the controller has no steps: why.
+        ModelError: There is not exactly one plant, or the controller cannot run in discrete steps.
     """
     diagram, plant = _diagram_and_plant(loop)
     wires, measured = Wires.of(diagram), measured_ports(diagram, plant)
@@ -89,15 +88,15 @@ def controller_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPar
 
 
 def plant_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPart:
-    """The plant of a loop with its sensors, whose input is the control.
+    """Returns the plant of a loop with its sensors; the input is the control.
 
-    Its outputs have the names of the controller's inputs, among others.
+    The outputs include all inputs of the controller, under the same names.
 
     Args:
-        loop, context: As of `controller_part`.
+        loop, context: As in `controller_part`.
 
     Raises:
-        ModelError: There is not one plant, or it changes as no function of the time does: why.
+        ModelError: There is not exactly one plant, or it has events, Drake's contact or noise.
     """
     diagram, plant = _diagram_and_plant(loop)
     wires, inputs = Wires.of(diagram), {}
@@ -120,14 +119,14 @@ def plant_part(loop: ClosedLoop | Diagram, context: Context) -> ExportedPart:
 def loop_part(
     loop: ClosedLoop | Diagram, context: Context, further: Sequence[str] = ()
 ) -> ExportedPart:
-    """A loop as a whole, which has no inputs. Its outputs are those of the record.
+    """Returns the whole loop, which has no inputs; the outputs are the signals of the record.
 
     Args:
-        loop, context: As of `controller_part`; a diagram may have any number of plants.
-        further: Names of output ports of a loop's diagram that are outputs as well.
+        loop, context: As in `controller_part`; a diagram may have any number of plants.
+        further: Names of output ports of a loop's diagram that become outputs, too.
 
     Raises:
-        ModelError: It changes as no function of the time does: why.
+        ModelError: The loop has events, Drake's contact or noise.
     """
     if further and not isinstance(loop, Diagram):
         compiled = compile_diagram(loop.diagram, [*loop.signals, *further])
@@ -180,14 +179,13 @@ def _diagram_and_plant(loop: ClosedLoop | Diagram) -> tuple[Diagram, Plant]:
     return loop.diagram, loop.plant
 
 
-def _check_time(compiled: CompiledDiagram, what: str) -> None:
-    """Refuses what is no function of the time, the state and the inputs.
+def check_events(compiled: CompiledDiagram, what: str) -> None:
+    """Checks that a part has no events of contacts or phases, and not Drake's own contact.
 
     Raises:
-        ModelError: Contacts open, phases end, Drake steps something, or random numbers are drawn.
+        ModelError: The part has one of them.
     """
-    changing = [*compiled.guards, *compiled.watched]
-    if changing:
+    if changing := [*compiled.guards, *compiled.watched]:
         raise ModelError(
             f"{what} changes at moments that a run has to find, as where a contact opens or a "
             f"phase ends ('{changing[0].system.get_name()}'): no export knows it; a rollout does"
@@ -197,6 +195,11 @@ def _check_time(compiled: CompiledDiagram, what: str) -> None:
             f"{what} has Drake's own contact ('{compiled.stepped[1].system.get_name()}'), which no "
             "export knows; a rollout does. Export one with an ideal plant"
         )
+
+
+def _check_time(compiled: CompiledDiagram, what: str) -> None:
+    """Checks that a part has neither events nor Drake's own contact nor noise."""
+    check_events(compiled, what)
     if compiled.noise:
         raise ModelError(
             f"{what} draws random numbers ('{compiled.noise[0].system.get_name()}'), which no "
@@ -205,39 +208,32 @@ def _check_time(compiled: CompiledDiagram, what: str) -> None:
 
 
 def _check_steps(compiled: CompiledDiagram) -> None:
-    """Refuses what a step does not know.
+    """Checks that a controller can run in discrete steps.
 
     Raises:
         ModelError: A block of the controller has a continuous state, phases or random numbers.
     """
-    reasons: dict[str, tuple[Sequence[Any], Callable[[str], str]]] = {
-        "state": (
+    phases = (*compiled.guards, *compiled.watched)
+    for places, reason in (
+        (
             compiled.states,
-            lambda name: (
-                f"'{name}' has a continuous state, as integrals of a law without samples: "
-                "give the loop a sampling, in a scenario `sampling: {period: 0.001}`"
-            ),
+            "has a continuous state, as integrals of a law without samples: give the loop a "
+            "sampling, in a scenario `sampling: {period: 0.001}`",
         ),
-        "phases": (
-            (*compiled.guards, *compiled.watched),
-            lambda name: f"'{name}' leads through phases in Python, which no C has; a rollout does",
-        ),
-        "noise": (
+        (phases, "leads through phases in Python, which no C has; a rollout does"),
+        (
             compiled.noise,
-            lambda name: (
-                f"'{name}' draws random numbers, which are none of a controller's: leave "
-                "it out, or put it behind a sensor"
-            ),
+            "draws random numbers, which are none of a controller's: leave it out, or put it "
+            "behind a sensor",
         ),
-    }
-    for places, text in reasons.values():
+    ):
         if places:
-            raise ModelError(text(places[0].system.get_name()))
+            raise ModelError(f"'{places[0].system.get_name()}' {reason}")
 
 
 def _known_signals(loop: ClosedLoop | Diagram, plant: Plant) -> dict[str, tuple[Signal, ...]]:
     dae = plant.dae
-    found: dict[str, Sequence[Signal]] = {
+    signals: dict[str, Sequence[Signal]] = {
         "state": dae.state_signals,
         "estimated_state": dae.state_signals,
         "constraint_force": dae.force_signals,
@@ -248,11 +244,12 @@ def _known_signals(loop: ClosedLoop | Diagram, plant: Plant) -> dict[str, tuple[
         **plant.further_signals,
         **({} if isinstance(loop, Diagram) else loop.signals),
     }
-    return {name: tuple(signals) for name, signals in found.items()}
+    return {name: tuple(entries) for name, entries in signals.items()}
 
 
 def _signals(known: Mapping[str, tuple[Signal, ...]], name: str, size: int) -> tuple[Signal, ...]:
-    found = known.get(name, ())
-    if len(found) == size:
-        return found
+    """The known signals of a port if their number is right, otherwise numbered ones."""
+    signals = known.get(name, ())
+    if len(signals) == size:
+        return signals
     return tuple(Signal(f"{name}[{i}]") for i in range(size))

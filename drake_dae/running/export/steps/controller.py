@@ -1,24 +1,23 @@
-"""The whole controller of a loop as one step in C99, and as a class of C++."""
+"""The whole controller of a loop as one step function in C99, and as a C++ class."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib.metadata import version
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import casadi as ca
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
+from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import ExportedPart, controller_part
 from drake_dae.running.export.steps.cuts import CONTROL
 from drake_dae.running.export.steps.parts import CONTROLLER, WrittenPart, defaults
 from drake_dae.running.export.steps.played import played_run
+from drake_dae.running.export.steps.ticks import Ticks
 from drake_dae.running.export.steps.words import (
-    called,
+    GeneratedFunctions,
+    common_words,
     file_of,
     identifiers,
     members,
@@ -28,14 +27,13 @@ from drake_dae.running.export.steps.words import (
     prefix_of,
     updates,
 )
-from drake_dae.running.export.text import braced, comment, generated, string, written
-from drake_dae.trace.compiled import without_branches
+from drake_dae.running.export.text import braced, string, written
 
 TEMPLATES = Path(__file__).parent / "c99"
 COMMON = TEMPLATES.parents[1] / "c99"
 
-STEPS = 2000
-"""At most so many steps has the run that the program plays."""
+MOST_PLAYED = 2000
+"""The largest number of steps of the run in the test program."""
 
 
 @checked(ModelError)
@@ -47,39 +45,41 @@ def export_controller(
     config: SimulatorConfig | None = None,
     duration: float = 2.0,
 ) -> list[Path]:
-    """Writes the whole controller of a loop as one step of C99, with a class of C++ over it.
+    """Writes the whole controller of a loop as one step function in C99, with a C++ class.
 
-    It has the law, references, observer, integrals, samples, delays and limits: all that leads from
-    what plant and sensors show to the control. name_controller.h says what it does with inputs that
-    are not numbers, too old or too late. The program play_name.c plays a run of Drake's Simulator,
-    name_run.csv, to it, compares, and takes the time of a step.
+    The controller consists of all blocks between measurements and control: law, references,
+    observer, integrals, samplers, delays and limits. name_controller.h describes the reaction to
+    inputs that are not finite, too old or too late. The program play_name.c feeds a recorded run of
+    Drake's Simulator, name_run.csv, to the controller, compares its outputs, and measures the time
+    of a step.
 
     Args:
         loop: The closed loop, or any diagram with one `Plant`.
         context: Its context at the start; not changed.
-        name: What the files are called, and, in letters that C takes, the functions.
-        folder: Where to write; made if there is none.
-        config: Drake's settings for the run; its defaults if None.
-        duration: How long that run is at most, in s. It has at most 2000 steps.
+        name: The name of the files, and, as a C identifier, the prefix of the functions.
+        folder: The folder to write to; created if it does not exist.
+        config: Drake's settings of the run; None for defaults.
+        duration: The largest duration of the run, in s. The run has at most 2000 steps.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        ModelError: The controller acts continuously, or has a block that no C has: why.
+        ModelError: The controller acts continuously, or has a block that cannot be exported.
         OSError: A file cannot be written.
     """
     part, file = controller_part(loop, context), file_of(name)
     words = _words(part, context, name)
     diagram = loop if isinstance(loop, Diagram) else loop.diagram
-    run = played_run(diagram, part, context, config, duration, STEPS)
-    found = [
+    run = played_run(diagram, part, context, config, duration, MOST_PLAYED)
+    files = [
         *_written(folder, file, words),
         *written(TEMPLATES, folder, {"play.c": f"play_{file}.c"}, words),
-        *written(COMMON, folder, {each: each for each in ("Makefile", "LICENSE.txt")}, words),
+        *written(COMMON, folder, {name: name for name in ("Makefile", "LICENSE.txt")}, words),
     ]
-    (found[0].parent / f"{file}_run.csv").write_text(run, encoding="utf-8")
-    return [*found, found[0].parent / f"{file}_run.csv"]
+    table = Path(folder) / f"{file}_run.csv"
+    table.write_text(run, encoding="utf-8")
+    return [*files, table]
 
 
 def write_controller(
@@ -88,13 +88,13 @@ def write_controller(
     """Writes a controller as name_controller.h, .c and .hpp.
 
     Args:
-        part: As `controller_part` made it.
+        part: The controller, from `controller_part`.
         context: The context of the diagram at the start.
-        name: What the files are called.
-        folder: Where to write; made if there is none.
+        name: The name of the files.
+        folder: The folder to write to; created if it does not exist.
 
     Raises:
-        ModelError: It reads nothing.
+        ModelError: The controller reads no measurement.
         OSError: A file cannot be written.
     """
     files = _written(folder, file_of(name), _words(part, context, name))
@@ -103,132 +103,90 @@ def write_controller(
     return WrittenPart(part, CONTROLLER, signals, values, inputs, tuple(files), context.get_time())
 
 
-def _words(part: ExportedPart, context: Context, name: str) -> dict[str, Any]:
-    prefix = prefix_of(name)
-    return _Words(part, context, prefix).found | {
-        "title": comment(name),
-        "name": file_of(name),
-        "prefix": prefix,
-        "guard": prefix.upper(),
-        "version": version("drake_dae"),
-        "casadi": ca.__version__,
-    }
-
-
-def _written(folder: str | Path, file: str, words: Mapping[str, Any]) -> list[Path]:
-    names = {f"controller.{each}": f"{file}_controller.{each}" for each in ("h", "c", "hpp")}
+def _written(folder: str | Path, file: str, words: Mapping[str, str]) -> list[Path]:
+    names = {f"controller.{end}": f"{file}_controller.{end}" for end in ("h", "c", "hpp")}
     return written(TEMPLATES, folder, names, words)
 
 
-@dataclass
-class _Words:
-    """What stands in the templates of a controller."""
+def _words(part: ExportedPart, context: Context, name: str) -> dict[str, str]:
+    """The texts for the templates of a controller."""
+    if not part.inputs:
+        raise ModelError("the controller reads nothing that is measured, so that none is needed")
+    compiled, ticks, prefix = part.compiled, part.ticks, f"{prefix_of(name)}_controller"
+    _, held = compiled.start(context)
+    functions = GeneratedFunctions.of(
+        compiled, ("given", "row"), held, f"{prefix_of(name)}_traced_controller"
+    )
 
-    part: ExportedPart
-    context: Context
-    prefix: str
-
-    def __post_init__(self) -> None:
-        part, compiled, prefix = self.part, self.part.compiled, self.prefix
-        if not part.inputs:
-            raise ModelError(
-                "the controller reads nothing that is measured, so that none is needed"
-            )
-        functions = compiled.staged
-        start, (_, held) = self.context.get_time(), compiled.start(self.context)
-        begin = compiled.initialization(held)
-        chosen = {"given": functions["given"], "row": functions["row"]}
-        chosen |= {name: each for name, each in functions.items() if name.startswith("update")}
-        if begin is not None:
-            chosen["begin"] = begin
-        self._functions = chosen
-        self._symbols = {key: f"{prefix}_traced_controller_{key}" for key in chosen}
-        inputs, outputs = identifiers(part.inputs), identifiers(part.outputs)
-        signals = parameter_signals(compiled)
-        values = compiled.values(self.context)[: len(signals)]
-        first = part.ticks.at(start)
-        count, updated = compiled.sizes["held"], self._updates()
-        self.found: dict[str, Any] = {
-            "period": repr(part.ticks.period),
-            "start": repr(part.ticks.time(first)),
-            "first": str(first),
-            "inputs": members(inputs),
-            "outputs": members(outputs),
-            "num_parameters": str(len(signals)),
-            "num_inputs": str(sum(map(len, inputs.values()))),
-            "num_outputs": str(sum(map(len, outputs.values()))),
-            "num_controls": str(len(part.outputs[CONTROL])),
-            "num_held": str(count + 1),
-            "count_held": str(count),
-            "num_given": str(functions["given"].numel_out(0) + 1),
-            "generated": without_branches(
-                generated({self._symbols[key]: each for key, each in chosen.items()})
-            ),
-            "names": named(f"{prefix}_controller", "parameter", signals),
-            "parameters": numbers(values),
-            "held": numbers(held),
-            "given": self._call("given", ["&time", "c->parameters"], ["c->given"]),
-            "row": self._call("row", self._arguments("held"), ["row", "&valid"]),
-            "begin": self._begin(),
-            "updates": updated["updates"],
-            "time": self._time(),
-            "steps": self._steps(updated),
-            "gathered": _copied(inputs, "in->{0}", "fresh + {1}", to_member=False),
-            "written": _copied(
-                {key: one for key, one in outputs.items() if key != CONTROL},
-                "out->{0}",
-                "row + {1}",
-                first=len(outputs[CONTROL]),
-            ),
-            "filled": _copied(inputs, "in->{0}", "row + {1}"),
-            "shown": _copied(outputs, "out->{0}", "row + {1}", to_member=False),
-            "output_sizes": braced(
-                [f"{{{string(key)}, {len(one)}}}" for key, one in outputs.items()]
-            ),
-        }
-
-    def _arguments(self, held: str) -> list[str]:
-        # There is no continuous state; its place takes any pointer.
+    def arguments(held: str) -> list[str]:
+        # There is no continuous state, so that its pointer can be null.
         return ["&time", "0", held, "c->parameters", "c->given"]
 
-    def _call(self, key: str, given: list[str], results: list[str]) -> str:
-        return called(self._symbols[key], self._functions[key], given, results)
+    code = updates(
+        compiled.rates,
+        "Controller *c",
+        lambda i: functions.call(f"update_{i}", arguments("before"), ["values", "&valid"]),
+        lambda i: f"is_due(tick, {ticks.every[i]}, {ticks.first[i]})",
+    )
+    # The outputs and the updates, in Drake's order.
+    steps = ["  good &= show(c, time, held, row);\n", code["unrestricted"] + code["discrete"]]
+    begin = ""
+    if "begin" in functions.functions:
+        begin = functions.call("begin", ["&time", "0", "held", "c->parameters"], ["c->held"])
+    inputs, outputs = identifiers(part.inputs), identifiers(part.outputs)
+    others = {key: signals for key, signals in outputs.items() if key != CONTROL}
+    parameters, first = parameter_signals(compiled), ticks.at(context.get_time())
+    num_controls = len(part.outputs[CONTROL])
+    return common_words(name) | {
+        "period": repr(ticks.period),
+        "start": repr(ticks.time(first)),
+        "first": str(first),
+        "inputs": members(inputs),
+        "outputs": members(outputs),
+        "num_parameters": str(len(parameters)),
+        "num_inputs": str(sum(map(len, inputs.values()))),
+        "num_outputs": str(sum(map(len, outputs.values()))),
+        "num_controls": str(num_controls),
+        "num_held": str(held.size + 1),
+        "count_held": str(held.size),
+        "num_given": str(functions.functions["given"].numel_out(0) + 1),
+        "generated": functions.code(),
+        "names": named(prefix, "parameter", parameters),
+        "parameters": numbers(compiled.values(context)[: len(parameters)]),
+        "held": numbers(held),
+        "given": functions.call("given", ["&time", "c->parameters"], ["c->given"]),
+        "row": functions.call("row", arguments("held"), ["row", "&valid"]),
+        "begin": begin,
+        "updates": code["updates"],
+        "time": _time(ticks),
+        "steps": "".join(steps if part.acts_at_once else steps[::-1]),
+        "gathered": _copied(inputs, "in->{0}", "fresh + {1}", to_member=False),
+        "written": _copied(others, "out->{0}", "row + {1}", first=num_controls),
+        "filled": _copied(inputs, "in->{0}", "row + {1}"),
+        "shown": _copied(outputs, "out->{0}", "row + {1}", to_member=False),
+        "output_sizes": braced(
+            [f"{{{string(key)}, {len(signals)}}}" for key, signals in outputs.items()]
+        ),
+    }
 
-    def _begin(self) -> str:
-        if "begin" not in self._functions:
-            return ""
-        return self._call("begin", ["&time", "0", "held", "c->parameters"], ["c->held"])
 
-    def _time(self) -> str:
-        """The time of a tick, to the bit as Drake has it: offset + k period of a due rate."""
-        lines, ticks = [], self.part.ticks
-        for every, first, (period, offset) in zip(
-            ticks.every, ticks.first, ticks.rates, strict=True
-        ):
-            moment = f"{offset!r} + (double)((tick - {first}) / {every}) * {period!r}"
-            lines.append(f"  if (is_due(tick, {every}, {first})) time = {moment};\n")
-        return "".join(lines)
-
-    def _steps(self, updated: Mapping[str, str]) -> str:
-        """The outputs and the updates, in Drake's order."""
-        show, acts_at_once = "  good &= show(c, time, held, row);\n", self.part.acts_at_once
-        lines = updated["unrestricted"] + updated["discrete"]
-        return show + lines if acts_at_once else lines + show
-
-    def _updates(self) -> dict[str, str]:
-        ticks = self.part.ticks
-        return updates(
-            self.part.compiled.rates,
-            "Controller *c",
-            lambda i: self._call(f"update_{i}", self._arguments("before"), ["values", "&valid"]),
-            lambda i: f"is_due(tick, {ticks.every[i]}, {ticks.first[i]})",
-        )
+def _time(ticks: Ticks) -> str:
+    """C code for the time of a tick, see `Ticks.time`."""
+    lines = []
+    for every, first, (period, offset) in zip(ticks.every, ticks.first, ticks.rates, strict=True):
+        moment = f"{offset!r} + (double)((tick - {first}) / {every}) * {period!r}"
+        lines.append(f"  if (is_due(tick, {every}, {first})) time = {moment};\n")
+    return "".join(lines)
 
 
 def _copied(
-    vectors: dict[str, Any], member: str, place: str, first: int = 0, to_member: bool = True
+    vectors: Mapping[str, Sequence[Signal]],
+    member: str,
+    place: str,
+    first: int = 0,
+    to_member: bool = True,
 ) -> str:
-    """Copies between members of a struct and one array."""
+    """C code that copies between members of a struct and one array."""
     lines = []
     for name, signals in vectors.items():
         pair = member.format(name, first), place.format(name, first)

@@ -1,6 +1,6 @@
-"""Where wires of a loop are cut: its plant, what is measured, and what leads to its control."""
+"""Where a loop is cut for an export: its plant, measured ports, and blocks upstream of control."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydrake.systems.framework import (
@@ -16,57 +16,53 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.plants.contract import Plant
 
 CONTROL = "control"
-"""What a controller gives, and a plant takes."""
+"""The name of a controller's output port and a plant's input port."""
 
 
 def plant_of(diagram: Diagram) -> Plant:
-    """The one plant of a diagram.
+    """Returns the plant of a diagram.
 
     Raises:
-        ModelError: There are none or several.
+        ModelError: The diagram does not have exactly one plant.
     """
-    found = list[Plant]()
-
-    def look(system: System) -> None:
-        if isinstance(system, Plant):
-            found.append(system)
-        elif isinstance(system, Diagram):
-            for each in system.GetSystems():
-                look(each)
-
-    look(diagram)
-    if len(found) != 1:
+    plants = [system for system in _systems(diagram) if isinstance(system, Plant)]
+    if len(plants) != 1:
         raise ModelError(
-            f"an export cuts a diagram at its plant, and this one has {len(found)}: a Plant, as "
+            f"an export cuts a diagram at its plant, and this one has {len(plants)}: a Plant, as "
             "RobotPlant, DaePlant or ContactPlant"
         )
-    return found[0]
+    return plants[0]
+
+
+def _systems(system: System) -> Iterator[System]:
+    """The plants, the sensors and all other leaves in a diagram."""
+    if isinstance(system, Diagram) and not (isinstance(system, Plant) or _measures(system)):
+        for inner in system.GetSystems():
+            yield from _systems(inner)
+    else:
+        yield system
+
+
+def _measures(system: System) -> bool:
+    return bool(getattr(system, "measures", False))
 
 
 def measured_ports(diagram: Diagram, plant: Plant) -> dict[Port, str]:
-    """What the plant and the sensors show: port of a leaf -> name."""
+    """The output ports of the plant and of sensors: port of a leaf -> name."""
     names = dict[Port, str]()
-
-    def add(system: System) -> None:
+    for system in _systems(diagram):
+        if not (system is plant or _measures(system)):
+            continue
         for index in range(system.num_output_ports()):
             port = system.get_output_port(index)
             name = port.get_name()
             taken = name in names.values()
             names[leaf_port(port)] = f"{system.get_name()}_{name}" if taken else name
-
-    def look(system: System) -> None:
-        if system is plant or getattr(system, "measures", False):
-            add(system)
-        elif isinstance(system, Diagram):
-            for each in system.GetSystems():
-                look(each)
-
-    look(diagram)
     return names
 
 
 def control_port(wires: Wires, plant: Plant) -> Port:
-    """What feeds the plant's control, also where the plant takes the law itself."""
+    """The port that feeds the plant's control, directly or as the plant's feedback."""
     system: Any = plant
     for name in (CONTROL, "feedback"):
         if not plant.HasInputPort(name):
@@ -91,7 +87,7 @@ def control_port(wires: Wires, plant: Plant) -> Port:
 def upstream(
     wires: Wires, port: Port, measured: Mapping[Port, str]
 ) -> tuple[set[System], dict[Port, str]]:
-    """The systems that lead to a port, and what they read that is measured."""
+    """The systems between measured ports and a port, and the measured ports that they read."""
     systems, inputs = set[System](), dict[Port, str]()
 
     def walk(system: System) -> None:
@@ -110,16 +106,16 @@ def upstream(
 
 
 def reaches(wires: Wires, port: Port, measured: Mapping[Port, str]) -> bool:
-    """Whether a port depends on what is measured in the same instant."""
-    done = set[Port]()
+    """Whether a port has direct feedthrough from a measured port."""
+    visited = set[Port]()
 
-    def walk(found: Port) -> bool:
-        if found in measured:
+    def walk(port: Port) -> bool:
+        if port in measured:
             return True
-        if found in done:
+        if port in visited:
             return False
-        done.add(found)
-        system, index = found
+        visited.add(port)
+        system, index = port
         for i in range(system.num_input_ports()):
             source = wires.sources.get((system, i))
             if source is None or not system.HasDirectFeedthrough(i, index):
@@ -132,5 +128,5 @@ def reaches(wires: Wires, port: Port, measured: Mapping[Port, str]) -> bool:
 
 
 def port_of(port: Port) -> OutputPort:
-    """The output port of a leaf."""
+    """The Drake port of (leaf system, index)."""
     return port[0].get_output_port(OutputPortIndex(port[1]))

@@ -1,9 +1,7 @@
-"""A plant, or a loop as a whole, over time in fixed steps, in C99."""
+"""Integration of a plant or of a whole loop with fixed steps, in C99."""
 
-from importlib.metadata import version
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
@@ -14,7 +12,8 @@ from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import ExportedPart
 from drake_dae.running.export.steps.parts import PLANT, WrittenPart, defaults
 from drake_dae.running.export.steps.words import (
-    called,
+    GeneratedFunctions,
+    common_words,
     file_of,
     named,
     numbers,
@@ -22,16 +21,15 @@ from drake_dae.running.export.steps.words import (
     prefix_of,
     updates,
 )
-from drake_dae.running.export.text import comment, generated, written
+from drake_dae.running.export.text import written
 from drake_dae.running.export.whole import signals_of
 from drake_dae.running.rollout.events import SAME
 from drake_dae.running.rollout.run import FIXED
-from drake_dae.trace.compiled import without_branches
 
 TEMPLATES = Path(__file__).parent / "c99"
 
 SCHEME, LONGEST = "runge_kutta5", 1e-3
-"""The method, and its step in s, where a run has error control, which no export has."""
+"""The method and its longest step in s for settings with error control, which no export has."""
 
 
 def write_integrated(
@@ -45,13 +43,13 @@ def write_integrated(
     """Writes a plant or a loop as name_kind.h and name_kind.c, which integrate it.
 
     Args:
-        part: As `plant_part` or `loop_part` made it.
+        part: The part, from `plant_part` or `loop_part`.
         kind: "plant" or "loop".
         context: The context of the diagram at the start.
-        name: What the files are called.
-        folder: Where to write; made if there is none.
-        config: Drake's settings, whose fixed steps it takes; where they have error control, and
-            for None, steps of at most 1 ms by `runge_kutta5`.
+        name: The name of the files.
+        folder: The folder to write to; created if it does not exist.
+        config: Drake's settings with fixed steps. If they have error control, or for None, the
+            steps are at most 1 ms by `runge_kutta5`.
 
     Raises:
         ModelError: The fixed steps are of an implicit method.
@@ -59,19 +57,22 @@ def write_integrated(
     """
     scheme, longest = fixed_steps(config)
     compiled, prefix, file = part.compiled, prefix_of(name), file_of(name)
-    functions = compiled.staged
     start, held = compiled.start(context)
-    begin = compiled.initialization(held)
-    chosen = {key: functions[key] for key in ("given", "rate", "row", "newton")}
-    chosen |= {key: each for key, each in functions.items() if key.startswith("update")}
-    if begin is not None:
-        chosen["begin"] = begin
-    symbols = {key: f"{prefix}_traced_{kind}_{key}" for key in chosen}
+    functions = GeneratedFunctions.of(
+        compiled, ("given", "rate", "row", "newton"), held, f"{prefix}_traced_{kind}"
+    )
 
     def call(key: str, state: str, held: str, results: list[str]) -> str:
-        given = ["&time", state, held, "own->parameters", "own->given"]
-        return called(symbols[key], chosen[key], given, results)
+        arguments = ["&time", state, held, "own->parameters", "own->given"]
+        return functions.call(key, arguments, results)
 
+    begin = ""
+    if "begin" in functions.functions:
+        begin = f"""  {{
+    double held[HELD + 1];
+    memcpy(held, own->held, sizeof(held));
+{call("begin", "own->state", "held", ["own->held"])}  }}
+"""
     parameters = parameter_signals(compiled)
     states = signals_of(compiled, compiled.states, compiled.sizes["state"], "state")
     signals = {
@@ -83,16 +84,10 @@ def write_integrated(
     values, inputs = defaults(part, context)
     tableau, rates = FIXED[scheme], compiled.rates
     time = context.get_time()
-    words = {
-        "title": comment(name),
-        "name": file,
-        "prefix": prefix,
-        "guard": prefix.upper(),
+    words = common_words(name) | {
         "kind": kind,
         "KIND": kind.upper(),
         "what": "plant with its sensors" if kind == PLANT else "loop",
-        "version": version("drake_dae"),
-        "casadi": ca.__version__,
         "scheme": scheme,
         "longest": repr(longest),
         "start": repr(time),
@@ -102,7 +97,7 @@ def write_integrated(
         "num_inputs": str(len(signals["input"])),
         "num_outputs": str(len(signals["output"])),
         "num_held": str(held.size + 1),
-        "num_given": str(functions["given"].numel_out(0) + 1),
+        "num_given": str(functions.functions["given"].numel_out(0) + 1),
         "num_rates": str(len(rates) + 1),
         "count_held": str(held.size),
         "count_rates": str(len(rates)),
@@ -113,22 +108,15 @@ def write_integrated(
         "periods": numbers(np.array([rate.period for rate in rates])),
         "offsets": numbers(np.array([rate.offset for rate in rates])),
         "near": repr(SAME * min((rate.period for rate in rates), default=0.0)),
-        "generated": without_branches(
-            generated({symbols[key]: each for key, each in chosen.items()})
-        ),
+        "generated": functions.code(),
         "names": "".join(named(f"{prefix}_{kind}", *item) for item in signals.items()),
         "parameters": numbers(np.concatenate([values, inputs])),
         "state": numbers(start),
         "held": numbers(held),
-        "given": called(
-            symbols["given"], chosen["given"], ["&time", "own->parameters"], ["own->given"]
-        ),
+        "given": functions.call("given", ["&time", "own->parameters"], ["own->given"]),
         "rate": call("rate", "x", "own->held", ["rate", "&valid"]),
         "row": call("row", "own->state", "own->held", ["own->row", "&valid"]),
-        "begin": "  {\n    double held[HELD + 1];\n    memcpy(held, own->held, sizeof(held));\n"
-        f"{call('begin', 'own->state', 'held', ['own->held'])}  }}\n"
-        if begin is not None
-        else "",
+        "begin": begin,
         "project": _project(call("newton", "at", "own->held", ["found", "&left"]), compiled),
         **updates(
             compiled.rates,
@@ -143,7 +131,7 @@ def write_integrated(
 
 
 def fixed_steps(config: SimulatorConfig | None) -> tuple[str, float]:
-    """The method of fixed steps, and the longest step in s.
+    """Returns the method of fixed steps and the longest step in s.
 
     Raises:
         ModelError: The method is implicit.

@@ -1,4 +1,4 @@
-"""The parts of a loop in C99, as far as each can be written."""
+"""The parts of a loop that can be written as C99."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -34,14 +34,16 @@ class WrittenPart:
     """A part that was written as C99.
 
     Attributes:
-        part: It.
+        part: The part.
         kind: "controller", "plant" or "loop".
-        parameters, states: Names and units; a controller has no continuous state.
-        values, start: Their defaults.
-        inputs: Those of the inputs.
-        longest: The longest step of a plant or a loop at first, in s.
-        time: Of the start, in s.
-        files: The header and the source, and what else there is.
+        parameters: Names and units of the parameters.
+        values: The default parameters.
+        inputs: The default inputs.
+        files: The header, the source, and any further files.
+        time: The start time, in s.
+        states: Names and units of the continuous state; a controller has none.
+        start: The initial continuous state.
+        longest: The default of the longest step of a plant or a loop, in s.
     """
 
     part: ExportedPart
@@ -57,11 +59,11 @@ class WrittenPart:
 
 
 class Export(NamedTuple):
-    """What an export wrote, and what it did not.
+    """The result of an export.
 
     Attributes:
-        files: The files.
-        left_out: Why a part is not among them, a sentence for each.
+        files: The paths of the written files.
+        left_out: For each part that was not written, a sentence with the reason.
     """
 
     files: list[Path]
@@ -71,29 +73,29 @@ class Export(NamedTuple):
 def parts_of_loop(
     loop: ClosedLoop | Diagram, context: Context, kinds: Sequence[str]
 ) -> tuple[dict[str, ExportedPart], list[str]]:
-    """The parts of a loop that can be exported, and why the others can not.
+    """Returns the parts of a loop that can be exported, and the reasons for the other parts.
 
     Args:
         loop: The loop, or any diagram with one `Plant`.
         context: Its context at the start.
-        kinds: Which parts are asked for.
+        kinds: The kinds of the requested parts.
 
     Raises:
-        ModelError: No part can be exported: why.
+        ModelError: No part can be exported; the message has the reasons.
     """
-    found, left_out = dict[str, ExportedPart](), list[str]()
+    parts, left_out = dict[str, ExportedPart](), list[str]()
     for kind in kinds:
         try:
-            found[kind] = MAKERS[kind](loop, context)
+            parts[kind] = MAKERS[kind](loop, context)
         except ModelError as error:
             left_out.append(f"the controller: {error}" if kind == CONTROLLER else str(error))
-    if not found:
+    if not parts:
         raise ModelError(f"nothing of it can be exported: {'; '.join(left_out)}")
-    return found, left_out
+    return parts, left_out
 
 
 def defaults(part: ExportedPart, context: Context) -> tuple[FloatArray, FloatArray]:
-    """The parameters of a part, and its inputs when a run begins.
+    """The parameters of a part, and its inputs at the start of a run.
 
     Args:
         part: The part.
@@ -102,7 +104,7 @@ def defaults(part: ExportedPart, context: Context) -> tuple[FloatArray, FloatArr
     values = part.compiled.values(context)
     if not part.inputs:
         return values, np.zeros(0)
-    # What a law holds, and the plant reads, is no number before a run begins.
+    # A discrete control, which the plant reads, is nan before a run is initialized.
     own = context.Clone()
     own.SetAccuracy(1e-9)
     part.compiled.diagram.ExecuteInitializationEvents(own)

@@ -1,4 +1,4 @@
-"""A run of Drake's Simulator, as what a controller reads and gives at each of its steps."""
+"""A run of Drake's Simulator as a table of a controller's inputs and outputs at each step."""
 
 from math import floor
 
@@ -19,18 +19,18 @@ def played_run(
     duration: float,
     most: int,
 ) -> str:
-    """The run as a table: a line has the time in s, the inputs, and the outputs that follow.
+    """Returns the run as CSV: each line has the time in s, the inputs, and the resulting outputs.
 
-    Inputs are those that the updates of an instant read. What is held after these is read by
-    letting Drake make them without going on in time.
+    The inputs are those before the updates of the same instant. If outputs change by these updates,
+    they are evaluated after Drake has made the updates without advancing the time.
 
     Args:
         diagram: The whole diagram.
-        part: The controller in it.
+        part: The controller of the diagram.
         context: The context at the start.
-        config: Drake's settings; its defaults if None.
-        duration: How long it is at most, in s.
-        most: How many steps it has at most.
+        config: Drake's settings; None for defaults.
+        duration: The largest duration of the run, in s.
+        most: The largest number of steps.
 
     Raises:
         SimulationError: The run ends before its first step.
@@ -48,11 +48,11 @@ def played_run(
     inputs, outputs = list(wires.inputs.values()), list(wires.outputs.values())
 
     def values(ports: list[Port]) -> list[float]:
-        found = [
+        columns = [
             system.get_output_port(OutputPortIndex(index)).Eval(system.GetMyContextFromRoot(own))
             for system, index in ports
         ]
-        return np.concatenate(found).tolist() if found else []
+        return np.concatenate(columns).tolist() if columns else []
 
     signals = [
         signal.name

@@ -1,4 +1,4 @@
-"""The common tick of all rates of a diagram: each of its updates falls on one."""
+"""The common period of all sample rates of a diagram: every update is at a multiple of it."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -10,20 +10,20 @@ from drake_dae.compiler.rates import UpdateRate
 from drake_dae.errors import ModelError
 
 FINEST = 1000
-"""A tick is at least the shortest period over this."""
+"""The largest ratio of the shortest sample period to the common period."""
 
 _SAME = 1e-9
-"""Times that differ by less than this, in ticks, are one."""
+"""Times that differ by less than this, in common periods, count as equal."""
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """When a step is due: at k period, k = 0, 1, ...; and which updates are due then.
+    """The sample instants of a controller: tick k is at the time k period, k = 0, 1, ...
 
     Attributes:
-        period: In s.
-        every, first: For each rate: it is due at ticks first, first + every, first + 2 every, ...
-        rates: The period and the offset of each rate, in s.
+        period: The time between two ticks, in s.
+        every, first: Rate i has updates at the ticks first[i] + j every[i], j = 0, 1, ...
+        rates: The (period, offset) of each rate, in s.
     """
 
     period: float
@@ -33,10 +33,10 @@ class Ticks:
 
     @classmethod
     def of(cls, rates: tuple[UpdateRate, ...], alone: float = 0.0) -> Self:
-        """The ticks of some rates, or of a single period where there are none.
+        """Finds the ticks of some rates; without any rate, the period is `alone`.
 
         Raises:
-            ModelError: There is no period, or periods and offsets have no common tick.
+            ModelError: Periods and offsets are no multiples of a common period.
         """
         if not rates:
             return cls(alone)
@@ -55,20 +55,20 @@ class Ticks:
         return cls(float(tick), every, first, own)
 
     def at(self, time: float) -> int:
-        """The first tick from a time in s on."""
+        """The first tick at or after a time in s."""
         return ceil(time / self.period - _SAME)
 
     def time(self, tick: int) -> float:
-        """The time of a tick in s, to the bit as Drake has it: offset + k period of a due rate."""
-        found = tick * self.period
+        """The time of a tick in s, equal to Drake's to the last bit: offset + k period."""
+        time = tick * self.period
         for every, first, (period, offset) in zip(self.every, self.first, self.rates, strict=True):
             if tick >= first and (tick - first) % every == 0:
-                found = offset + (tick - first) // every * period
-        return found
+                time = offset + (tick - first) // every * period
+        return time
 
 
 def _fraction(time: float) -> Fraction:
-    """The time in s that a user wrote; what was computed from such times has their round-off."""
+    """The time in s as a fraction, without the round-off of computed times."""
     return Fraction(time).limit_denominator(10**9)
 
 
