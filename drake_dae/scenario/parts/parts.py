@@ -92,7 +92,7 @@ class Adaptive:
             of Gamma, in the unit of the parameter squared per J. The initial estimate is the law's
             value.
         rate: The rate in 1/s at which errors of positions decay.
-        damping: The rate in 1/s at which the velocity error of this decay decays itself.
+        damping: The rate in 1/s at which the deviation e' + rate e from this decay decays.
         force_rate: The rate in 1/s at which the error of a measured force decays, with
             `force_feedback`; 0 without.
     """
