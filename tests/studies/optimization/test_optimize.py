@@ -309,10 +309,10 @@ def test_what_changes_nothing_is_named_and_stays():
         ({"cost": lambda run: 1 / 0}, "cost failed: ZeroDivisionError"),
         ({"cost": lambda run: "x"}, "must be a CasADi expression of the run"),
         ({"cost": lambda run: ca.sumsqr(run["reference"])}, "does not depend on what is free"),
-        ({"cost": lambda run: ca.log(-error(run))}, "the cost is not finite with the values"),
+        ({"cost": lambda run: ca.log(-error(run))}, "the cost is not finite at the initial guess"),
         (
             {"limits": lambda run: {"odd": (0, ca.log(-error(run)), None)}},
-            "limit 'odd' is not finite with the values",
+            "limit 'odd' is not finite at the initial guess",
         ),
         ({"cost": lambda run: ca.sqrt(run["peak"]), "more": {"peak": 0.0}}, "no finite derivative"),
         ({"limits": lambda run: 3}, "limits must return a mapping"),
