@@ -92,8 +92,8 @@ def links_behind(
     The depth of a link is that of the origin of its frame, or with `shapes` of the corners of its
     collision geometry. A real surface may end before it reaches the robot's base, such as a table
     beside the robot. So a link counts only if it is not much farther from the contact than from
-    fixed links; its shape also if all fixed links are in front of the surface, except for the first
-    links. The shapes of links at the contact do not count.
+    fixed links. Where all fixed links are in front of the surface, the shapes of all links count,
+    except those that are next to the base. The shapes of links at the contact never count.
 
     Args:
         model: The robot.
