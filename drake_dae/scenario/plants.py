@@ -77,7 +77,7 @@ class ScenarioPlant(ABC):
 
     @property
     def rolled(self) -> "ScenarioPlant":
-        """The member that a rollout runs instead."""
+        """The plant that a rollout uses in place of this one; itself if it is traced."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.

@@ -176,7 +176,7 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
     for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
         if _rank(gradient[remaining]) < _rank(gradient):
             raise ModelError(
-                f"{system.name}: {gone} cannot be left out: its gradients are no combinations of "
+                f"{system.name}: {gone} cannot be left out: its gradients are not combinations of "
                 "the gradients of the remaining constraints"
             )
         both = np.hstack([gradient, moved])
@@ -188,8 +188,8 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
             )
         if _rank(fields["g"].T[remaining]) < _rank(fields["g"].T):
             raise ModelError(
-                f"{system.name}: {gone} cannot be left out: the constraint inputs of the same "
-                "numbers act in directions in which no other input acts"
+                f"{system.name}: {gone} cannot be left out: its columns of g are not combinations "
+                "of the remaining columns"
             )
 
 

@@ -299,8 +299,8 @@ def _settled(
         if not moves.all():
             stop = float(piece.times[int(np.argmin(moves))])
             raise ReferenceSignalError(
-                f"the motion cannot go on from t = {stop:.4g} s of the reference: rest there uses "
-                "all of a limit"
+                f"the motion cannot continue from t = {stop:.4g} s of the reference: a control or "
+                "force is at its limit there even at rest. Raise that limit, or change the path"
             )
         if before is not None and np.abs(fastest.b - before).max() <= SETTLED * fastest.b.max():
             break

@@ -216,8 +216,8 @@ class RevoluteLoopJoint(LoopJoint):
         ends = [end for end in (low, high, self.rest) if np.isfinite(end)]
         if any(abs(end - middle) >= pi for end in ends):
             raise ModelError(
-                f"lower, upper and rest must be within half a turn of {middle:g} rad, where the "
-                f"angle counts from, got {brief(ends)}; a joint that goes round has neither"
+                f"lower, upper and rest must be within half a turn of {middle:g} rad, got "
+                f"{brief(ends)}. Leave out both limits for a continuous joint"
             )
 
     @property

@@ -72,9 +72,9 @@ class RolloutRequest:
         return cls(program, moments, choice, settings, lasting)
 
     def machine_code(self, program: RolloutProgram, count: int) -> machine.Library | None:
-        """Returns a diagram as machine code; None if it does not pay to make it.
+        """Returns a diagram as machine code, or None if compiling takes longer than it saves.
 
-        If these runs are all, machine code in the cache is used even where making it does not pay.
+        Code that is already in the cache is used in any case, unless further runs will follow.
         """
         if self.choice is False:
             return None

@@ -177,11 +177,13 @@ def run_together(
     seeds: Sequence[Seed],
     lasting: float,
 ) -> list[Rollout | None]:
-    """Runs side by side, on one core; arguments as of `run_loop`.
+    """Runs a loop from several starts at once, in the vector registers of one core.
+
+    The arguments are those of `run_loop`.
 
     Returns:
-        A run for each start; None for a run that fails, that takes more than `USUAL` steps, or
-        whose loop has no such machine code. These are left to `run_loop`.
+        A run for each start. It is None if the run fails, if it takes more than `USUAL` steps, or
+        if there is no machine code for several runs at once; use `run_loop` for these starts.
 
     Raises:
         InconsistentStateError: A start is not on N*.

@@ -36,8 +36,8 @@ class TorqueLoop(ParameterizedSystem):
     where a_d is the acceleration of the links that the rigid model has under tau_d, f_o an estimate
     of f, the friction of the motors and other disturbances, and tau_d' the difference of samples,
     limited to `slope` and filtered at 2 w. So no derivative of the model is taken. Then e = tau -
-    tau_d obeys, without sampling and with q'' - a_d = M^-1 P e + d, where P is 1 less the reaction
-    of the constraints and d an error of the rigid model,
+    tau_d obeys, without sampling and with q'' - a_d = M^-1 P e + d, where P is the identity
+    without the reaction of the constraints, and d an error of the rigid model,
 
         e'' + 2 zeta w e' + (w^2 + K M^-1 P) e = -tau_d'' - K d + K B^-1 (f_o - f).
 

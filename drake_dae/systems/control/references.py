@@ -147,7 +147,7 @@ class ReferenceGenerator(DifferentiableSystem):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def places(self, name: str) -> slice:
-        """The part of numeric parameter 0 that is a parameter."""
+        """Returns the entries of numeric parameter 0 that belong to a named parameter."""
         first = 0
         for known, value in self.reference_parameters.items():
             if known == name:

@@ -149,7 +149,7 @@ class TracedTask:
 
     @staticmethod
     def touched(segments: Sequence[ReferenceSegment]) -> bool:
-        """Whether the robot was free before the current segment."""
+        """Whether the contact was open in the previous segment, so that a touch began this one."""
         return len(segments) > 1 and not segments[-2].change.in_contact
 
     def _in_phase(self, values: Callable[[int], ca.SX], otherwise: ca.SX) -> ca.SX:
