@@ -26,13 +26,13 @@ MOST = 1e15
 class CsvReference(SplineReference):
     """A smooth reference from columns of a CSV file; constant before the first and after the last.
 
-    Between rows the columns go straight. The reference is that motion q, averaged over a window: a
-    uniform B-spline over q at times that are `smoothing` apart, with order + 2 of them in a window.
+    Columns are interpolated linearly between rows. The reference is this motion q, averaged over a
+    window: a uniform B-spline over q at times that are `smoothing` apart, order + 2 in a window.
     The deviation from the rows is, to leading order, (order + 2) / 24 smoothing^2 q''; its maximum
     is `deviation`, and more than `tolerance` is refused. At a kink of q, as on a path of few rows,
     the deviation is of first order in `smoothing`. Derivatives divide noise by powers of
-    `smoothing`: choose both numbers for noisy rows. If q starts in motion, the reference starts
-    half a window before the first row.
+    `smoothing`: choose both numbers for noisy rows. If the velocity of q is not zero at the
+    first row, the reference starts half a window before it.
 
     Attributes:
         file: The file: a row of names, then rows of numbers; comma, semicolon or tab between.

@@ -170,7 +170,7 @@ def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[in
     Args:
         without: A_0, A(x) without friction, shape (m, m).
         per_unit: D, the decrease of A per unit of friction, shape (m, m).
-        rows: The contacts; minors hold all other rows.
+        rows: The rows of contacts. Only minors with all other rows count.
     """
     largest = 0.0
     for used in _sets(len(without), rows):

@@ -121,10 +121,10 @@ class _Changes:
         return goes_on and _is_same(reacted, held_after, state, held)
 
     def has_settled(self, run: Run, time: float, state: FloatArray, held: FloatArray) -> bool:
-        """Whether a step follows, since a reaction changed nothing but round-off.
+        """Returns whether the next step can begin: the last reaction changed only round-off.
 
-        Otherwise further reactions may follow at the same time, up to `MOST_REPEATED`: of contacts
-        that touch without a force any mode fits.
+        Otherwise up to `MOST_REPEATED` reactions follow at the same time. There is a limit, since
+        the mode of a closed contact with zero force is not unique.
         """
         self.repeated = self.repeated + 1 if time == run.time else 0
         is_same = time == run.time and _is_same(state, held, run.state, run.held)

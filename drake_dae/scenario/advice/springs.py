@@ -16,7 +16,7 @@ _DIGITS = 3
 
 
 def rounded(value: float) -> float:
-    """A recommended number, rounded to three digits."""
+    """Returns a recommended number, rounded to three digits for a scenario file."""
     return float(f"{value:.{_DIGITS}g}")
 
 

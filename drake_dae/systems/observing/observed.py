@@ -107,7 +107,7 @@ class Observed:
         return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
 
     def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
-        """The change of mu at a sample, by which friction takes its share of r."""
+        """The change of the estimate mu at a sample, by the part of r that friction explains."""
         gain = -np.expm1(-self._observing.friction_rate * self._period)
         terms = contact.friction, contact.planes, contact.velocity, contact.metric
         after = mu + contact.slides * gain * shares(*terms, r)

@@ -58,7 +58,7 @@ class GCodeReference(SplineReference):
 
     A .csv has the points of a path without times in place of a program: x and y in mm, and the
     speed in mm/s or the feed in mm/min with which a point is reached, see `read_points`; without
-    speeds the limit of the speed holds. With `press` all of it has the first force.
+    speeds the limit of the speed holds. With `press` the whole path has the first force.
 
     Attributes:
         file: The program, or the points as a .csv.
