@@ -299,6 +299,37 @@ def test_points_without_speeds_go_at_the_limit_and_press_all_the_way(tmp_path):
     np.testing.assert_allclose(values[:, 2, 0], 15.0, atol=1e-9)
 
 
+def test_further_columns_are_followed_along_the_path(tmp_path):
+    """A column that is linear in x and y stays so, since the spline is linear: round-off alone."""
+    rows = [(0, 0), (80, 0), (80, 0), (80, 60), (10, 20)]
+    lines = [f"{x},{y},{0.1 + 1e-3 * x - 2e-3 * y},{x / 100}" for x, y in rows]
+    (tmp_path / "path.csv").write_text("\n".join(["x,y,nx,ny", *lines]))
+    reference = GCodeReference(
+        str(tmp_path / "path.csv"), LIMITS, press=[15.0, 5.0], columns=["nx", "ny"]
+    )
+    _, values = samples(reference, 1)
+    assert values.shape[1] == 5
+    x, y, force, nx, ny = np.moveaxis(values, 1, 0)
+    np.testing.assert_allclose(nx[:, 0], 0.1 + x[:, 0] - 2.0 * y[:, 0], atol=1e-12)
+    np.testing.assert_allclose(ny, 10.0 * x, atol=1e-11)
+    np.testing.assert_allclose(force[:, 0], 15.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,nx\n1,2,0\n1,2,1\n1,3,1", "row 3: nx change while x and y stay"),
+        ("x,y\n1,2\n1,3", "has no column nx, but x, y"),
+        ("G1 X1 F100", "is a program and has no columns nx"),
+    ],
+)
+def test_columns_that_cannot_be_followed_are_refused(text, message, tmp_path):
+    file = tmp_path / ("path.csv" if "," in text else "path.nc")
+    file.write_text(text)
+    with pytest.raises(ReferenceSignalError, match=message):
+        _ = GCodeReference(str(file), LIMITS, columns=["nx"]).spline
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -58,7 +58,9 @@ class GCodeReference(SplineReference):
 
     A .csv has the points of a path without times in place of a program: x and y in mm, and the
     speed in mm/s or the feed in mm/min with which a point is reached, see `read_points`; without
-    speeds the limit of the speed holds. With `press` the whole path has the first force.
+    speeds the limit of the speed holds. With `press` the whole path has the first force. Each of
+    `columns` is one more output, linear between the points: so the tool can follow normals that a
+    CAM program gives, as the components of its axis.
 
     Attributes:
         file: The program, or the points as a .csv.
@@ -67,6 +69,7 @@ class GCodeReference(SplineReference):
         along: The direction of X, shape (2,): the change of the outputs per m.
         up: The direction of Y, likewise.
         press: The force in G1, G2 and G3 and that in G0, in N, shape (2,); None without force.
+        columns: Further columns of a .csv, one for each further output, in the outputs' units.
         tolerance: The largest distance of the path from the reference, in m.
         start_time: The start of the motion, in s.
         order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
@@ -82,6 +85,7 @@ class GCodeReference(SplineReference):
     along: ArrayLike = (1.0, 0.0)
     up: ArrayLike = (0.0, 1.0)
     press: ArrayLike | None = None
+    columns: Sequence[str] = ()
     tolerance: float = 1e-4
     start_time: float = 0.0
     order: int = 4
@@ -93,7 +97,7 @@ class GCodeReference(SplineReference):
 
     @property
     def size(self) -> int:
-        return 2 if self.press is None else 3
+        return 2 + (self.press is not None) + len(self.columns)
 
     def beside(self, folder: Path) -> Self:
         return replace(self, file=os.path.abspath(folder / self.file))
@@ -102,7 +106,12 @@ class GCodeReference(SplineReference):
     def program(self) -> GCodeProgram:
         """The moves that the file contains."""
         if Path(self.file).suffix.lower() == ".csv":
-            return read_points(self.file)
+            return read_points(self.file, self.columns)
+        if self.columns:
+            raise ReferenceSignalError(
+                f"'{self.file}' is a program and has no columns {', '.join(self.columns)}; give "
+                "the points of the path as a .csv"
+            )
         try:
             return read_program(read_text(self.file), self.file)
         except (OSError, ValueError) as error:
@@ -170,6 +179,8 @@ class GCodeReference(SplineReference):
             is_rapid = np.array([is_program and not isfinite(m.speed) for m in path.moves])
             force = np.asarray(self.press)[is_rapid[path.moves_at(along)].astype(int)]
             points = np.column_stack([points, force])
+        further = [np.interp(along, path.ends, column) for column in self.program.further.T]
+        points = np.column_stack([points, *further])
         spline = spline_within(points, self.limits, self.start_time, self.order, among=2)
         return replace(spline, step=max(spline.step, step)), off
 

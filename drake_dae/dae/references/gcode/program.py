@@ -88,10 +88,13 @@ class GCodeProgram:
     Attributes:
         moves: The moves that have a length, each from where the one before ends.
         ignored: The words without a move, such as "M3" and "Z", in order.
+        further: The values of k further outputs at the start and at the ends of all moves, shape
+            (moves + 1, k).
     """
 
     moves: tuple[GCodeMove, ...]
     ignored: tuple[str, ...]
+    further: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass
