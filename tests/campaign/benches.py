@@ -22,8 +22,6 @@ from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.running.bench.live import Server
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 
-WIDTH, HEIGHT = 900, 640
-
 MOMENTS = {
     "start": "await run(0.05);",
     "commanded": """
@@ -59,7 +57,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("sheet"), help="folder for the sheets")
     parser.add_argument("--only", nargs="*", default=list(shipped_scenarios()))
     parser.add_argument("--kind", choices=("page", "live", "both"), default="both")
+    parser.add_argument(
+        "--size", default="900x640", help="of the window in pixels; 390x780 is a phone"
+    )
     options = parser.parse_args()
+    size = tuple(map(int, options.size.split("x")))
     if not CHROMIUM:
         print("there is no Chromium")
         return 1
@@ -67,13 +69,13 @@ def main() -> int:
     failures = 0
     for kind in ("page", "live"):
         if options.kind in (kind, "both"):
-            rows = [(name, *_pictures(kind, name)) for name in options.only]
-            _sheet(rows, options.out / f"{kind}.png")
+            rows = [(name, *_pictures(kind, name, size)) for name in options.only]
+            _sheet(rows, size, options.out / f"{kind}_{options.size}.png")
             failures += sum(bool(failed) for _, _, failed in rows)
     return int(failures > 0)
 
 
-def _pictures(kind: str, name: str) -> tuple[list[Image.Image], str]:
+def _pictures(kind: str, name: str, size: tuple[int, ...]) -> tuple[list[Image.Image], str]:
     """The pictures of a scenario, and what failed."""
     print(kind, name, flush=True)
     scenario = load_scenario(find_scenario(name))
@@ -81,7 +83,7 @@ def _pictures(kind: str, name: str) -> tuple[list[Image.Image], str]:
         built = build_commanded(scenario)
         with TemporaryDirectory() as folder:
             if kind == "live":
-                return _live(built, scenario, name, Path(folder)), ""
+                return _live(built, scenario, name, Path(folder), size), ""
             file = Path(folder) / "page.html"
             try:
                 write_page(built.loop, built.context, file, None, name)
@@ -91,14 +93,14 @@ def _pictures(kind: str, name: str) -> tuple[list[Image.Image], str]:
             text, found = file.read_text(), []
             for body in MOMENTS.values():
                 file.write_text(with_script(text, body + SHOWN))
-                found.append(_picture(file.as_uri(), Path(folder)))
+                found.append(_picture(file.as_uri(), Path(folder), size))
             return found, ""
     except (DrakeDaeError, RuntimeError) as error:
         print(f"  {error}", flush=True)
         return [], str(error)
 
 
-def _live(built, scenario, name: str, folder: Path) -> list[Image.Image]:
+def _live(built, scenario, name: str, folder: Path, size: tuple[int, ...]) -> list[Image.Image]:
     found = []
     with Server(built.loop, built.context, scenario.integrator, name) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
@@ -107,16 +109,16 @@ def _live(built, scenario, name: str, folder: Path) -> list[Image.Image]:
         try:
             for body in MOMENTS.values():
                 server.page = with_script(text, body + SHOWN)
-                found.append(_picture(server.address, folder))
+                found.append(_picture(server.address, folder, size))
         finally:
             server.shutdown()
             thread.join()
     return found
 
 
-def _picture(address: str, folder: Path) -> Image.Image:
+def _picture(address: str, folder: Path, size: tuple[int, ...]) -> Image.Image:
     shot = folder / "shot.png"
-    more = f"--window-size={WIDTH},{HEIGHT}", f"--user-data-dir={folder / 'profile'}"
+    more = f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder / 'profile'}"
     command = [CHROMIUM, *OPTIONS, *more, "--hide-scrollbars", "--virtual-time-budget=8000"]
     command += [f"--screenshot={shot}", address]
     subprocess.run(command, capture_output=True, check=True, timeout=300)
@@ -124,9 +126,11 @@ def _picture(address: str, folder: Path) -> Image.Image:
         return image.convert("RGB")
 
 
-def _sheet(rows: list[tuple[str, list[Image.Image], str]], file: Path) -> None:
+def _sheet(
+    rows: list[tuple[str, list[Image.Image], str]], size: tuple[int, ...], file: Path
+) -> None:
     """Writes the pictures of all scenarios, a row for each."""
-    width, height = WIDTH // 2, HEIGHT // 2
+    width, height = size[0] // 2, size[1] // 2
     sheet = Image.new("RGB", (width * len(MOMENTS), (height + 16) * len(rows)), "white")
     pen = ImageDraw.Draw(sheet)
     for row, (name, pictures, failed) in enumerate(rows):
