@@ -117,8 +117,8 @@ class Study:
 
         `study.html` is a self-contained page with a sortable table, parallel coordinates, and a
         comparison of runs. If a folder "run<number>" exists beside the page, the page shows the
-        plots and the animation of this run. If the study has a scenario, `scenario.yaml` is
-        written, too, and the page shows the commands that create these folders.
+        plots and the animation of this run, and otherwise the command that creates the folder.
+        Without `again` a study of a scenario writes it to `scenario.yaml` for these commands.
 
         Args:
             folder: The folder to write to; created if it does not exist.
@@ -136,11 +136,11 @@ class Study:
             raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        if self.scenario is not None:
+        if self.scenario is not None and not again:
             base = folder / "scenario.yaml"
             save_scenario(self.scenario, base)
             made = ["drake-dae", "simulate", str(base), *(["--rollout"] if self.rollout else [])]
-            again = again or rerun_commands(made, self.variations, folder)
+            again = rerun_commands(made, self.variations, folder)
             duration = self.scenario.duration if duration is None else duration
         table, summary, page = (folder / name for name in FILES[:3])
         columns = self.table()

@@ -8,7 +8,7 @@ from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
-from test_any_diagram import pendulum
+from test_bench_of_any_diagram import pendulum
 
 from drake_dae import LiveBench, inline_page, replay, write_page
 
