@@ -130,6 +130,7 @@ def bench_of(
         "pushes": {
             name: {"input": place, "most": strongest[name]}
             for name, place in controls.pushes.items()
+            if name in strongest  # A payload of the plant alone is not drawn.
         },
         "prediction": compared,
         "phases": _phase_inputs(loop, inputs),
