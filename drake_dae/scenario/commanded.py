@@ -1,4 +1,4 @@
-"""A scenario whose references, surfaces and links a person can move while it runs."""
+"""Builds a scenario so that a person can move references, surfaces and links while it runs."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -32,8 +32,8 @@ class Commanded:
 
     Attributes:
         scenario: The completed scenario, with the added parameters and wrenches.
-        loop: Its closed loop.
-        context: The context of its diagram at the start.
+        loop: The closed loop of the scenario.
+        context: The initial context of the loop's diagram.
         left_out: A sentence for each kind of change that is not possible.
     """
 
@@ -47,61 +47,61 @@ class Commanded:
 def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> Commanded:
     """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
 
-    Without commands the loop runs as in the scenario: surfaces are fixed, and wrenches and
-    additional friction are zero. Signals for which a task waits are inputs of the diagram. Changes
-    that the scenario does not permit are left out.
+    Without commands the loop behaves as in the scenario: surfaces are fixed, and wrenches and
+    additional friction are zero. Signals for which a task waits are inputs of the diagram. The loop
+    omits changes that the scenario does not permit, and `left_out` contains the reasons.
 
     Args:
-        scenario: What `load_scenario` returns.
-        limits: How fast references follow commands; `CommandLimits()` if None.
+        scenario: A scenario as returned by `load_scenario`.
+        limits: The limits with which references follow commands; `CommandLimits()` if None.
 
     Raises:
-        ScenarioError: The scenario itself is not valid; the message names the key.
+        ScenarioError: The scenario itself is not valid; the message contains the key.
     """
     limits, left_out = limits or CommandLimits(), dict[str, str]()
     with suppress(DrakeDaeError):
-        return _built(scenario, _with_parts(scenario, left_out), limits, left_out)
-    # Some part does not fit: one is added after the other.
-    left_out, wanted = {}, scenario
-    found = _built(scenario, wanted, limits, left_out)
+        return _build(scenario, _with_all_parts(scenario, left_out), limits, left_out)
+    # A part does not fit: add one after the other, and omit those that fail.
+    left_out, extended = {}, scenario
+    commanded = _build(scenario, extended, limits, left_out)
     for name, add in _PARTS.items():
-        added = add(wanted)
+        result = add(extended)
         try:
-            if isinstance(added, str):
-                raise ScenarioError(("", added))
-            found = _built(scenario, added, limits, left_out)
-            wanted = added
+            if isinstance(result, str):
+                raise ScenarioError(("", result))
+            commanded = _build(scenario, result, limits, left_out)
+            extended = result
         except DrakeDaeError as error:
             left_out[name] = f"{name}: {error}"
-    return replace(found, left_out=tuple(left_out.values()))
+    return replace(commanded, left_out=tuple(left_out.values()))
 
 
-def _with_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
-    """A scenario with all parts, except those that say why not."""
+def _with_all_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
+    """Adds all possible parts, and puts the reasons for the others into `left_out`."""
     for name, add in _PARTS.items():
-        added = add(scenario)
-        if isinstance(added, str):
-            left_out[name] = f"{name}: {added}"
+        result = add(scenario)
+        if isinstance(result, str):
+            left_out[name] = f"{name}: {result}"
         else:
-            scenario = added
+            scenario = result
     return scenario
 
 
-def _built(
-    given: Scenario, wanted: Scenario, limits: CommandLimits, left_out: Mapping[str, str]
+def _build(
+    original: Scenario, extended: Scenario, limits: CommandLimits, left_out: Mapping[str, str]
 ) -> Commanded:
-    """The loop of a scenario that is made from a given one."""
-    completed, loop = build_completed(wanted, commands=limits)
-    # At rest, where the scenario itself starts at rest.
-    begun = replace(completed.scenario, exogenous=given.exogenous)
-    context = start_scenario(begun, loop)
+    """Builds the loop of an extended scenario, with the initial state of the original one."""
+    completed, loop = build_completed(extended, commands=limits)
+    # The original exogenous signals decide whether the loop starts at rest.
+    initial = replace(completed.scenario, exogenous=original.exogenous)
+    context = start_scenario(initial, loop)
     return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Makes the positions of surfaces constant exogenous signals; or says why it cannot.
+    """Makes the positions of surfaces constant exogenous signals; or returns why it cannot.
 
-    Those of a compliant contact are moved as parameters of the plant, which no law knows.
+    In a compliant contact, positions are parameters of the plant, and not of the law.
     """
     if scenario.plant.carries:
         return "none, since the surfaces of Drake's own contact stand still"
@@ -123,14 +123,14 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
 
 
 def _with_friction(scenario: Scenario) -> Scenario | str:
-    """Gives frictionless contacts a coefficient of friction of 0; or says why it cannot."""
+    """Adds a coefficient of friction of 0 to frictionless contacts; or returns why it cannot."""
     constraints = [
         replace(constraint, friction=0.0)
         if isinstance(constraint, PointOnSurface) and constraint.friction is None
         else constraint
         for constraint in scenario.constraints
     ]
-    # The plant may have a friction of its own.
+    # A compliant contact has its friction in the material.
     if constraints == scenario.constraints or scenario.plant.material is not None:
         return scenario
     if scenario.actuation:
@@ -139,9 +139,9 @@ def _with_friction(scenario: Scenario) -> Scenario | str:
 
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
-    """Adds a zero wrench to each movable link; or says why it cannot."""
+    """Adds a zero wrench to each movable link."""
     if scenario.plant.carries:
-        return scenario  # Its plant has pushes of its own.
+        return scenario  # A plant with Drake's own contact contains pushes.
     plant = robot_links(scenario.robot, SceneGraph())[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
@@ -153,19 +153,19 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
 
 
 def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
-    """A task whose phases end by hand, too, except those that make or break contact."""
+    """Makes a task's phases end also by hand, except those that make or break contact."""
     task = scenario.task
     if task is None:
         return scenario
     contacts = task.make().contacts
     phases = [
         phase
-        if phase.signal or contacts[place] != contacts[place + 1]
-        else ended_by_hand(phase, place)
-        for place, phase in enumerate(task.phases)
+        if phase.signal or contacts[index] != contacts[index + 1]
+        else ended_by_hand(phase, index)
+        for index, phase in enumerate(task.phases)
     ]
-    given = {phase.signal: 0.0 for phase in phases if phase.signal}
-    return replace(scenario, task=replace(task, phases=phases, signals={**given, **task.signals}))
+    signals = {**{phase.signal: 0.0 for phase in phases if phase.signal}, **task.signals}
+    return replace(scenario, task=replace(task, phases=phases, signals=signals))
 
 
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
@@ -174,4 +174,4 @@ _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,
 }
-"""The additions by name, in this order."""
+"""Name -> function that adds this part to a scenario, or returns why it cannot; in this order."""

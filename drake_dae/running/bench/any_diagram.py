@@ -1,6 +1,7 @@
-"""What a bench shows of any Drake diagram, and what a person changes in it."""
+"""The plots, the scene and the sliders of a bench of any Drake diagram."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 
@@ -23,10 +24,10 @@ from drake_dae.errors import ModelError
 from drake_dae.running.bench.controls import (
     Control,
     Controls,
-    of_plant,
-    of_pole,
     pushes_of,
     rounded,
+    slider_of_pole,
+    sliders_of_plant,
 )
 from drake_dae.running.bench.inputs import PUSH, Inputs
 from drake_dae.running.bench.posed import NO_BODIES, VISUALIZER, PosedBodies
@@ -35,20 +36,21 @@ from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 
 MOST_SLIDERS = 24
-"""Further numbers are set by their names."""
+"""The largest number of sliders of general blocks; the page sets other inputs by their names."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiagramParts:
-    """What a bench shows of a diagram.
+    """The parts of a diagram that a bench shows.
 
     Attributes:
         robots: The plants that are drawn as robots.
-        scene_graph: The geometry of their links, or None.
-        posed: What Drake's SceneGraph poses.
-        ports: Name -> port: all output ports of the diagram with vectors, and those of robots.
-        outputs, signals: The names of the former; names and units of their entries.
-        notes: What is not shown, a sentence for each.
+        scene_graph: The geometry of the robots' links, or None.
+        posed: The bodies that Drake's SceneGraph poses.
+        ports: Name -> port: all vector output ports of the diagram, and those of the robots.
+        outputs: The names of the diagram's vector output ports.
+        signals: Names and units of the entries of these ports.
+        notes: A sentence for each part that is not shown.
     """
 
     robots: Sequence[Plant]
@@ -61,14 +63,14 @@ class DiagramParts:
 
 
 def parts_of_diagram(diagram: Diagram, context: Context) -> DiagramParts:
-    """What a bench shows of a diagram.
+    """Returns the parts of a diagram that a bench shows.
 
     Args:
         diagram: The diagram.
-        context: Its context at the start.
+        context: Its initial context.
 
     Raises:
-        ModelError: It has no output port with a vector.
+        ModelError: The diagram has no vector output port.
     """
     wires, notes = Wires.of(diagram), list[str]()
     ports, signals = dict[str, OutputPort](), list[Signal]()
@@ -80,34 +82,32 @@ def parts_of_diagram(diagram: Diagram, context: Context) -> DiagramParts:
             "the diagram has no output port with a vector, so that a bench has nothing to plot: "
             "export one, builder.ExportOutput(system.GetOutputPort(...), name)"
         )
-    outputs, scenes = list(ports), [one for one in wires.systems if isinstance(one, SceneGraph)]
-    robots = _robots(wires, notes)
+    outputs, robots = list(ports), _robots(wires, notes)
     for robot in robots:
         for name in ("state", "constraint_force"):
             ports[f"{robot.get_name()}.{name}"] = robot.GetOutputPort(name)
-        if (moving := _exogenous(wires, robot)) is not None:
-            ports[f"{robot.get_name()}.exogenous"] = moving
-    scene_graph, posed = scenes[0] if scenes else None, NO_BODIES
-    own = [each.robot("a bench").links.plant for each in robots]
+        if (exogenous := _exogenous_source(wires, robot)) is not None:
+            ports[f"{robot.get_name()}.exogenous"] = exogenous
+    scene_graph = next((s for s in wires.systems if isinstance(s, SceneGraph)), None)
+    posed = NO_BODIES
     if scene_graph is not None:
         inspector = scene_graph.model_inspector()
-        known = [one for one in own if one is not None and one.get_source_id() is not None]
-        sources = [one.get_source_id() for one in known]
-        frames = chain.from_iterable(
-            inspector.FramesForSource(s) for s in sources if inspector.SourceIsRegistered(s)
-        )
+        multibodies = (robot.robot("a bench").links.plant for robot in robots)
+        ids = [plant.get_source_id() for plant in multibodies if plant is not None]
+        sources = [s for s in ids if s is not None and inspector.SourceIsRegistered(s)]
+        frames = chain.from_iterable(map(inspector.FramesForSource, sources))
         drawn = {"/".join((*VISUALIZER, *inspector.GetName(f).split("::"))) for f in frames}
-        multibody = [one for one in wires.systems if isinstance(one, MultibodyPlant)]
-        posed = PosedBodies.of(scene_graph, multibody, drawn)
+        plants = [system for system in wires.systems if isinstance(system, MultibodyPlant)]
+        posed = PosedBodies.of(scene_graph, plants, drawn)
         try:
             posed.poses(context)
         except RuntimeError:
             posed = NO_BODIES
             notes.append("bodies of a SceneGraph are not drawn, since its poses have no wire")
-        if not any(map(inspector.SourceIsRegistered, sources)):
+        if not sources:
             scene_graph = None
     if robots and scene_graph is None:
-        names = ", ".join(each.get_name() for each in robots)
+        names = ", ".join(robot.get_name() for robot in robots)
         notes.append(
             f"links of {names} are not drawn: add the SceneGraph of their MultibodyPlant to the "
             "diagram, builder.AddSystem(scene_graph)"
@@ -116,79 +116,79 @@ def parts_of_diagram(diagram: Diagram, context: Context) -> DiagramParts:
 
 
 def vector_outputs(diagram: Diagram) -> list[tuple[str, OutputPort]]:
-    """The output ports of a diagram with vectors, and their names."""
-    found = (diagram.get_output_port(index) for index in range(diagram.num_output_ports()))
-    vectors = (p for p in found if p.get_data_type() == PortDataType.kVectorValued and p.size())
+    """Returns name and port of a diagram's vector outputs."""
+    ports = (diagram.get_output_port(index) for index in range(diagram.num_output_ports()))
+    vectors = (p for p in ports if p.get_data_type() == PortDataType.kVectorValued and p.size())
     return [(port.get_name(), port) for port in vectors]
 
 
 def controls_of_diagram(diagram: Diagram, context: Context) -> Controls:
-    """Sliders for the numbers of a diagram, and the links that are pushed.
+    """Returns sliders for the numbers of a diagram, and the links that can be pushed.
 
-    Of a plant they are masses and coefficients of friction, of a law the pole. A parameter p of
-    another block goes from 0 to 3 p, an input or a constant from -3 |p| to 3 |p|; one that is 0
-    goes from -1 to 1.
+    A plant has sliders for masses and coefficients of friction, a law one for its pole. The range
+    of a parameter p of another block is from 0 to 3 p; of an input or a constant p, from -3 |p| to
+    3 |p|; of a value 0, from -1 to 1.
 
     Args:
         diagram: The diagram.
-        context: Its context at the start.
+        context: Its initial context.
     """
     inputs = Inputs.of(diagram, context)
-    values, found = inputs.values(context), list[Control]()
-    plants = [one for one in inputs.blocks if isinstance(one, Plant)]
-    laws = [one for one in inputs.blocks if isinstance(one, Controller)]
+    values, sliders = inputs.values(context), list[Control]()
+    plants = [block for block in inputs.blocks if isinstance(block, Plant)]
+    controllers = [block for block in inputs.blocks if isinstance(block, Controller)]
     for port, first in inputs.ports.items():
-        found += _sliders("input", inputs, values, first, port.size(), is_signed=True)
+        sliders += _sliders("input", inputs, values, first, port.size(), is_signed=True)
     for block, first in inputs.blocks.items():
         if isinstance(block, Plant | Controller) or f".{PUSH}" in inputs.names[first]:
             continue
         count = block.GetMyContextFromRoot(context).get_numeric_parameter(0).size()
         is_signed = isinstance(block, ConstantVectorSource)
         kind = "input" if is_signed else "parameter"
-        found += _sliders(kind, inputs, values, first, count, is_signed)
-    found = found[:MOST_SLIDERS]
+        sliders += _sliders(kind, inputs, values, first, count, is_signed)
+    sliders = sliders[:MOST_SLIDERS]
+    only_controller = controllers[0] if len(plants) == len(controllers) == 1 else None
     for plant in plants:
-        twin = laws[0] if len(plants) == len(laws) == 1 else None
-        found += of_plant(plant, twin, inputs, values)
-    for law in laws:
-        found += of_pole(law, inputs, values)
-    return Controls(inputs, found, pushes_of(plants, inputs))
+        sliders += sliders_of_plant(plant, only_controller, inputs, values)
+    for controller in controllers:
+        sliders += slider_of_pole(controller, inputs, values)
+    return Controls(inputs, sliders, pushes_of(plants, inputs))
 
 
 def _sliders(
     kind: str, inputs: Inputs, values: FloatArray, first: int, count: int, is_signed: bool
 ) -> list[Control]:
-    found = []
-    for place in range(first, first + count):
-        value = float(values[place])
-        most = rounded(3.0 * abs(value)) or 1.0
-        low = -most if is_signed or value <= 0.0 else 0.0
-        high = 0.0 if value < 0.0 and not is_signed else most
-        name, unit = inputs.names[place], inputs.units[place]
-        found.append(Control(kind, name, unit, low, high, value, (place,)))
-    return found
+    sliders = []
+    for index in range(first, first + count):
+        value = float(values[index])
+        reach = rounded(3.0 * abs(value)) or 1.0
+        low = -reach if is_signed or value <= 0.0 else 0.0
+        high = 0.0 if value < 0.0 and not is_signed else reach
+        name, unit = inputs.names[index], inputs.units[index]
+        sliders.append(Control(kind, name, unit, low, high, value, (index,)))
+    return sliders
 
 
 def _robots(wires: Wires, notes: list[str]) -> list[Plant]:
-    """The plants that are robots; of those with constraints of the same name, the first."""
-    found, names = list[Plant](), set[str]()
+    """Returns the plants that are robots; of several with equal names of constraints, the first."""
+    robots, names = list[Plant](), set[str]()
     for system in wires.systems:
         if not isinstance(system, Plant) or system.model is None:
             continue
-        own = {constraint.name for constraint in system.model.constraints}
-        if own & names:
+        constraints = {constraint.name for constraint in system.model.constraints}
+        if constraints & names:
             notes.append(
                 f"{system.get_name()} is not drawn: another robot has constraints of the name "
-                f"{', '.join(sorted(own & names))}"
+                f"{', '.join(sorted(constraints & names))}"
             )
             continue
-        names |= own
-        found.append(system)
-    return found
+        names |= constraints
+        robots.append(system)
+    return robots
 
 
-def _exogenous(wires: Wires, plant: Plant) -> OutputPort | None:
-    """What feeds a plant's exogenous signals."""
+def _exogenous_source(wires: Wires, plant: Plant) -> OutputPort | None:
+    """Returns the output port of a plant's exogenous signals, or None."""
     if not plant.HasInputPort("exogenous"):
         return None
     source = wires.sources.get((plant, int(plant.GetInputPort("exogenous").get_index())))
@@ -196,15 +196,13 @@ def _exogenous(wires: Wires, plant: Plant) -> OutputPort | None:
 
 
 def _signals(port: OutputPort, system: System, index: int) -> list[Signal]:
-    """Names and units of the entries of an output port, as far as its block tells them."""
-    known = tuple[Signal, ...]()
-    own = system.get_output_port(OutputPortIndex(index)).get_name()
+    """Returns names and units of the entries of an output port, from its block if possible."""
+    signals = tuple[Signal, ...]()
+    block_port = system.get_output_port(OutputPortIndex(index)).get_name()
     if isinstance(system, Traced):
-        try:
-            known = system.traced().ports.get(own, ())
-        except ModelError:  # It runs in Drake's Simulator alone.
-            known = ()
-    if len(known) == port.size():
-        return list(known)
+        with suppress(ModelError):  # Only Drake's Simulator runs this block.
+            signals = system.traced().ports.get(block_port, ())
+    if len(signals) == port.size():
+        return list(signals)
     name = port.get_name()
     return [Signal(f"{name}[{i}]" if port.size() > 1 else name) for i in range(port.size())]

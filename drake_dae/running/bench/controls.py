@@ -1,4 +1,4 @@
-"""What a person can change in a loop that runs: its numeric parameters, and what moves them."""
+"""The sliders and pushes by which a person changes the numeric parameters of a running loop."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,25 +19,26 @@ from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.phases.by_hand import BY_HAND
 
-SLOW = 0.05
-"""How fast a surface moves that no law knows, in m/s."""
+MAX_SURFACE_SPEED = 0.05
+"""The largest speed, in m/s, of a surface whose motion is not in the law's model."""
 
 _ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
-"""The order of sliders; others follow."""
+"""(kind, unit) -> the rank of a slider; all others follow."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """A slider, or something that is dragged, and the inputs that it sets.
+    """A slider, or an object that a person drags, and the inputs that it sets.
 
     Attributes:
         kind: "speed", "reference", "surface", "signal", "plant", "pole", "parameter" or "input".
-        label, unit: What it is called.
-        low, high, value: The ends of the slider, and where it begins.
-        inputs: The entries of `Inputs` that it sets.
-        known: Those of the law's model with the same meaning, which it sets if the law is to know.
-        powers: For poles: each input is `factors[i] * |value| ** powers[i]`.
-        rate: How fast it changes at most, in its unit per s; 0 for at once.
+        label, unit: Its name and unit.
+        low, high, value: The smallest, the largest and the initial value.
+        inputs: The indices in `Inputs` that it sets.
+        known: The indices of the same parameters in the law's model, which it sets, too, if the
+            person so chooses.
+        factors, powers: For poles: it sets input i to `factors[i] * |value| ** powers[i]`.
+        rate: The largest rate of change, in its unit per s; 0 for no limit.
     """
 
     kind: str
@@ -55,12 +56,12 @@ class Control:
 
 @dataclass(frozen=True, eq=False)
 class Controls:
-    """All controls of a loop, and the names of the rest.
+    """All controls of a loop or diagram.
 
     Attributes:
-        inputs: The parameters.
-        sliders: The controls that are sliders.
-        pushes: Name of a link -> the first of six inputs: force, then moment.
+        inputs: The inputs of the loop or diagram.
+        sliders: The sliders and dragged objects.
+        pushes: Name of a link -> the index of the first of six inputs: force, then moment.
     """
 
     inputs: Inputs
@@ -68,48 +69,52 @@ class Controls:
     pushes: Mapping[str, int] = field(default_factory=dict)
 
     def data(self) -> list[dict[str, Any]]:
-        """The sliders as plain data."""
-        return [asdict(each) for each in self.sliders]
+        """Returns the sliders in the form of JSON."""
+        return [asdict(slider) for slider in self.sliders]
 
 
 def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
-    """The controls of a loop.
+    """Returns the controls of a loop.
 
     Args:
         loop: The loop.
-        context: The context of its diagram at the start.
+        context: The initial context of its diagram.
         size: The size of the robot, in m.
     """
     inputs = Inputs.of(loop)
     values = inputs.values(context)
-    found = _commands(loop, inputs, context, size) + _surfaces(loop, inputs, 0.2 * size)
-    found += _unknown_surfaces(loop.plant, inputs, values, 0.2 * size)
-    found += [
-        Control("signal", name, "", 0.0, 1.0, 0.0, (place,))
-        for port, place in inputs.ports.items()
+    plant, controller = loop.plant, loop.controller
+    sliders = [
+        *_commands(loop, inputs, context, size),
+        *_exogenous_surfaces(loop, inputs, 0.2 * size),
+        *_compliant_surfaces(plant, inputs, values, 0.2 * size),
+    ]
+    sliders += [
+        Control("signal", name, "", 0.0, 1.0, 0.0, (index,))
+        for port, index in inputs.ports.items()
         if not (name := port.get_name().removeprefix(SIGNAL)).startswith(BY_HAND)
     ]
-    plant, controller = loop.plant, loop.controller
-    found += of_plant(plant, controller, inputs, values) + of_pole(controller, inputs, values)
-    return Controls(inputs, found, pushes_of([plant], inputs))
+    sliders += sliders_of_plant(plant, controller, inputs, values)
+    sliders += slider_of_pole(controller, inputs, values)
+    return Controls(inputs, sliders, pushes_of([plant], inputs))
 
 
 def pushes_of(plants: Sequence[Plant], inputs: Inputs) -> dict[str, int]:
-    """Name of a link that can be pushed -> the first of its six inputs."""
-    found = dict[str, int]()
+    """Returns the name of a link that can be pushed -> the index of the first of its six inputs."""
+    pushes = dict[str, int]()
     for plant in plants:
-        for name, place in _places(plant.dae, inputs.blocks.get(plant)).items():
+        for name, index in _parameter_indices(plant.dae, inputs.blocks.get(plant)).items():
             if name.startswith(PUSH) and name.endswith(".force.0"):
-                found[name.removeprefix(PUSH).removesuffix(".force.0")] = place
-    for place, name in enumerate(inputs.names):
+                pushes[name.removeprefix(PUSH).removesuffix(".force.0")] = index
+    for index, name in enumerate(inputs.names):
         _, is_push, link = name.partition(f".{PUSH}")
         if is_push and link.endswith(".force[0]"):
-            found.setdefault(link.removesuffix(".force[0]"), place)
-    return found
+            pushes.setdefault(link.removesuffix(".force[0]"), index)
+    return pushes
 
 
-def _places(dae: DaeSystem, first: int | None) -> dict[str, int]:
-    """Name and number of an entry of a system's parameters -> its place among the inputs."""
+def _parameter_indices(dae: DaeSystem, first: int | None) -> dict[str, int]:
+    """Returns "name.k" for entry k of a system's parameter -> its index in `Inputs`."""
     return {
         f"{parameter.name}.{k}": first + dae.parameter_slice(parameter.name).start + k
         for parameter in dae.parameters
@@ -118,130 +123,136 @@ def _places(dae: DaeSystem, first: int | None) -> dict[str, int]:
     }
 
 
-def of_plant(
+def sliders_of_plant(
     plant: Plant, controller: Controller | None, inputs: Inputs, values: FloatArray
 ) -> list[Control]:
-    """Frictions and masses: first frictions, then links from the tool on.
+    """Returns the sliders of frictions, then those of masses, from the tool to the base.
 
     Args:
         plant: The plant.
-        controller: The one whose law may know them; None without one.
+        controller: The controller whose law contains the same parameters, or None.
         inputs, values: All inputs, and their values.
     """
     first, known = inputs.blocks.get(plant), dict[str, int]()
     if controller is not None:
-        known = _places(controller.law.system, inputs.blocks.get(controller))
-    places = _places(plant.dae, first)
+        known = _parameter_indices(controller.law.system, inputs.blocks.get(controller))
+    indices = _parameter_indices(plant.dae, first)
     if first is not None:
         further = plant.further_parameters.items()
-        places |= {f"{name}.0": first + place for name, (_, place) in further}
+        indices |= {f"{name}.0": first + offset for name, (_, offset) in further}
     frictions, masses = list[Control](), list[Control]()
-    for name, place in reversed(places.items()):
-        unit, value, label = inputs.units[place], float(values[place]), name.removesuffix(".0")
-        given = (place,), (known[name],) if name in known else ()
+    for name, index in reversed(indices.items()):
+        unit, value, label = inputs.units[index], float(values[index]), name.removesuffix(".0")
+        set_inputs = (index,), (known[name],) if name in known else ()
         if label.endswith((".friction", ".viscous_friction")):
-            most = rounded(max(0.6, 2.0 * value))
-            frictions.append(Control("plant", label, unit, 0.0, most, value, *given))
+            high = rounded(max(0.6, 2.0 * value))
+            frictions.append(Control("plant", label, unit, 0.0, high, value, *set_inputs))
         elif label.endswith(".mass") and unit == "kg":
-            most = rounded(max(3.0 * value, 1.0))
-            masses.append(Control("plant", label, unit, 0.5 * value, most, value, *given))
+            high = rounded(max(3.0 * value, 1.0))
+            masses.append(Control("plant", label, unit, 0.5 * value, high, value, *set_inputs))
     return frictions + masses
 
 
 def _commands(loop: ClosedLoop, inputs: Inputs, context: Context, size: float) -> list[Control]:
-    """The speed along the path, and a change of each reference."""
+    """Returns sliders for the speed along the path, and for an offset of each reference."""
     generator = loop.generator
     if not isinstance(generator, CommandedReferences):
         return []
     first = inputs.blocks[generator]
-    layout = loop.controller.law.layout
-    now = generator.reference(context.get_time())[layout.lowest]
-    start = int(generator.commands[0] is SPEED)
-    found = []
-    if start:
-        found.append(Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,)))
-    for i, signal in enumerate(generator.commands[start:]):
-        reach = {"m": 0.15 * size, "N": max(abs(now[i]), 10.0), "N m": max(abs(now[i]), 1.0)}
-        most = rounded(reach.get(signal.unit, 0.5))
-        place = (first + start + i,)
-        found.append(Control("reference", signal.name, signal.unit, -most, most, 0.0, place))
-    return sorted(found, key=lambda each: _ORDER.get((each.kind, each.unit), 3))
+    reference = generator.reference(context.get_time())[loop.controller.law.layout.lowest]
+    has_speed = int(generator.commands[0] is SPEED)
+    sliders = []
+    if has_speed:
+        sliders.append(Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,)))
+    for i, signal in enumerate(generator.commands[has_speed:]):
+        r = abs(reference[i])
+        ranges = {"m": 0.15 * size, "N": max(r, 10.0), "N m": max(r, 1.0)}
+        high = rounded(ranges.get(signal.unit, 0.5))
+        index = (first + has_speed + i,)
+        sliders.append(Control("reference", signal.name, signal.unit, -high, high, 0.0, index))
+    return sorted(sliders, key=lambda slider: _ORDER.get((slider.kind, slider.unit), 3))
 
 
-def _surfaces(loop: ClosedLoop, inputs: Inputs, reach: float) -> list[Control]:
-    """The positions of surfaces, for plant and law."""
-    generators = loop.plant_exogenous, loop.exogenous
-    found = dict[str, list[int]]()
-    for generator in generators:
+def _exogenous_surfaces(loop: ClosedLoop, inputs: Inputs, distance: float) -> list[Control]:
+    """Returns sliders for the positions of surfaces, which move in the plant and in the law."""
+    indices_of = dict[str, list[int]]()
+    for generator in (loop.plant_exogenous, loop.exogenous):
         if isinstance(generator, CommandedReferences):
             for i, signal in enumerate(generator.commands):
-                found.setdefault(signal.name, []).append(inputs.blocks[generator] + i)
-    most = rounded(reach)
+                indices_of.setdefault(signal.name, []).append(inputs.blocks[generator] + i)
+    high = rounded(distance)
     return [
-        Control("surface", name, inputs.units[places[0]], -most, most, 0.0, tuple(places))
-        for name, places in found.items()
-        if ".position" in name and inputs.units[places[0]] == "m"
+        Control("surface", name, "m", -high, high, 0.0, tuple(indices))
+        for name, indices in indices_of.items()
+        if ".position" in name and inputs.units[indices[0]] == "m"
     ]
 
 
-def _unknown_surfaces(
-    plant: Plant, inputs: Inputs, values: FloatArray, reach: float
+def _compliant_surfaces(
+    plant: Plant, inputs: Inputs, values: FloatArray, distance: float
 ) -> list[Control]:
-    """The positions of the surfaces of a compliant contact, which no law knows.
+    """Returns sliders for the positions of the surfaces of a compliant contact.
 
-    They are parameters of the plant, and so change in steps: slow ones, which are small.
+    They are parameters of the plant and not of the law, and change in steps. The limited rate makes
+    the steps small.
     """
     if plant.is_ideal or plant.model is None or plant not in inputs.blocks:
         return []
-    places, moving = _places(plant.dae, inputs.blocks[plant]), plant.dae.exogenous.moving
-    known, most, found = {one.name for one in moving}, rounded(reach), list[Control]()
+    indices = _parameter_indices(plant.dae, inputs.blocks[plant])
+    exogenous = {parameter.name for parameter in plant.dae.exogenous.moving}
+    reach, sliders = rounded(distance), list[Control]()
     for constraint in plant.model.constraints:
         name = f"{constraint.name}.position"
-        for k in range(3) if f"{name}.0" in places and name not in known else ():
-            place = places[f"{name}.{k}"]
-            value, label = float(values[place]), inputs.names[place].partition(".")[2]
-            limits = value - most, value + most, value
-            found.append(Control("surface", label, "m", *limits, (place,), rate=SLOW))
-    return found
+        if f"{name}.0" not in indices or name in exogenous:
+            continue
+        for k in range(3):
+            index = indices[f"{name}.{k}"]
+            value, label = float(values[index]), inputs.names[index].partition(".")[2]
+            limits = value - reach, value + reach, value
+            sliders.append(
+                Control("surface", label, "m", *limits, (index,), rate=MAX_SURFACE_SPEED)
+            )
+    return sliders
 
 
-def of_pole(controller: Controller, inputs: Inputs, values: FloatArray) -> list[Control]:
-    """One pole for all errors, where the gains are those of one pole."""
+def slider_of_pole(controller: Controller, inputs: Inputs, values: FloatArray) -> list[Control]:
+    """Returns a slider for the pole of all errors; none if the gains do not have a single pole."""
     law = controller.law
     if not controller.follows or controller not in inputs.blocks:
         return []
     first = inputs.blocks[controller]
     size = law.system.parameter_vector(None).size
     try:
-        at = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
+        gains = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
     except GainError:
         return []
-    places = [first + size + i for i in range(at[1.0].size)]
-    factors = at[1.0]
-    powers = np.round(np.log2(np.where(factors, at[2.0] / np.where(factors, factors, 1.0), 1.0)))
-    if not places or not np.allclose(factors * 3.0**powers, at[3.0], rtol=1e-9):
+    factors = gains[1.0]
+    indices = [first + size + i for i in range(factors.size)]
+    powers = np.round(np.log2(np.where(factors, gains[2.0] / np.where(factors, factors, 1.0), 1.0)))
+    if not indices or not np.allclose(factors * 3.0**powers, gains[3.0], rtol=1e-9):
         return []
-    # The mean of all poles; eigenvalues that coincide are not found exactly.
-    own = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
-    if not np.allclose(values[places], factors * own**powers, rtol=1e-9):
+    # The mean of all poles, since the computed eigenvalues of a multiple pole are not exact.
+    pole = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
+    if not np.allclose(values[indices], factors * pole**powers, rtol=1e-9):
         return []
-    given = tuple(places), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
-    most = rounded(max(4.0 * own, 20.0))
-    return [Control("pole", "pole of all errors", "1/s", -most, -0.5, -own, *given)]
+    set_inputs = tuple(indices), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
+    fastest = rounded(max(4.0 * pole, 20.0))
+    return [Control("pole", "pole of all errors", "1/s", -fastest, -0.5, -pole, *set_inputs)]
 
 
 def rounded(value: float) -> float:
-    """A number of one or two digits near a value."""
+    """Returns a value rounded to one significant digit."""
     return float(f"{value:.1g}")
 
 
 def prediction(loop: ClosedLoop, inputs: Inputs) -> dict[str, Any] | None:
-    """How the error is predicted: E of e' = E e (30), and which of e each output shows.
+    """Returns the data for the prediction of the error: E of e' = E e (30), and its outputs.
 
     Returns:
-        "size"; "ends": the rows of E that hold gains; "gains": (row, column, input) of each;
-        "shown": (output, coordinate, whether its derivative is shown), without outputs whose error
-        is zero. None where the errors of a controller are no linear system.
+        "size": the number of error coordinates; "ends": the rows of E that contain gains; "gains":
+        (row, column, index in `Inputs`) of each gain; "shown": (output, coordinate, whether the
+        derivative is shown), without outputs whose error is zero. None if the controller's errors
+        do not form a linear system.
     """
     controller = loop.controller
     if not (controller.follows and loop.generator is not None and controller in inputs.blocks):
@@ -253,8 +264,8 @@ def prediction(loop: ClosedLoop, inputs: Inputs) -> dict[str, Any] | None:
     first = inputs.blocks[controller] + law.system.parameter_vector(None).size
     row_of = dict(zip(layout.dynamic.tolist(), layout.ends.tolist(), strict=True))
     gains = [
-        (row_of[i], j, first + number)
-        for number, (i, j) in enumerate(
+        (row_of[i], j, first + k)
+        for k, (i, j) in enumerate(
             (i, j)
             for j in range(layout.chain_size)
             for i in np.flatnonzero(law.gains.matrix[:, j]).tolist()

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Self
 
 from pydrake.systems.analysis import SimulatorConfig
@@ -12,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
-from drake_dae.running.bench.live import PATIENCE, Server
+from drake_dae.running.bench.live import POLL_INTERVAL, Server
 from drake_dae.running.bench.page import page_text
 from drake_dae.running.bench.run import Commands
 from drake_dae.simulation.records.record import Record
@@ -26,29 +25,29 @@ def inline_page(
     title: str = "",
     notes: Sequence[str] = (),
 ) -> InlinePage:
-    """The page of `write_page` as text, which a notebook shows in its place.
+    """Returns the page of `write_page` as an object that a notebook displays in its output cell.
 
-    It runs without this process, and stays in the notebook's file. Arguments and errors are those
-    of `write_page`.
+    The page runs without this process, and is stored in the notebook's file. For arguments and
+    errors see `write_page`.
     """
     return InlinePage(page_text(loop, context, config, title, notes))
 
 
 @checked(ModelError)
 class LiveBench:
-    """The bench of `live` beside this process's own work, which a notebook shows in its place.
+    """Runs the bench of `live` in the background; a notebook displays its page in an output cell.
 
-    It runs in a thread of its own until `close` is called or the process ends. Only this machine
-    reaches it: a notebook in a browser on another one shows an empty frame.
+    The bench runs in a separate thread until `close` is called or the process ends. Only browsers
+    on this machine reach it: a notebook in a browser on another machine shows an empty frame.
 
     Args:
-        loop, context, config, title, notes, port: As of `live`.
+        loop, context, config, title, notes, port: See `live`.
 
     Attributes:
-        address: The address of its page.
+        address: The address of the page.
 
     Raises:
-        ModelError: The plant of a loop is no robot; or a diagram has no output port with a vector.
+        ModelError: The plant of a loop is not a robot, or a diagram has no vector output port.
         OSError: The port is in use.
     """
 
@@ -61,26 +60,26 @@ class LiveBench:
         notes: Sequence[str] = (),
         port: int = 0,
     ) -> None:
-        self._server = Server(loop, context, config, title, notes, self._kept, port)
+        self._server = Server(loop, context, config, title, notes, self._saved, port)
         self.address = self._server.address
         serve = self._server.serve_forever
-        self._thread = threading.Thread(target=serve, args=(PATIENCE,), daemon=True)
+        self._thread = threading.Thread(target=serve, args=(POLL_INTERVAL,), daemon=True)
         self._thread.start()
 
     @property
     def record(self) -> Record:
-        """The record so far."""
+        """The record from the start until now."""
         with self._server.lock:
             return self._server.run.record()
 
     @property
     def commands(self) -> Commands:
-        """What was changed so far, as `replay` takes it."""
+        """The changes from the start until now, for `replay`."""
         with self._server.lock:
             return self._server.run.commands
 
     def close(self) -> None:
-        """Ends it; its page then says so."""
+        """Ends the run and its server; the page then reports this."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -88,12 +87,7 @@ class LiveBench:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -104,5 +98,5 @@ class LiveBench:
         return f'<iframe src="{self.address}" style="{style}"></iframe>'
 
     @staticmethod
-    def _kept(run: object) -> str:
+    def _saved(run: object) -> str:
         return "its record and commands are those of the LiveBench"

@@ -1,7 +1,8 @@
-"""The numbers of a diagram that a person changes while it runs."""
+"""The numbers of a diagram that a person can change while the diagram runs."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from pydrake.common.value import Value
@@ -27,7 +28,7 @@ from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.plants.contract import Plant
 
 PUSH = "push."
-"""Begins the names of the wrenches that push links."""
+"""The prefix of the names of the wrenches that push links."""
 
 _WRENCH = [
     (f"{part}[{k}]", unit) for part, unit in (("force", "N"), ("moment", "N m")) for k in range(3)
@@ -37,14 +38,14 @@ _Forces = Value[list[ExternallyAppliedSpatialForce]]
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """The numeric parameters of the blocks of a diagram, below each other, and its free inputs.
+    """The numeric parameters of the blocks of a diagram, and its free inputs, as one vector.
 
     Attributes:
-        blocks: The blocks, each with numeric parameter 0, and where its entries begin.
-        ports: Input ports without a wire -> where their entries begin.
-        pushed: Plants of Drake's whose links are pushed through the port `applied_spatial_force`,
-            which has no wire -> where the wrenches of their links begin.
-        names, units: Those of each entry.
+        blocks: A block with numeric parameter 0 -> the index of its first entry.
+        ports: An input port without connection -> the index of its first entry.
+        pushed: One of Drake's own plants whose port `applied_spatial_force` has no connection, so
+            that it can push the links -> the index of the first entry of the links' wrenches.
+        names, units: The name and the unit of each entry.
     """
 
     blocks: Mapping[System, int]
@@ -55,35 +56,40 @@ class Inputs:
 
     @classmethod
     def of(cls, loop: ClosedLoop | Diagram, context: Context | None = None) -> "Inputs":
-        """Those of the generators, the plant and the controller of a loop, or of all blocks.
+        """Returns the inputs of a loop or diagram.
+
+        The blocks of a loop are its generators, plant and controller; of a diagram, all blocks.
 
         Args:
             loop: The loop, or any diagram.
-            context: The context of the diagram in which inputs have values; the default if None.
+            context: A context of the diagram, with the values of its inputs; the default context if
+                None.
         """
         diagram = loop if isinstance(loop, Diagram) else loop.diagram
         if context is None:
             context = diagram.CreateDefaultContext()
         if isinstance(loop, Diagram):
-            made, free, plants = _all(loop, context)
+            systems, free, plants = _parts_of_diagram(loop, context)
         else:
             sources = loop.generator, loop.exogenous, loop.plant_exogenous
-            made = [*sources, loop.plant, loop.controller, loop.plant.pushes]
-            free, plants = _signals(diagram), []
+            systems = [*sources, loop.plant, loop.controller, loop.plant.pushes]
+            inputs = [(port.get_name(), port) for port in _vector_inputs(diagram)]
+            free, plants = [(name, p) for name, p in inputs if name.startswith(SIGNAL)], []
         blocks, signals = dict[System, int](), list[Signal]()
-        for block in made:
-            # Drake's own contact is a Diagram, whose numbers are those of many blocks.
+        for block in systems:
+            # A plant with Drake's own contact is a Diagram: it contains many blocks.
             if not isinstance(block, LeafSystem):
                 continue
-            own = block.GetMyContextFromRoot(context)
-            if own.num_numeric_parameter_groups():
+            block_context = block.GetMyContextFromRoot(context)
+            if block_context.num_numeric_parameter_groups():
                 blocks[block] = len(signals)
-                signals += parameters_of_block(block, own.get_numeric_parameter(0).size())
+                size = block_context.get_numeric_parameter(0).size()
+                signals += parameters_of_block(block, size)
         ports, pushed = dict[InputPort, int](), dict[MultibodyPlant, int]()
         for name, port in free:
             ports[port] = len(signals)
-            several = [f"{name}[{i}]" for i in range(port.size())] if port.size() > 1 else [name]
-            signals += map(Signal, several)
+            names = [f"{name}[{i}]" for i in range(port.size())] if port.size() > 1 else [name]
+            signals += map(Signal, names)
         for plant in plants:
             pushed[plant] = len(signals)
             signals += [
@@ -91,127 +97,119 @@ class Inputs:
                 for body in _links(plant)
                 for part, unit in _WRENCH
             ]
-        found = distinct(signals)
-        return cls(blocks, ports, [s.name for s in found], [s.unit for s in found], pushed)
+        signals = distinct(signals)
+        return cls(blocks, ports, [s.name for s in signals], [s.unit for s in signals], pushed)
 
     def values(self, context: Context) -> FloatArray:
-        """Their values in a context of the diagram; zero where a port has none."""
-        own = (block.GetMyContextFromRoot(context) for block in self.blocks)
-        parts = [each.get_numeric_parameter(0).CopyToVector() for each in own]
-        for port in self.ports:
-            at = port.get_system().GetMyContextFromRoot(context)
-            parts.append(port.Eval(at) if port.HasValue(at) else np.zeros(port.size()))
-        parts += [self._wrenches(plant, context) for plant in self.pushed]
+        """Returns their values in a context of the diagram; zero for ports without a value."""
+        contexts = (block.GetMyContextFromRoot(context) for block in self.blocks)
+        parts = [c.get_numeric_parameter(0).CopyToVector() for c in contexts]
+        parts += [_port_value(port, context) for port in self.ports]
+        parts += [_wrenches(plant, context) for plant in self.pushed]
         return np.concatenate([np.zeros(0), *parts])
 
     def set(self, context: Context, changes: Mapping[int, float]) -> None:
-        """Changes entries in a context."""
+        """Sets entries in a context: index -> value."""
         for block, first in self.blocks.items():
-            own = block.GetMyMutableContextFromRoot(context)
-            values = own.get_numeric_parameter(0).CopyToVector()
-            if _changed(values, first, changes):
-                own.get_mutable_numeric_parameter(0).SetFromVector(values)
+            block_context = block.GetMyMutableContextFromRoot(context)
+            values = block_context.get_numeric_parameter(0).CopyToVector()
+            if _apply_changes(values, first, changes):
+                block_context.get_mutable_numeric_parameter(0).SetFromVector(values)
         for port, first in self.ports.items():
-            own = port.get_system().GetMyMutableContextFromRoot(context)
-            values = np.array(port.Eval(own)) if port.HasValue(own) else np.zeros(port.size())
-            if _changed(values, first, changes):
-                port.FixValue(own, values)
+            values = _port_value(port, context)
+            if _apply_changes(values, first, changes):
+                port.FixValue(port.get_system().GetMyMutableContextFromRoot(context), values)
         for plant, first in self.pushed.items():
-            values = self._wrenches(plant, context)
-            if _changed(values, first, changes):
-                applied = [
-                    _applied(BodyIndex(number), row)
-                    for number, row in enumerate(values.reshape(-1, 6), start=1)
+            values = _wrenches(plant, context)
+            if _apply_changes(values, first, changes):
+                forces = [
+                    _spatial_force(BodyIndex(i), wrench)
+                    for i, wrench in enumerate(values.reshape(-1, 6), start=1)
                 ]
-                own = plant.GetMyMutableContextFromRoot(context)
-                plant.get_applied_spatial_force_input_port().FixValue(own, _Forces(applied))
-
-    @staticmethod
-    def _wrenches(plant: MultibodyPlant, context: Context) -> FloatArray:
-        port = plant.get_applied_spatial_force_input_port()
-        own, found = plant.GetMyContextFromRoot(context), np.zeros((plant.num_bodies() - 1, 6))
-        for one in port.Eval(own) if port.HasValue(own) else ():
-            wrench = one.F_Bq_W
-            found[int(one.body_index) - 1] = [*wrench.translational(), *wrench.rotational()]
-        return found.ravel()
+                plant_context = plant.GetMyMutableContextFromRoot(context)
+                port = plant.get_applied_spatial_force_input_port()
+                port.FixValue(plant_context, _Forces(forces))
 
 
-def started(diagram: Diagram, context: Context) -> Context:
-    """A copy of a context of a diagram in which all vector inputs have values: zero if none."""
-    found = context.Clone()
-    for index in range(diagram.num_input_ports()):
-        port = diagram.get_input_port(index)
-        if port.get_data_type() == PortDataType.kVectorValued and not port.HasValue(found):
-            port.FixValue(found, np.zeros(port.size()))
-    return found
+def _port_value(port: InputPort, context: Context) -> FloatArray:
+    """Returns a copy of the value of an input port; zero without a value."""
+    system_context = port.get_system().GetMyContextFromRoot(context)
+    has_value = port.HasValue(system_context)
+    return np.array(port.Eval(system_context)) if has_value else np.zeros(port.size())
 
 
-def _changed(values: FloatArray, first: int, changes: Mapping[int, float]) -> bool:
-    """Puts changes of entries into the values that begin at one of them; whether there were any."""
-    own = {i - first: x for i, x in changes.items() if first <= i < first + values.size}
-    values[list(own)] = list(own.values())
-    return bool(own)
+def _wrenches(plant: MultibodyPlant, context: Context) -> FloatArray:
+    """Returns force and moment on each link, below each other."""
+    port = plant.get_applied_spatial_force_input_port()
+    plant_context = plant.GetMyContextFromRoot(context)
+    wrenches = np.zeros((plant.num_bodies() - 1, 6))
+    for force in port.Eval(plant_context) if port.HasValue(plant_context) else ():
+        F = force.F_Bq_W
+        wrenches[int(force.body_index) - 1] = [*F.translational(), *F.rotational()]
+    return wrenches.ravel()
 
 
-def _signals(diagram: Diagram) -> list[tuple[str, InputPort]]:
-    """The inputs of a loop for the signals for which its task waits."""
-    ports = (diagram.get_input_port(i) for i in range(diagram.num_input_ports()))
-    return [(port.get_name(), port) for port in ports if port.get_name().startswith(SIGNAL)]
+def with_input_values(diagram: Diagram, context: Context) -> Context:
+    """Returns a copy of a context of a diagram, with zero for vector inputs without a value."""
+    copy = context.Clone()
+    for port in _vector_inputs(diagram):
+        if not port.HasValue(copy):
+            port.FixValue(copy, np.zeros(port.size()))
+    return copy
 
 
-def _all(
+def _vector_inputs(system: System) -> list[InputPort]:
+    ports = (system.get_input_port(index) for index in range(system.num_input_ports()))
+    return [port for port in ports if port.get_data_type() == PortDataType.kVectorValued]
+
+
+def _apply_changes(values: FloatArray, first: int, changes: Mapping[int, float]) -> bool:
+    """Changes values in place, of which `first` is the first index; returns whether any changed."""
+    local = {i - first: x for i, x in changes.items() if first <= i < first + values.size}
+    values[list(local)] = list(local.values())
+    return bool(local)
+
+
+def _parts_of_diagram(
     diagram: Diagram, context: Context
 ) -> tuple[list[System | None], list[tuple[str, InputPort]], list[MultibodyPlant]]:
-    """All blocks of a diagram, its free inputs, and its plants whose links may be pushed.
+    """Returns a diagram's blocks, its free inputs, and Drake's own plants with a free force port.
 
-    An input port of a block that is no input of the diagram is free where it has a value.
+    Free are the inputs of the diagram, and unconnected inputs of blocks that have a fixed value.
     """
-    wires, exported = Wires.of(diagram), set[tuple[System, int]]()
-    free = list[tuple[str, InputPort]]()
-    for index in range(diagram.num_input_ports()):
-        port = diagram.get_input_port(index)
-        exported |= set(leaf_inputs(diagram, index))
-        if port.get_data_type() == PortDataType.kVectorValued and port.size():
-            free.append((port.get_name(), port))
+    wires, count = Wires.of(diagram), diagram.num_input_ports()
+    exported = list(chain.from_iterable(leaf_inputs(diagram, index) for index in range(count)))
+    free = [(port.get_name(), port) for port in _vector_inputs(diagram) if port.size()]
     blocks, plants = list[System | None](), list[MultibodyPlant]()
     for system in wires.systems:
-        # Bodies and geometry have parameters without names.
+        # The parameters of bodies and geometry have no names.
         if not isinstance(system, MultibodyPlant | SceneGraph):
             blocks.append(system)
         if isinstance(system, Plant):
             blocks.append(system.pushes)
-        taken = {port for giver, port in wires.sources if giver is system}
-        taken |= {port for giver, port in exported if giver is system}
-        free += _with_values(system, taken, context)
+        connected = {port for target, port in chain(wires.sources, exported) if target is system}
+        system_context = system.GetMyContextFromRoot(context)
+        free += [
+            (f"{block_name(system)}.{port.get_name()}", port)
+            for port in _vector_inputs(system)
+            if int(port.get_index()) not in connected and port.HasValue(system_context)
+        ]
         if isinstance(system, MultibodyPlant):
-            own = system.get_applied_spatial_force_input_port()
-            at = system.GetMyContextFromRoot(context)
-            if int(own.get_index()) not in taken and not own.HasValue(at):
+            port = system.get_applied_spatial_force_input_port()
+            if int(port.get_index()) not in connected and not port.HasValue(system_context):
                 plants.append(system)
     return blocks, free, plants
 
 
-def _with_values(
-    system: System, taken: set[int], context: Context
-) -> Iterator[tuple[str, InputPort]]:
-    """The input ports of a block without a wire, and with a value in a context."""
-    own = system.GetMyContextFromRoot(context)
-    for index in range(system.num_input_ports()):
-        port = system.get_input_port(index)
-        is_vector = port.get_data_type() == PortDataType.kVectorValued
-        if is_vector and index not in taken and port.HasValue(own):
-            yield f"{block_name(system)}.{port.get_name()}", port
-
-
 def _links(plant: MultibodyPlant) -> list[str]:
-    """The names of the links of a plant, in the order of their wrenches."""
+    """Returns the names of the links of a plant, in the order of their wrenches."""
     bodies = (plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies()))
     return [body.scoped_name().get_full() for body in bodies]
 
 
-def _applied(body: BodyIndex, wrench: FloatArray) -> ExternallyAppliedSpatialForce:
-    """A force and a moment at the origin of a body."""
-    found = ExternallyAppliedSpatialForce()
-    found.body_index = body
-    found.F_Bq_W = SpatialForce(wrench[3:], wrench[:3])
-    return found
+def _spatial_force(body: BodyIndex, wrench: FloatArray) -> ExternallyAppliedSpatialForce:
+    """Returns a force and a moment, in this order in `wrench`, at the origin of a body."""
+    force = ExternallyAppliedSpatialForce()
+    force.body_index = body
+    force.F_Bq_W = SpatialForce(wrench[3:], wrench[:3])
+    return force

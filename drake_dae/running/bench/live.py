@@ -1,4 +1,4 @@
-"""A loop that runs in this process, while a person changes it in a browser."""
+"""Runs a loop in this process, while a person changes it in a browser."""
 
 import errno
 import json
@@ -23,35 +23,35 @@ from drake_dae.running.bench.page import page_of, title_of, web_text
 from drake_dae.running.bench.run import HandRun, Sampler
 
 HOST = "127.0.0.1"
-"""Nobody else reaches it."""
+"""The address of the server, which only programs on this machine reach."""
 
-MOST = 1_000_000
-"""The longest request, in bytes."""
+MOST_BYTES = 1_000_000
+"""The largest size of a request."""
 
 MOST_TICKS = 60
-"""The most ticks of a request."""
+"""The largest number of ticks in a request."""
 
-PATIENCE = 0.5
-"""How often, in s, a server without requests looks whether it should end."""
+POLL_INTERVAL = 0.5
+"""The time, in s, between two checks of an idle server whether it should end."""
 
 
 class Server(ThreadingHTTPServer):
-    """Serves the page of a bench to this machine, and runs its loop as the page asks.
+    """Serves the page of a bench to this machine, and runs its loop at the page's requests.
 
-    The page's address has a secret, so that no other page of the browser can reach it.
+    The page's address contains a secret, so that no other page of the browser can reach it.
 
     Args:
-        loop, context, config, title, notes: As of `live`.
-        save: (run) -> what was saved, in words.
-        port: The port; 0 for any that is free.
+        loop, context, config, title, notes: See `live`.
+        save: Saves the run, and returns a text that the page shows.
+        port: The port; 0 for any free port.
 
     Attributes:
         address: The address of the page.
         run: The present run.
-        lock: Held while the run advances.
+        lock: The lock of the run.
 
     Raises:
-        ModelError: The plant is no robot.
+        ModelError: The plant of a loop is not a robot, or a diagram has no vector output port.
         OSError: The port is in use.
     """
 
@@ -72,53 +72,57 @@ class Server(ThreadingHTTPServer):
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
-            what = f"port {port} on this machine is in use: choose another, or 0 for any"
-            text = what if error.errno == errno.EADDRINUSE else f"port {port}: {error.strerror}"
+            text = f"port {port}: {error.strerror}"
+            if error.errno == errno.EADDRINUSE:
+                text = f"port {port} on this machine is in use: choose another, or 0 for any"
             raise OSError(error.errno, text) from None
         try:
             diagram = loop if isinstance(loop, Diagram) else loop.diagram
             context = diagram.CreateDefaultContext() if context is None else context
             bench = bench_of(loop, context, title or title_of(loop), notes)
             self._sampler = Sampler(bench)
-            self._made = loop, context, config
+            self._arguments = loop, context, config
             self._save, self.lock = save, threading.Lock()
             self.path = f"/{secrets.token_urlsafe(12)}/"
             self.address = f"http://{HOST}:{self.server_port}{self.path}"
-            self.page = page_of(
-                bench, bench.data | {"kind": "live"}, [web_text("live.js")], "'self'"
-            )
+            data = bench.data | {"kind": "live"}
+            self.page = page_of(bench, data, [web_text("live.js")], "'self'")
             self.start()
         except BaseException:
             self.server_close()
             raise
 
     def start(self) -> dict[str, Any]:
-        """Begins again."""
-        self.run = HandRun(*self._made)
+        """Begins a new run; returns its first sample."""
+        self.run = HandRun(*self._arguments)
         return {"samples": [self._sampler(self.run.context)]}
 
-    def answer(self, what: str, told: Any) -> dict[str, Any]:
-        """What the page gets for a request.
+    def answer(self, request: str, data: Any) -> dict[str, Any]:
+        """Returns the answer to a request of the page.
+
+        Args:
+            request: "start", "save" or "advance".
+            data: For "advance", the number of "ticks", and "set", a list of (input, value).
 
         Raises:
-            ModelError: It asks for what there is not.
-            DrakeDaeError: The loop cannot go on.
+            ModelError: There is no such request or input, or the data are wrong.
+            DrakeDaeError: The loop cannot continue.
         """
-        with self.lock:  # A browser keeps several connections, each of which has a thread.
-            return self._answer(what, told)
+        with self.lock:  # A browser opens several connections; each has its own thread.
+            return self._answer(request, data)
 
-    def _answer(self, what: str, told: Any) -> dict[str, Any]:
-        if what == "start":
+    def _answer(self, request: str, data: Any) -> dict[str, Any]:
+        if request == "start":
             return self.start()
-        if what == "save" and self._save is not None:
+        if request == "save" and self._save is not None:
             return {"saved": self._save(self.run)}
-        if what != "advance":
-            raise ModelError(f"a bench does not know '{what}'")
+        if request != "advance":
+            raise ModelError(f"a bench does not know '{request}'")
         try:
-            changes = {int(number): float(value) for number, value in told["set"]}
-            ticks = int(told["ticks"])
+            changes = {int(index): float(value) for index, value in data["set"]}
+            ticks = int(data["ticks"])
         except (TypeError, ValueError, KeyError):
-            raise ModelError("a bench is asked for ticks, with a list of changes") from None
+            raise ModelError("a bench needs a number of ticks, and a list of changes") from None
         self.run.set(changes)
         samples = []
         for _ in range(min(ticks, MOST_TICKS)):
@@ -134,28 +138,26 @@ class _Handler(BaseHTTPRequestHandler):
     server: Server
 
     def do_GET(self) -> None:
-        if self._is_ours(self.server.path):
+        if self._is_from_page(self.path == self.server.path):
             self._send(self.server.page.encode(), "text/html; charset=utf-8")
 
     def do_POST(self) -> None:
-        if not self._is_ours(self.server.path, is_whole=False):
+        if not self._is_from_page(self.path.startswith(self.server.path)):
             return
         size = int(self.headers.get("Content-Length") or 0)
-        if not 0 <= size <= MOST:
+        if not 0 <= size <= MOST_BYTES:
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
         try:
-            told = json.loads(self.rfile.read(size) or b"null")
-            found = self.server.answer(self.path.removeprefix(self.server.path), told)
+            data = json.loads(self.rfile.read(size) or b"null")
+            answer = self.server.answer(self.path.removeprefix(self.server.path), data)
         except (DrakeDaeError, RuntimeError, ValueError, OSError) as error:
-            found = {"error": " ".join(str(error).split())}
-        self._send(json.dumps(found).encode(), "application/json")
+            answer = {"error": " ".join(str(error).split())}
+        self._send(json.dumps(answer).encode(), "application/json")
 
-    def _is_ours(self, path: str, is_whole: bool = True) -> bool:
-        """Whether a request comes from the page, and not from elsewhere in the browser."""
-        is_path = self.path == path if is_whole else self.path.startswith(path)
-        host = self.headers.get("Host", "")
-        if is_path and host in (f"{HOST}:{self.server.server_port}",):
+    def _is_from_page(self, has_secret: bool) -> bool:
+        """Returns whether a request comes from the page; sends an error if it does not."""
+        if has_secret and self.headers.get("Host") == f"{HOST}:{self.server.server_port}":
             return True
         self.send_error(HTTPStatus.NOT_FOUND)
         return False
@@ -170,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, *arguments: Any) -> None:
-        """Nothing is printed."""
+        """Prints nothing."""
 
 
 @checked(ModelError)
@@ -189,43 +191,45 @@ def live(
 ) -> None:
     """Runs a loop or diagram in real time, with a page in the browser to change it, until Ctrl-C.
 
-    The page is that of `write_page`, but the loop runs here, by Drake's Simulator, so that it may
-    have what no export has: Drake's own contact, contacts that open, tasks, blocks of your own.
-    Only this machine reaches the page. What is changed takes effect at the next 1/120 s; "save"
-    writes the record and the commands, which `replay` runs again.
+    The page is that of `write_page`, but the loop runs in this process, by Drake's Simulator.
+    Therefore it may contain parts that cannot be exported: Drake's own contact, contacts that open,
+    tasks, and your own blocks. Only browsers on this machine reach the page. A change takes effect
+    at the next multiple of 1/120 s. "save" writes the record and the commands; `replay` repeats
+    such a run.
 
-    Any diagram with an output port of a vector has a bench, see `write_page`. Bodies that its
-    SceneGraph poses are drawn, and links of a MultibodyPlant whose port `applied_spatial_force` is
-    free are pushed.
+    `live` supports any diagram with a vector output port, see `write_page`. The page draws the
+    bodies that its SceneGraph poses. Links of a MultibodyPlant can be pushed if its port
+    `applied_spatial_force` has no connection.
 
     Args:
-        loop, context, config, title, notes: As of `write_page`; of the settings all are used
-            except the rate of real time.
-        folder: Where "save" writes record.npz and commands.json; made if there is none.
-        port: The port; 0 for any that is free.
+        loop, context, config, title, notes: See `write_page`. All settings of `config` apply,
+            except the real-time rate.
+        folder: The folder in which "save" writes record.npz and commands.json; it is created if
+            necessary.
+        port: The port; 0 for any free port.
         opens: Whether to open the page in a browser.
-        tell: What prints a line.
-        save: What saves a run, and says so in words; into the folder if None.
+        tell: Prints a line.
+        save: Saves a run, and returns a text that the page shows; None to save it in the folder.
 
     Raises:
-        ModelError: The plant of a loop is no robot; or a diagram has no output port with a vector.
+        ModelError: The plant of a loop is not a robot, or a diagram has no vector output port.
         OSError: The port is in use.
     """
 
-    def saved(run: HandRun) -> str:
+    def save_in_folder(run: HandRun) -> str:
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         run.record().save(target / "record.npz")
         run.commands.save(target / "commands.json")
         return str(target)
 
-    with Server(loop, context, config, title, notes, save or saved, port) as server:
+    with Server(loop, context, config, title, notes, save or save_in_folder, port) as server:
         tell(f"{server.address}  (Ctrl-C ends it)")
         if opens:
-            opened = False
+            is_open = False
             with suppress(webbrowser.Error):
-                opened = webbrowser.open(server.address)
-            if not opened:
+                is_open = webbrowser.open(server.address)
+            if not is_open:
                 tell("found no browser here; open this address in one on this machine")
         with suppress(KeyboardInterrupt):
-            server.serve_forever(PATIENCE)
+            server.serve_forever(POLL_INTERVAL)

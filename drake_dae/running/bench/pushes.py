@@ -1,4 +1,4 @@
-"""How hard links are pushed."""
+"""The largest forces by which a person pushes links."""
 
 from collections.abc import Sequence
 
@@ -18,45 +18,48 @@ def strongest_pushes(
     links: Sequence[str],
     rate: float,
 ) -> dict[str, float]:
-    """Link -> the force of the strongest push on it, N.
+    """Returns link -> the force of the strongest push on it, N.
 
-    A law with poles at -p holds a mass m as a spring of stiffness m p^2 does, and the mass felt at
-    the link's origin is 1 / (J M^-1 J^T). So a force m p^2 d moves it by d.
+    A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
+    at the link's origin is 1 / (J M^-1 J^T). So a force m p^2 d moves the link by d.
 
     Args:
-        robots, plants: Robots, and plants of Drake's, that have these links.
+        robots, plants: The robots, and Drake's own plants, that contain the links.
         context: The context of the diagram.
-        links: The links.
+        links: The names of the links.
         rate: p^2 d, in m/s^2.
     """
-    found = dict[str, float]()
+    masses = dict[str, float]()
     for robot in robots:
-        drawn = robot.robot("a bench").links.plant
-        if drawn is not None:
+        multibody = robot.robot("a bench").links.plant
+        if multibody is not None:
             state = robot.state(robot.GetMyContextFromRoot(context))
-            found |= _felt(drawn, state[: drawn.num_positions()], links)
+            masses |= _effective_masses(multibody, state[: multibody.num_positions()], links)
     for plant in plants:
-        found |= _felt(plant, plant.GetPositions(plant.GetMyContextFromRoot(context)), links)
-    return {name: mass * rate for name, mass in found.items()}
+        positions = plant.GetPositions(plant.GetMyContextFromRoot(context))
+        masses |= _effective_masses(plant, positions, links)
+    return {name: mass * rate for name, mass in masses.items()}
 
 
-def _felt(drawn: MultibodyPlant, positions: FloatArray, links: Sequence[str]) -> dict[str, float]:
-    """Link -> the mass that is felt at its origin, kg."""
-    context = drawn.CreateDefaultContext()
-    drawn.SetPositions(context, positions)
-    mass, world, found = drawn.CalcMassMatrix(context), drawn.world_frame(), {}
+def _effective_masses(
+    plant: MultibodyPlant, positions: FloatArray, links: Sequence[str]
+) -> dict[str, float]:
+    """Returns link -> the effective mass at its origin, kg."""
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, positions)
+    M, world, masses = plant.CalcMassMatrix(context), plant.world_frame(), dict[str, float]()
     for name in links:
-        instance, _, body = name.rpartition("::")
-        if not drawn.HasModelInstanceNamed(instance):
+        model, _, body = name.rpartition("::")
+        if not plant.HasModelInstanceNamed(model):
             continue
-        number = drawn.GetModelInstanceByName(instance)
-        if not drawn.HasBodyNamed(body, number):
+        instance = plant.GetModelInstanceByName(model)
+        if not plant.HasBodyNamed(body, instance):
             continue
-        frame = drawn.GetBodyByName(body, number).body_frame()
-        J = drawn.CalcJacobianTranslationalVelocity(
+        frame = plant.GetBodyByName(body, instance).body_frame()
+        J = plant.CalcJacobianTranslationalVelocity(
             context, JacobianWrtVariable.kV, frame, np.zeros(3), world, world
         )
-        # The direction in which it is lightest; a base that turns about its origin is not moved.
-        lightest = float(np.linalg.eigvalsh(J @ np.linalg.solve(mass, J.T))[-1])
-        found[name] = 1.0 / max(lightest, 1.0 / float(np.trace(mass)))
-    return found
+        # In the direction of the smallest mass; the bound covers links whose origin cannot move.
+        mobility = float(np.linalg.eigvalsh(J @ np.linalg.solve(M, J.T))[-1])
+        masses[name] = 1.0 / max(mobility, 1.0 / float(np.trace(M)))
+    return masses

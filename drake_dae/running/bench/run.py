@@ -1,8 +1,9 @@
-"""A loop that a person changes while Drake's Simulator runs it, and the same run again."""
+"""Runs of Drake's Simulator that a person changes, and their repetition from the commands."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +19,28 @@ from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
 from drake_dae.files import read_text
 from drake_dae.running.bench.any_diagram import parts_of_diagram, vector_outputs
 from drake_dae.running.bench.description import TICK, Bench, shown_function
-from drake_dae.running.bench.inputs import Inputs, started
+from drake_dae.running.bench.inputs import Inputs, with_input_values
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.functions import TracedFunction
 
-MOST = 100_000_000
-"""The longest file of commands, in bytes."""
+MOST_BYTES = 100_000_000
+"""The largest size of a file of commands."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What was changed in a run, and when.
+    """The changes in a run, and their times.
 
     Attributes:
-        commands: (k, name, value): the input of this name has this value from k ticks after the
-            start on.
+        commands: (k, name, value): from k ticks after the start, the input with this name has this
+            value.
         end: The number of ticks of the run.
         tick: The length of a tick, in s.
 
     Raises:
-        ModelError: They are not in the order of time, or a number makes no sense.
+        ModelError: The commands are not in chronological order, or a number is not valid.
     """
 
     commands: Sequence[tuple[int, str, float]]
@@ -47,37 +48,37 @@ class Commands:
     tick: float = TICK
 
     def __post_init__(self) -> None:
-        before = 0
-        for one in self.commands:
+        last = 0
+        for command in self.commands:
             try:
-                (k, name, value) = one
-                is_right = before <= k <= self.end and str(name) == name and np.isfinite(value)
+                (k, name, value) = command
+                is_valid = last <= k <= self.end and str(name) == name and np.isfinite(value)
             except (TypeError, ValueError):
-                is_right = False
-            if not is_right:
+                is_valid = False
+            if not is_valid:
                 raise ModelError(
-                    f"commands: (tick, name, value), at a tick from {before} to {self.end}, is "
-                    f"needed, got {brief(repr(one))}"
+                    f"commands: each is (tick, name, value) with a tick from {last} to {self.end} "
+                    f"and a finite value, got {brief(repr(command))}"
                 )
-            before = one[0]
+            last = k
         if not (np.isfinite(self.tick) and self.tick > 0.0):
             raise ModelError(f"commands: the tick is a positive time in s, got {self.tick}")
 
     def save(self, path: str | Path) -> None:
-        """Writes them as JSON."""
+        """Writes the commands as JSON."""
         Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> "Commands":
-        """Those of a file, of a live bench or of a page.
+        """Returns the commands in a file that a live bench or a page saved.
 
         Raises:
-            ModelError: It cannot be read, or has no commands.
+            ModelError: The file cannot be read, or does not contain commands.
         """
         try:
-            found = json.loads(read_text(path, MOST))
-            commands = [(int(k), str(name), float(value)) for k, name, value in found["commands"]]
-            return cls(commands, int(found["end"]), float(found["tick"]))
+            data = json.loads(read_text(path, MOST_BYTES))
+            commands = [(int(k), str(name), float(value)) for k, name, value in data["commands"]]
+            return cls(commands, int(data["end"]), float(data["tick"]))
         except OSError as error:
             raise ModelError(f"commands: {describe_os_error(error)}") from error
         except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
@@ -85,11 +86,11 @@ class Commands:
 
 
 class HandRun:
-    """A run by Drake's Simulator, tick by tick, with changes between ticks.
+    """A run of Drake's Simulator, tick by tick, with changes between ticks.
 
     Args:
         loop: The loop, or any diagram.
-        context: The context of its diagram at the start; not changed.
+        context: The initial context of its diagram, which is not changed.
         config: Drake's settings of the integrator.
         tick: The length of a tick, in s.
     """
@@ -105,10 +106,11 @@ class HandRun:
         diagram = loop if isinstance(loop, Diagram) else loop.diagram
         self._start = context.get_time()
         config = config or SimulatorConfig()
-        own = started(loop, context) if isinstance(loop, Diagram) else context.Clone()
+        is_diagram = isinstance(loop, Diagram)
+        initial = with_input_values(diagram, context) if is_diagram else context.Clone()
         check_config(config)
-        own.SetAccuracy(config.accuracy)  # For witness functions, as in `simulate`.
-        self._simulator = Simulator(diagram, own)
+        initial.SetAccuracy(config.accuracy)  # For witness functions, as in `simulate`.
+        self._simulator = Simulator(diagram, initial)
         ApplySimulatorConfig(config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
@@ -116,31 +118,32 @@ class HandRun:
         self._failure: Exception | None = None
         self._log: list[tuple[int, str, float]] = []
         self._rows = list[tuple[float, dict[str, FloatArray]]]()
-        self._keep()
+        self._record_row()
 
     @property
     def context(self) -> Context:
-        """The context of the diagram now."""
+        """The present context of the diagram."""
         return self._simulator.get_context()
 
     def set(self, changes: Mapping[int, float]) -> None:
-        """Changes inputs from now on; number in `Inputs` -> value.
+        """Changes inputs from now on: index in `Inputs` -> value.
 
         Raises:
             ModelError: There is no such input, or a value is not finite.
         """
         names = self.inputs.names
-        for number, value in changes.items():
-            if not 0 <= number < len(names) or not np.isfinite(value):
-                raise ModelError(f"no input number {number} takes {value}; there are {len(names)}")
+        for index, value in changes.items():
+            if not 0 <= index < len(names) or not np.isfinite(value):
+                raise ModelError(f"no input number {index} takes {value}; there are {len(names)}")
         self.inputs.set(self._simulator.get_mutable_context(), changes)
-        self._log += [(self.count, names[number], value) for number, value in changes.items()]
+        self._log += [(self.count, names[index], value) for index, value in changes.items()]
 
     def advance(self) -> None:
         """Runs one tick.
 
         Raises:
-            DrakeDaeError: The loop cannot go on: where and why; the same at each further call.
+            DrakeDaeError: The loop cannot continue; the message contains time and reason. Each
+                further call raises the same error.
         """
         if self._failure is not None:
             raise self._failure
@@ -150,27 +153,29 @@ class HandRun:
             self._failure = error
             raise
         self.count += 1
-        self._keep()
+        self._record_row()
 
     @property
     def commands(self) -> Commands:
-        """What was changed so far."""
+        """The changes from the start until now."""
         return Commands(tuple(self._log), self.count, self.tick)
 
     def record(self) -> Record:
-        """The record so far: of a loop what it logs, of a diagram its output ports at each tick."""
+        """Returns the record from the start until now.
+
+        For a loop, these are its logs; for a diagram, its output ports at each tick.
+        """
         if not isinstance(self.loop, Diagram):
             return self.loop.record(self.context)
-        ports, found = parts_of_diagram(self.loop, self.context), dict[str, Recorded]()
-        left = list(ports.signals)
-        for name in ports.outputs:
+        parts, recorded = parts_of_diagram(self.loop, self.context), dict[str, Recorded]()
+        signals = iter(parts.signals)
+        for name in parts.outputs:
             values = np.array([row[name] for _, row in self._rows])
-            own, left = left[: values.shape[1]], left[values.shape[1] :]
-            found[name] = Recorded(values, tuple(own))
-        return Record(np.array([time for time, _ in self._rows]), found)
+            recorded[name] = Recorded(values, tuple(islice(signals, values.shape[1])))
+        return Record(np.array([time for time, _ in self._rows]), recorded)
 
-    def _keep(self) -> None:
-        """Keeps a row of a diagram, which logs nothing by itself."""
+    def _record_row(self) -> None:
+        """Records the outputs of a diagram; a loop has its own logs."""
         if isinstance(self.loop, Diagram):
             row = {name: np.array(p.Eval(self.context)) for name, p in vector_outputs(self.loop)}
             self._rows.append((self.context.get_time(), row))
@@ -183,62 +188,62 @@ def replay(
     commands: Commands,
     config: SimulatorConfig | None = None,
 ) -> Record:
-    """The record of a run with given commands: on the same machine, the same numbers.
+    """Repeats a run from its commands and returns the record.
+
+    On the machine of the original run, the numbers are identical.
 
     Args:
-        loop: The loop or diagram that was commanded, or one with inputs of the same names.
-        context: The context of its diagram at the start; not changed.
-        commands: What was changed, as a live bench or a page saved it.
-        config: Drake's settings, as in that run.
+        loop: The loop or diagram of the original run, or one with the same names of inputs.
+        context: The initial context of its diagram, which is not changed.
+        commands: The changes that a live bench or a page saved.
+        config: Drake's settings in the original run.
 
     Raises:
-        ModelError: The loop has no input of such a name.
-        DrakeDaeError: The loop cannot go on: where and why.
+        ModelError: The loop has no input with the name in a command.
+        DrakeDaeError: The loop cannot continue; the message contains time and reason.
     """
     run = HandRun(loop, context, config, commands.tick)
-    places = {name: number for number, name in enumerate(run.inputs.names)}
-    waiting = list(commands.commands)
-    for name in dict.fromkeys(name for _, name, _ in waiting):
-        if name not in places:
-            own = [place for place in places if not place.endswith("'")]
-            raise ModelError(unknown_name("input of the loop", name, own))
+    indices = {name: index for index, name in enumerate(run.inputs.names)}
+    changes: dict[int, dict[int, float]] = {}
+    for k, name, value in commands.commands:
+        if name not in indices:
+            names = [name for name in indices if not name.endswith("'")]
+            raise ModelError(unknown_name("input of the loop", name, names))
+        changes.setdefault(k, {})[indices[name]] = value
     for k in range(commands.end):
-        now = {places[name]: value for at, name, value in waiting if at == k}
-        waiting = [one for one in waiting if one[0] > k]
-        run.set(now)
+        run.set(changes.get(k, {}))
         run.advance()
     return run.record()
 
 
 class Sampler:
-    """What a bench in a browser shows of a loop at a moment.
+    """Samples the values that a bench in a browser shows.
 
     Args:
         bench: The bench of the loop.
     """
 
     def __init__(self, bench: Bench) -> None:
-        self._bench, inputs = bench, bench.controls.inputs
-        self._ports = dict(bench.ports)
+        self._bench, self._ports = bench, dict(bench.ports)
         columns = {name: ca.SX.sym(name, port.size()) for name, port in self._ports.items()}
-        given = ca.SX.sym("inputs", len(inputs.names))
-        value = {"shown": shown_function(bench, columns, given)}
-        self._function = TracedFunction("bench", {**columns, "inputs": given}, value)
-        count = bench.data["prediction"]
-        self._count = 0 if count is None else count["size"]
+        symbols = ca.SX.sym("inputs", len(bench.controls.inputs.names))
+        value = {"shown": shown_function(bench, columns, symbols)}
+        self._function = TracedFunction("bench", {**columns, "inputs": symbols}, value)
+        prediction = bench.data["prediction"]
+        self._num_coordinates = 0 if prediction is None else prediction["size"]
 
     def __call__(self, context: Context) -> dict[str, Any]:
-        """The sample, as plain data; what has no value is None."""
-        bench = self._bench
+        """Returns the values in a context in the form of JSON; None for a missing value."""
         values = {
             name: port.Eval(port.get_system().GetMyContextFromRoot(context))
             for name, port in self._ports.items()
         }
-        shown = self._function(*values.values(), bench.controls.inputs.values(context))[0]
-        posed = bench.scene.posed.poses(context)
+        inputs = self._bench.controls.inputs.values(context)
+        shown = self._function(*values.values(), inputs)[0]
+        posed = self._bench.scene.posed.poses(context)
         shown[: posed.size] = posed
-        z, r, phase, place = self._compared(context, values)
-        size = len(shown) - self._count
+        z, r, phase, index = self._compared(context, values)
+        size = len(shown) - self._num_coordinates
         return {
             "time": context.get_time(),
             "z": _plain(z),
@@ -246,37 +251,40 @@ class Sampler:
             "scene": _plain(shown[:size]),
             "coordinates": _plain(shown[size:]),
             "phase": phase,
-            "place": place,
+            "place": index,
         }
 
     def _compared(
         self, context: Context, values: Mapping[str, FloatArray]
     ) -> tuple[FloatArray, FloatArray, str, int]:
-        """z and r, which a diagram does not know, and the name and the place of the phase."""
+        """Returns z, r, and the name and the index of the phase; r of a diagram is NaN."""
         loop = self._bench.loop
         if isinstance(loop, Diagram):
             z = np.concatenate([values[name] for name in self._bench.outputs])
             return z, np.full(z.size, np.nan), "", 0
         changes = loop.changes(context)
-        now = (changes[-1].phase, changes[-1].place) if changes else ("", 0)
-        return *self._of_loop(loop, context), *now
+        phase = (changes[-1].phase, changes[-1].place) if changes else ("", 0)
+        return *self._compared_in_loop(loop, context), *phase
 
-    def _of_loop(self, loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
+    def _compared_in_loop(
+        self, loop: ClosedLoop, context: Context
+    ) -> tuple[FloatArray, FloatArray]:
+        """Returns z and r; r is NaN for outputs without reference."""
         z = loop.diagram.GetOutputPort("controlled_output").Eval(context)
-        own = loop.controller.GetMyContextFromRoot(context)
         if "reference" in self._ports:
             reference = self._ports["reference"].Eval(context)
             return z, reference[loop.controller.law.layout.lowest]
-        found = loop.controller.compared(
-            own, lambda name: loop.diagram.GetOutputPort(name).Eval(context)
+        compared = loop.controller.compared(
+            loop.controller.GetMyContextFromRoot(context),
+            lambda name: loop.diagram.GetOutputPort(name).Eval(context),
         )
-        wanted = np.full(z.size, np.nan)
-        if found is not None:
+        r = np.full(z.size, np.nan)
+        if compared is not None:
             names = [signal.name for signal in loop.plant.dae.output_signals]
-            for value, signal in zip(found[1], found[2], strict=True):
+            for value, signal in zip(compared[1], compared[2], strict=True):
                 if signal.name in names:
-                    wanted[names.index(signal.name)] = value
-        return z, wanted
+                    r[names.index(signal.name)] = value
+        return z, r
 
 
 def _plain(values: FloatArray) -> list[float | None]:

@@ -1,4 +1,4 @@
-"""What a bench draws: Meshcat's page of a robot, and what its parts follow, as functions."""
+"""The scene of a bench: Meshcat's page of a robot, and the poses of its parts as functions."""
 
 import gc
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from pydrake.geometry import Rgba, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context
 
@@ -22,23 +22,23 @@ from drake_dae.robots.surfaces.surface import rotation_of
 from drake_dae.running.bench.posed import NO_BODIES, VISUALIZER, PosedBodies
 from drake_dae.systems.plants.contract import Plant
 
-_BACKGROUND = Rgba(0.97, 0.97, 0.98, 1.0)
+_BACKGROUND = [0.97, 0.97, 0.98]
 
 
 @dataclass(frozen=True, eq=False)
 class RobotScene:
-    """What a bench draws of a robot.
+    """The drawn parts of a robot.
 
     Attributes:
-        plant: The robot.
-        links: The name and the path in Meshcat of each body that moves.
+        plant: The plant of the robot.
+        links: The name and the path in Meshcat of each moving body.
         constraints: The constraints that act at a point.
-        with_moment: Whether each of these has a moment.
-        surfaces: The constraints whose surface moves.
+        with_moment: For each of `constraints`, whether it has a moment.
+        surfaces: The constraints with a moving surface.
         targets: The outputs that are coordinates of a point.
-        function: (link state, lambda, parameters) -> six columns: 12 numbers for each body, R by
-            columns and p; points of application, forces and moments of all constraints; 12 numbers
-            for each surface; the point of each target, in the world.
+        function: (link state, lambda, parameters) -> six columns, in the world: 12 numbers for each
+            body, R by columns and p; points of application, forces and moments of all constraints;
+            12 numbers for each surface; the point of each target.
     """
 
     plant: Plant
@@ -52,13 +52,13 @@ class RobotScene:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a bench draws.
+    """The drawn robots and bodies.
 
     Attributes:
         page: Meshcat's page at the start, self-contained.
-        robots: The robots.
-        size: The size of the view, in m.
-        posed: The bodies that Drake's SceneGraph poses, which stand before those of the robots.
+        robots: The drawn robots.
+        size: The diagonal of the bounding box of the scene, in m.
+        posed: The bodies that Drake's SceneGraph poses; they precede the bodies of the robots.
     """
 
     page: str
@@ -68,8 +68,8 @@ class Scene:
 
     @property
     def links(self) -> list[tuple[str, tuple[str, ...]]]:
-        """The name and the path in Meshcat of each body that moves."""
-        return [*self.posed.links, *(link for one in self.robots for link in one.links)]
+        """The name and the path in Meshcat of each moving body."""
+        return [*self.posed.links, *(link for robot in self.robots for link in robot.links)]
 
 
 def scene_of(
@@ -78,25 +78,25 @@ def scene_of(
     context: Context,
     posed: PosedBodies = NO_BODIES,
 ) -> Scene:
-    """The scene of robots.
+    """Returns the scene of robots.
 
     Args:
-        plants: Their plants.
+        plants: The plants of the robots.
         scene_graph: The geometry of their links, or None.
-        context: The context of the diagram at the start; not changed.
+        context: The initial context of the diagram, which is not changed.
         posed: The bodies that Drake's SceneGraph poses.
 
     Raises:
-        ModelError: A plant is no robot.
+        ModelError: A plant is not a robot.
         OSError: There is no free port for Meshcat, which makes the page.
     """
-    robots, seen = list[RobotScene](), [posed.corners(context)]
+    robots, points = list[RobotScene](), [posed.corners(context)]
     states = [plant.state(plant.GetMyContextFromRoot(context)) for plant in plants]
     for plant, state in zip(plants, states, strict=True):
         robots.append(_robot_scene(plant, scene_graph))
         model = plant.robot("a bench")
-        seen.append(scene_points(model, ConstraintWrenches(model), state[None], scene_graph))
-    corners = np.vstack(seen)
+        points.append(scene_points(model, ConstraintWrenches(model), state[None], scene_graph))
+    corners = np.vstack(points)
     size = float(np.linalg.norm(np.ptp(corners, axis=0))) if corners.size else 1.0
     page = _static_page(plants, scene_graph, states, posed, context)
     # Drake's Meshcat ends the process if another thread, as of a server, collects it.
@@ -106,18 +106,18 @@ def scene_of(
 
 def _robot_scene(plant: Plant, scene_graph: SceneGraph | None) -> RobotScene:
     model = plant.robot("a bench")
-    drawn = _drawn_bodies(model, scene_graph)
+    bodies = _drawn_bodies(model, scene_graph)
     wrenches = ConstraintWrenches(model)
-    surfaces = [each for each in model.constraints if _moves(each, plant.is_ideal)]
-    targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
+    surfaces = [c for c in model.constraints if _has_moving_surface(c, plant.is_ideal)]
+    targets = [output for output in model.outputs if isinstance(output, PointCoordinates)]
     return RobotScene(
         plant,
-        [(name, path) for name, path, _ in drawn],
+        [(name, path) for name, path, _ in bodies],
         wrenches.constraints,
         wrenches.with_moment,
         surfaces,
         targets,
-        _function(model, wrenches, [frame for _, _, frame in drawn], surfaces, targets),
+        _function(model, wrenches, [frame for _, _, frame in bodies], surfaces, targets),
     )
 
 
@@ -128,20 +128,19 @@ def _static_page(
     posed: PosedBodies,
     context: Context,
 ) -> str:
-    """Meshcat's page at the start, from a server that is gone afterwards."""
+    """Returns Meshcat's initial page, which does not depend on the server that made it."""
     meshcat = start_unwatched_meshcat()
     meshcat.SetProperty("/Background", "visible", True)
     for part in ("top_color", "bottom_color"):
-        color = [_BACKGROUND.r(), _BACKGROUND.g(), _BACKGROUND.b()]
-        meshcat.SetProperty("/Background/<object>", part, color)
+        meshcat.SetProperty("/Background/<object>", part, _BACKGROUND)
     for plant, state in zip(plants, states, strict=True):
         draw_scene(plant, meshcat, scene_graph)
         links = view_of_links(plant, scene_graph, meshcat)
         if links is not None:
-            shown = links.CreateDefaultContext()
+            view_context = links.CreateDefaultContext()
             port = links.get_input_port()
-            port.FixValue(shown, state[: port.size()])
-            links.ForcedPublish(shown)
+            port.FixValue(view_context, state[: port.size()])
+            links.ForcedPublish(view_context)
     posed.draw(meshcat, context, is_alone=not plants)
     return str(meshcat.StaticHtml())
 
@@ -149,23 +148,23 @@ def _static_page(
 def _drawn_bodies(
     model: RobotModel, scene_graph: SceneGraph | None
 ) -> list[tuple[str, tuple[str, ...], Frame]]:
-    """Name, path in Meshcat and frame of each body with geometry that moves."""
-    drawn = model.links.plant
-    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
+    """Returns name, path in Meshcat and frame of each moving body with geometry."""
+    plant = model.links.plant
+    if scene_graph is None or plant is None or plant.get_source_id() is None:
         return []
-    inspector, found = scene_graph.model_inspector(), []
-    for number in inspector.GetAllFrameIds():
-        body = drawn.GetBodyFromFrameId(number)
-        if body is None or drawn.IsAnchored(body) or not drawn.GetVisualGeometriesForBody(body):
+    inspector, bodies = scene_graph.model_inspector(), []
+    for frame in inspector.GetAllFrameIds():
+        body = plant.GetBodyFromFrameId(frame)
+        if body is None or plant.IsAnchored(body) or not plant.GetVisualGeometriesForBody(body):
             continue
-        path = (*VISUALIZER, *inspector.GetName(number).split("::"))
-        found.append((body.scoped_name().get_full(), path, body.body_frame()))
-    return found
+        path = (*VISUALIZER, *inspector.GetName(frame).split("::"))
+        bodies.append((body.scoped_name().get_full(), path, body.body_frame()))
+    return bodies
 
 
-def _moves(constraint: Constraint, is_ideal: bool) -> bool:
-    """Whether a surface moves: of a compliant contact also by its parameters."""
-    names = [each.name for each in constraint.parameters if each.exogenous or not is_ideal]
+def _has_moving_surface(constraint: Constraint, is_ideal: bool) -> bool:
+    """Returns whether a surface moves; in a compliant contact its parameters move it, too."""
+    names = [p.name for p in constraint.parameters if p.exogenous or not is_ideal]
     return f"{constraint.name}.position" in names or f"{constraint.name}.rpy" in names
 
 
@@ -179,41 +178,39 @@ def _function(
     links, dae = model.links, model.dae
     force = ca.SX.sym("force", wrenches.function.sizes[2])
     parameters = dae.parameter_symbol
-    acting = wrenches.function.function.call([links.q, links.v, force, parameters])[:3]
-    placed = list[ca.SX]()
+    wrench_columns = wrenches.function.function.call([links.q, links.v, force, parameters])[:3]
+    surface_poses = list[ca.SX]()
     for constraint in surfaces:
-        own = {each.name: each.symbol for each in constraint.parameters}
-        rpy = own.get(f"{constraint.name}.rpy")
-        placed.append(ca.SX.eye(3) if rpy is None else rotation_of(rpy))
-        placed.append(own[f"{constraint.name}.position"])
+        symbols = {parameter.name: parameter.symbol for parameter in constraint.parameters}
+        rpy = symbols.get(f"{constraint.name}.rpy")
+        surface_poses.append(ca.SX.eye(3) if rpy is None else rotation_of(rpy))
+        surface_poses.append(symbols[f"{constraint.name}.position"])
     columns = [
         [part for body in bodies for part in (links.rotation(body), links.position(body))],
-        *([part] for part in acting),
-        placed,
-        [links.position(each.frame, each.point) for each in targets],
+        *([column] for column in wrench_columns),
+        surface_poses,
+        [links.position(target.frame, target.point) for target in targets],
     ]
     value = [
         ca.vertcat(ca.SX(0, 1), *(ca.vec(ca.densify(part)) for part in parts)) for parts in columns
     ]
-    given = [ca.vertcat(links.q, links.v), force, parameters]
-    return ca.Function("scene", given, ca.cse(value))
+    arguments = [ca.vertcat(links.q, links.v), force, parameters]
+    return ca.Function("scene", arguments, ca.cse(value))
 
 
 def surface_direction(model: RobotModel, constraint: Constraint, state: FloatArray) -> FloatArray:
-    """The normal of a surface at its contact point, along which it is dragged, shape (3,).
+    """Returns the unit normal of a surface at its contact point, shape (3,).
 
-    At rest there is no friction, so that the force is along it.
+    At zero velocity there is no friction, so that the contact force is along the normal.
     """
     wrenches = ConstraintWrenches(model)
     row = list(wrenches.constraints).index(constraint)
     rest = np.concatenate([state[: model.links.q.numel()], np.zeros(model.links.v.numel())])
-    push = np.concatenate(
-        [np.zeros(0), *(np.ones(len(c.force_signals)) for c in model.constraints)]
-    )
-    force = wrenches(rest, push).forces[row]
+    multipliers = np.ones(sum(len(c.force_signals) for c in model.constraints))
+    force = wrenches(rest, multipliers).forces[row]
     return np.asarray(force / np.linalg.norm(force))
 
 
-def path_of_surface(constraint: Constraint) -> list[str]:
-    """The path of a surface in Meshcat."""
-    return path_of(constraint, "surface").strip("/").split("/")
+def path_in_meshcat(constraint: Constraint, part: str) -> list[str]:
+    """Returns the path in Meshcat of a constraint's "force", "moment" or "surface"."""
+    return path_of(constraint, part).strip("/").split("/")

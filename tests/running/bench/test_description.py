@@ -140,3 +140,11 @@ def test_a_loop_without_commands_has_the_sliders_of_its_parameters():
         each.kind for each in controls_of(loop, loop.diagram.CreateDefaultContext(), 1.0).sliders
     ]
     assert set(kinds) == {"plant", "pole"}
+
+
+@pytest.mark.slow
+def test_a_payload_that_only_the_plant_has_is_not_pushed():
+    built = build_commanded(scenario("wall_flexible_reversals"))
+    pushes = bench_of(built.loop, built.context, "arm", ()).data["pushes"]
+    assert any("link7" in name for name in pushes)
+    assert not any("payload" in name for name in pushes)

@@ -185,7 +185,7 @@ def test_pages_share_a_bundle(tmp_path):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("wall_point_contact", "the plant has Drake's own contact, which no export knows"),
+        ("wall_point_contact", "the plant has Drake's own contact, which cannot be exported"),
         ("wall_bounce", "as where a contact opens or a phase ends"),
         ("wall_guarded", "as where a contact opens or a phase ends"),
     ],

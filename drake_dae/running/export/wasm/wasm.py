@@ -1,4 +1,4 @@
-"""A controller, its plant and their loop as WebAssembly, for a page in a browser."""
+"""Exports a controller, its plant and their loop as WebAssembly, for a page in a browser."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
+from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.pieces import in_pieces
@@ -43,54 +44,55 @@ def export_wasm(
 ) -> Export:
     """Writes controller, plant and loop as one WebAssembly module, name.wasm.
 
-    It needs no imports. name.mjs loads it in a page or in Node: parts are created, parameters set,
-    steps made by `step(dt)`, outputs and state read by their names. The sources in C99 stand beside
-    it. A part that cannot be exported is left out.
+    The module has no imports. name.mjs loads it in a page or in Node. The caller creates parts,
+    sets parameters, simulates with `step(dt)`, and reads outputs and state by their names. The
+    folder also contains the sources in C99. The export omits parts that cannot be exported.
 
     Args:
         loop: The closed loop, or any diagram with one `Plant`.
-        context: Its context at the start; not changed.
-        name: What the files are called.
-        folder: Where to write; made if there is none.
-        config: Drake's settings, whose fixed steps plant and loop take; where they have error
-            control, and for None, steps of at most 1 ms by `runge_kutta5`.
+        context: Its initial context, which is not changed.
+        name: The name of the files.
+        folder: The folder of the files, which is created if necessary.
+        config: Drake's settings, of which the fixed steps apply to plant and loop; with error
+            control, or for None, steps of at most 1 ms by `runge_kutta5`.
 
     Raises:
-        ModelError: No part can be exported, or the fixed steps are of an implicit method.
-        MachineCodeError: There is no zig, as of `pip install 'drake_dae[compiler]'`, or it fails.
+        ModelError: No part can be exported, or the fixed steps are those of an implicit method.
+        MachineCodeError: zig is not installed (`pip install 'drake_dae[compiler]'` adds it), or it
+            fails.
         OSError: A file cannot be written.
     """
     parts, left_out = parts_of_loop(loop, context, (LOOP, PLANT, CONTROLLER))
-    found = [
+    written_parts = [
         write_controller(part, context, name, folder)
         if kind == CONTROLLER
         else write_integrated(part, kind, context, name, folder, config)
         for kind, part in parts.items()
     ]
-    files = write_module(found, name, folder)
-    sources = [path for each in found for path in each.files]
+    files = write_module(written_parts, name, folder)
+    sources = [path for part in written_parts for path in part.files]
     return Export([*files, *sources], left_out)
 
 
 def write_module(
-    found: Sequence[WrittenPart],
+    parts: Sequence[WrittenPart],
     name: str,
     folder: str | Path,
     further: Mapping[str, ca.Function] | None = None,
 ) -> list[Path]:
-    """Compiles parts that are written as C to name.wasm, and writes name.mjs.
+    """Compiles the C sources of parts to name.wasm, and writes name.mjs.
 
     Args:
-        found: The parts.
-        name, folder: As of `export_wasm`.
-        further: Name -> a function of all outputs and all parameters of the first part, which the
-            module shows beside it; read by `part.view(name, 0, size)`.
+        parts: The parts.
+        name, folder: See `export_wasm`.
+        further: Name -> a further function of all outputs and all parameters of the first part,
+            which `part.view(name, 0, size)` reads.
 
     Returns:
-        name.wasm, name.mjs, and the C source of what the module shows.
+        The paths of name.wasm, name.mjs, and the C source of the module's exported functions.
 
     Raises:
-        MachineCodeError, OSError: As of `export_wasm`.
+        MachineCodeError, OSError: See `export_wasm`.
     """
     prefix, file = prefix_of(name), file_of(name)
     words = {
@@ -100,31 +102,35 @@ def write_module(
         "prefix": prefix,
         "guard": prefix.upper(),
     }
-    sources = [each.files[1] for each in found]
+    sources = [part.files[1] for part in parts]
     shown = ""
     for key, function in (further or {}).items():
         symbol = f"{prefix}_{key}"
-        own = {"symbol": symbol, "key": key, "kind": found[0].kind, "prefix": prefix}
-        own |= {
+        function_words = {
+            "symbol": symbol,
+            "key": key,
+            "kind": parts[0].kind,
+            "prefix": prefix,
             "size": str(function.numel_out(0)),
-            "given": str(function.sz_arg()),
+            "arguments": str(function.sz_arg()),
             "results": str(function.sz_res()),
             "generated": without_branches(generated({f"{symbol}_traced": function})),
         }
-        sources += written(TEMPLATES, folder, {"further.c": f"{file}_{key}.c"}, own)
-        shown += Template((TEMPLATES / "shown.c").read_text(encoding="utf-8")).substitute(own)
+        sources += written(TEMPLATES, folder, {"further.c": f"{file}_{key}.c"}, function_words)
+        template = Template((TEMPLATES / "shown.c").read_text(encoding="utf-8"))
+        shown += template.substitute(function_words)
     glue = words | {
-        "includes": "".join(f'#include "{each.files[0].name}"\n' for each in found),
-        "parts": "".join(_glue(each, words) for each in found) + shown,
+        "includes": "".join(f'#include "{part.files[0].name}"\n' for part in parts),
+        "parts": "".join(_exports_of(part, words) for part in parts) + shown,
     }
     (source,) = written(TEMPLATES, folder, {"exports.c": f"{file}_exports.c"}, glue)
-    described = {each.kind: _described(each) for each in found}
-    first = found[0].kind
-    steps = "$.step(0)" if first == CONTROLLER else "$.step(0.01);"
+    descriptions = {part.kind: _description(part) for part in parts}
+    first = parts[0].kind
+    step = f"{first}.step(0)" if first == CONTROLLER else f"{first}.step(0.01);"
     words |= {
-        "parts": json.dumps(described, indent=1),
+        "parts": json.dumps(descriptions, indent=1),
         "first": first,
-        "example": steps.replace("$", first) + f"  {first}.outputs",
+        "example": f"{step}  {first}.outputs",
     }
     (module,) = written(TEMPLATES, folder, {"module.mjs": f"{file}.mjs"}, words)
     target = module.with_suffix(".wasm")
@@ -136,26 +142,31 @@ def write_module(
     return [target, module, source]
 
 
-def _glue(each: WrittenPart, words: dict[str, str]) -> str:
-    """What the module shows of a part, in C."""
-    template = "controller.c" if each.kind == CONTROLLER else "integrated.c"
+def _exports_of(part: WrittenPart, words: dict[str, str]) -> str:
+    """Returns the C source of the functions that the module exports for a part."""
+    template = "controller.c" if part.kind == CONTROLLER else "integrated.c"
     text = Template((TEMPLATES / template).read_text(encoding="utf-8"))
-    return text.substitute(words, kind=each.kind, KIND=each.kind.upper())
+    return text.substitute(words, kind=part.kind, KIND=part.kind.upper())
 
 
-def _described(each: WrittenPart) -> dict[str, Any]:
-    """What name.mjs says of a part."""
-    found: dict[str, Any] = {
+def _description(written_part: WrittenPart) -> dict[str, Any]:
+    """Returns the description of a part in name.mjs."""
+    part, values = written_part.part, written_part.values.tolist()
+    description: dict[str, Any] = {
         "parameters": [
-            {"name": signal.name, "unit": signal.unit, "default": value}
-            for signal, value in zip(each.parameters, each.values.tolist(), strict=True)
+            {**_named(signal), "default": value}
+            for signal, value in zip(written_part.parameters, values, strict=True)
         ]
     }
-    for key, vectors in (("inputs", each.part.inputs), ("outputs", each.part.outputs)):
-        found[key] = {
-            name: [{"name": signal.name, "unit": signal.unit} for signal in signals]
+    for key, vectors in (("inputs", part.inputs), ("outputs", part.outputs)):
+        description[key] = {
+            name: [_named(signal) for signal in signals]
             for name, signals in identifiers(dict(vectors)).items()
         }
-    if each.kind == CONTROLLER:
-        return found | {"period": each.part.ticks.period}
-    return found | {"state": [{"name": s.name, "unit": s.unit} for s in each.states]}
+    if written_part.kind == CONTROLLER:
+        return description | {"period": part.ticks.period}
+    return description | {"state": [_named(signal) for signal in written_part.states]}
+
+
+def _named(signal: Signal) -> dict[str, str]:
+    return {"name": signal.name, "unit": signal.unit}

@@ -1,4 +1,4 @@
-/* What ${name}.wasm shows: functions of each part, on pointers that `create` returns. */
+/* The exports of ${name}.wasm: functions of each part, on pointers that `create` returns. */
 
 #include <stddef.h>
 
@@ -7,7 +7,7 @@ $includes
 
 extern unsigned char __heap_base;
 
-/* Memory that is never given back; 0 if there is none left. */
+/* Allocates memory, which is never released; returns 0 if there is not enough. */
 static void *take(size_t size) {
   static size_t used;
   size_t first = (size_t)&__heap_base + used, page = 65536;

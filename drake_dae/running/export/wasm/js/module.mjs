@@ -5,11 +5,11 @@
      const $first = create("$first");
      $example
 
-   `parameters`, `inputs` and `outputs` have what `parts` names, with units; numbers in vectors are
-   Float64Arrays on the memory of the module, good until the next `create`. Everything is computed
-   in $name.wasm, which needs nothing of its surroundings. */
+   `parts` lists the names and units in `parameters`, `inputs` and `outputs`. Vectors are
+   Float64Arrays in the memory of the module, which are valid until the next `create`. $name.wasm
+   computes everything and has no imports. */
 
-/* What there is: kind -> names, units and defaults. */
+/* Kind of a part -> names, units and defaults. */
 export const parts = $parts;
 
 const reasons = ["", "a function has no value: not finite, or singular", "no consistent state is near"];
@@ -18,7 +18,7 @@ const faults = ["", "number", "stale", "late", "clock", "value"];
 
 /* Loads the module.
 
-   source: its bytes, a Response, or where it is; beside this file if there is none. */
+   source: its bytes, a Response, or its address; by default the address beside this file. */
 export async function load(source = new URL("./$name.wasm", import.meta.url)) {
   const { instance } = await WebAssembly.instantiate(await bytes(source), {});
   instance.exports._initialize?.();
@@ -33,9 +33,9 @@ async function bytes(source) {
     const { readFile } = await import("node:fs/promises");
     return readFile(url);
   }
-  const found = await fetch(url);
-  if (!found.ok) throw new Error(`$${url}: $${found.status} $${found.statusText}`);
-  return found.arrayBuffer();
+  const response = await fetch(url);
+  if (!response.ok) throw new Error(`$${url}: $${response.status} $${response.statusText}`);
+  return response.arrayBuffer();
 }
 
 function create(code, kind) {
@@ -47,10 +47,10 @@ function create(code, kind) {
   return new (kind === "controller" ? Controller : Integrated)(code, kind, pointer);
 }
 
-/* What all parts have. */
+/* The common members of all parts. */
 class Part {
   constructor(code, kind, pointer) {
-    this.call = (name, ...given) => code[`$${kind}_$${name}`](pointer, ...given);
+    this.call = (name, ...values) => code[`$${kind}_$${name}`](pointer, ...values);
     this.view = (name, first, size) =>
       new Float64Array(code.memory.buffer, this.call(name) + 8 * first, size);
     const { parameters, inputs, outputs } = parts[kind];
@@ -60,38 +60,38 @@ class Part {
     this.outputs = this.vectors("outputs", outputs);
     Object.freeze(this.parameters);
   }
-  /* Defaults, and the start. */
+  /* Sets the default values and the initial state. */
   reset() {
     this.call("reset");
   }
-  number(owner, key, name, place) {
+  number(owner, key, name, index) {
     Object.defineProperty(owner, key, {
       enumerable: true,
-      get: () => this.view(name, place, 1)[0],
+      get: () => this.view(name, index, 1)[0],
       set: (value) => {
         if (typeof value !== "number") throw new TypeError(`$${key} is a number, got $${value}`);
-        this.view(name, place, 1)[0] = value;
+        this.view(name, index, 1)[0] = value;
       },
     });
   }
   vectors(name, signals) {
-    const found = {};
-    let first = 0;
+    const properties = {};
+    let end = 0;
     for (const [key, { length }] of Object.entries(signals)) {
-      const place = first;
-      first += length;
-      Object.defineProperty(found, key, {
+      const first = end;
+      end += length;
+      Object.defineProperty(properties, key, {
         enumerable: true,
-        get: () => this.view(name, place, length),
+        get: () => this.view(name, first, length),
         set: (values) => {
           if (values?.length !== length) {
             throw new RangeError(`$${key} has $${length} numbers, got $${values?.length}`);
           }
-          this.view(name, place, length).set(values);
+          this.view(name, first, length).set(values);
         },
       });
     }
-    return Object.freeze(found);
+    return Object.freeze(properties);
   }
 }
 
@@ -114,7 +114,7 @@ class Integrated extends Part {
   advance(time) {
     this.check(this.call("advance", time));
   }
-  /* Computes the outputs again, as after a change of the state or of the inputs. */
+  /* Computes the outputs again, for example after a change of the state or of the inputs. */
   show() {
     this.check(this.call("show"));
   }
