@@ -11,7 +11,7 @@ import yaml  # type: ignore[import-untyped]
 _HEAD = """# Error codes
 
 On the command line the message of an error ends with a code, as `[E12]`. `drake-dae explain E12`
-prints the entry of this page. A code belongs to a kind of message, or else to a class of exceptions.
+prints the entry of this page. A code belongs to a kind of message, or else to an exception class.
 
 ```python
 import numpy as np
