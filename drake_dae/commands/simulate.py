@@ -36,7 +36,7 @@ from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
-from drake_dae.pictures.moments import moments_of, ordered
+from drake_dae.pictures.moments import events_of, sorted_events
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.scene.friction import slips
@@ -310,14 +310,14 @@ def _write(run: _CommandRun) -> bool:
         course: RunMotion | None = None
         if run.pictures and (write.plots or write.animation) and model is not None:
             course = follow(loop, record, run.context)
-        moments = moments_of(record, limits)
+        events = events_of(record, limits)
         if course is not None:
-            moments = ordered(record, [*moments, *slips(course)])
+            events = sorted_events(record, [*events, *slips(course)])
         if write.plots and run.pictures:
             paths = contact_paths(course) if course is not None else []
             plots = [name for name in PLOTS if paths or name != PATHS]
             with _collected(problems), stage(folder, *plots) as temporary, _frozen():
-                save_plots(record, predicted, limits.control, temporary, paths, accuracy, moments)
+                save_plots(record, predicted, limits.control, temporary, paths, accuracy, events)
             for reference in loop.generator.references if loop.generator is not None else ():
                 if isinstance(reference, TimeOptimalReference):
                     with _collected(problems), stage(folder, PROFILE) as temporary:
@@ -325,7 +325,7 @@ def _write(run: _CommandRun) -> bool:
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as temporary:
                 spans = phase_spans(record)
-                page = animate(course, loop.scene_graph, run.title, spans, moments)
+                page = animate(course, loop.scene_graph, run.title, spans, events)
                 (temporary / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]

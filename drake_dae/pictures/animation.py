@@ -1,4 +1,4 @@
-"""A run of a robot, replayed in Meshcat as one HTML page."""
+"""The animation of a run of a robot in Meshcat, as one HTML page."""
 
 import html
 import json
@@ -16,7 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
-from drake_dae.pictures.moments import RunEvent, RunEventKind, moments_of, ordered
+from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
 from drake_dae.pictures.scene.arrows import (
     FORCE_COLOR,
     LEAST_SCALE,
@@ -64,7 +64,7 @@ _FOREVER = 2**31 - 1
 """The number of repetitions of the animation."""
 
 _SIDES = 6
-"""The sides of a line drawn as a tube, since lines of a browser are one pixel wide."""
+"""The number of sides of the tube that draws a path; browsers draw lines one pixel wide."""
 
 _OVERLAY = Path(__file__).with_name("overlay.html")
 
@@ -73,29 +73,29 @@ _OVERLAY = Path(__file__).with_name("overlay.html")
 def make_animation(
     loop: ShownLoop, record: Record, context: Context, title: str = ""
 ) -> InlinePage:
-    """Replays a record of a robot in Meshcat, with the paths of its constrained points.
+    """Returns an animation of a recorded run in Meshcat, with the paths of the contact points.
 
-    The page shows the clock and the size of each constraint force at its arrow, draws the actual
-    path over the desired one, and repeats. A bar below has the phases of a task and marks of what
-    happens, and moves the run to any time; the address "page.html#t=2.5" shows that moment. An
-    impact flashes; an open contact has no arrow; a contact with friction has its cone.
+    The page shows the time, the constraint forces as arrows with their sizes, and the actual path
+    over the desired one; it repeats the run. A time bar shows the phases of a task and the events
+    of the run, and jumps to any time; the address "page.html#t=2.5" shows the run at 2.5 s. An
+    impact is a flash. An open contact has no arrow. A contact with friction has a friction cone.
 
     Args:
         loop: A loop of a `RobotPlant`.
         record: The record of a run of this loop.
-        context: The context of its diagram, for the parameters; not changed.
+        context: The context of its diagram, which contains the parameters; not changed.
         title: The title of the page; the robot's name if empty.
 
     Returns:
-        One HTML page that holds the scene and the animation, as text. In a notebook it shows
-        itself.
+        One HTML page with the scene and the animation, as text. A notebook displays it.
 
     Raises:
-        ModelError: There is no robot.
+        ModelError: The plant is not a robot.
     """
     course = follow(loop, record, context)
-    moments = [*moments_of(record, Limits.of(course.model)), *slips(course)]
-    return animate(course, loop.scene_graph, title, phase_spans(record), ordered(record, moments))
+    events = [*events_of(record, Limits.of(course.model)), *slips(course)]
+    phases = phase_spans(record)
+    return animate(course, loop.scene_graph, title, phases, sorted_events(record, events))
 
 
 def animate(
@@ -103,18 +103,18 @@ def animate(
     scene_graph: SceneGraph | None,
     title: str = "",
     phases: Sequence[PhaseSpan] = (),
-    moments: Sequence[RunEvent] = (),
+    events: Sequence[RunEvent] = (),
 ) -> InlinePage:
-    """The page of `make_animation`.
+    """Returns the page of `make_animation`.
 
     Args:
         course: The motion of the robot.
         scene_graph: The geometry of the robot, or None.
         title: The title of the page; the robot's name if empty.
-        phases: The phases of a task, shown beside the clock.
-        moments: What happens in the run, marked on the bar of time.
+        phases: The phases of a task, shown beside the time.
+        events: The events of the run, marked on the time bar.
     """
-    # A separate server, made only now: other runs do not open a port.
+    # The server starts here, so that runs without an animation do not open a port.
     meshcat = start_unwatched_meshcat()
     plant, acting = course.plant, course.acting
     model = course.model
@@ -124,83 +124,73 @@ def animate(
 
     # The static parts: surfaces, floor, actual paths and desired paths.
     _, size = scene_extent(model, acting, course.states[0], scene_graph)
-    touched = surroundings(model, acting, course.points, course.parameters[0], PIECE * size)
-    draw_surroundings(meshcat, touched)
-    seen = run_points(course, scene_graph)
-    floor = floor_below(seen, touched)
+    surfaces = surroundings(model, acting, course.points, course.parameters[0], PIECE * size)
+    draw_surroundings(meshcat, surfaces)
+    floor = floor_below(run_points(course, scene_graph), surfaces)
     draw_floor(meshcat, floor)
     view = ViewAngles.of(CAMERA_ANGLE, ASPECT)
     look_at(meshcat, *run_view(course, scene_graph, view, ARROW * size))
     _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
-    _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
+    _draw_paths(meshcat, acting, course.desired_points, "desired", _DESIRED, 0.0015 * size)
 
     # The moving parts: links and arrows, frame by frame.
-    replay = links.CreateDefaultContext() if links is not None else None
+    links_context = links.CreateDefaultContext() if links is not None else None
     cones = friction_cones(course)
     for cone in cones:
         _add_cone(meshcat, acting.constraints[cone.row], cone, 0.5 * ARROW * size)
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    flashing = _add_flashes(meshcat, course, 0.05 * size)
-    for number, time in enumerate(course.times):
-        state, wrench = course.states[number], course.wrenches[number]
-        if links is not None and replay is not None:
-            replay.SetTime(time)
+    flash_paths = _add_flashes(meshcat, course, 0.05 * size)
+    for frame, time in enumerate(course.times):
+        state, wrench = course.states[frame], course.wrenches[frame]
+        if links is not None and links_context is not None:
+            links_context.SetTime(time)
             link_state = links.get_input_port()
-            link_state.FixValue(replay, state[: link_state.size()])
-            links.ForcedPublish(replay)
+            link_state.FixValue(links_context, state[: link_state.size()])
+            links.ForcedPublish(links_context)
         arrows.draw(wrench, time)
-        arrows.place(course.parameters[number], time)
+        arrows.place(course.parameters[frame], time)
         for cone in cones:
-            # It encloses the arrow, which ends at the contact.
-            turned = RotationMatrix(axes_along(-cone.normals[number]))
+            # The cone opens against the normal, since the arrow's tip is at the contact.
+            rotation = RotationMatrix(axes_along(-cone.normals[frame]))
             path = path_of(acting.constraints[cone.row], "cone")
-            meshcat.SetTransform(path, RigidTransform(turned, wrench.points[cone.row]), time)
-            is_there = 1.0 if wrench.forces[cone.row].any() else LEAST_SCALE
-            meshcat.SetProperty(f"{path}/form", "scale", [is_there] * 3, time)
-        for row, path in flashing.items():
+            meshcat.SetTransform(path, RigidTransform(rotation, wrench.points[cone.row]), time)
+            scale = 1.0 if wrench.forces[cone.row].any() else LEAST_SCALE
+            meshcat.SetProperty(f"{path}/form", "scale", [scale] * 3, time)
+        for row, path in flash_paths.items():
             meshcat.SetTransform(path, RigidTransform(wrench.points[row]), time)
-            bright = max(course.flashes[number, row], LEAST_SCALE)
-            meshcat.SetProperty(f"{path}/ball", "scale", [bright] * 3, time)
+            brightness = max(course.flashes[frame, row], LEAST_SCALE)
+            meshcat.SetProperty(f"{path}/ball", "scale", [brightness] * 3, time)
     meshcat.StopRecording()
     recording = meshcat.get_mutable_recording()
     recording.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
-    said = {
+    legend = _legend(course, arrows, cones, floor)
+    texts = {
         "title": title or model.dae.name,
-        "legend": [*_legend(course, arrows, cones, floor), *_marks(moments)],
+        "legend": [*legend, *((kind.color, kind.label) for kind in event_kinds(events))],
         "phases": [[span.begin, span.name] for span in phases],
-        "moments": [[one.time, one.kind.color, one.text] for one in moments],
+        "moments": [[event.time, event.kind.color, event.text] for event in events],
     }
-    return InlinePage(_with_overlay(meshcat.StaticHtml(), course, said))
+    return InlinePage(_with_overlay(meshcat.StaticHtml(), course, texts))
 
 
 def _legend(
     course: RunMotion, arrows: ForceArrows, cones: Sequence[DrawnFrictionCone], floor: Floor
 ) -> list[tuple[str, str]]:
-    """The color and the meaning of all that is drawn besides the robot."""
-    found = []
+    """Returns (color, meaning) of everything drawn besides the robot."""
+    entries = []
     if course.acting.constraints:
-        # Lines in a legend, in the order of what one looks for.
-        found += [(_hex(PATH_COLOR), "path"), (_hex(_DESIRED), "desired path")]
+        entries += [(_hex(PATH_COLOR), "path"), (_hex(_DESIRED), "desired path")]
         longest = f"constraint force, the longest {arrows.largest_force:.3g} N"
-        found.append((_hex(FORCE_COLOR), longest))
+        entries.append((_hex(FORCE_COLOR), longest))
     if arrows.has_moment:
         longest = f"moment, the longest {arrows.largest_moment:.3g} N m"
-        found.append((_hex(MOMENT_COLOR), longest))
+        entries.append((_hex(MOMENT_COLOR), longest))
     if cones:
         numbers = sorted({f"{cone.coefficient:.3g}" for cone in cones})
-        found.append((_hex(_CONE), f"friction cone, coefficient {' and '.join(numbers)}"))
-    return [*found, ("#bbbbbb", f"grid of {floor.cell:g} m")]
-
-
-def _marks(moments: Sequence[RunEvent]) -> list[tuple[str, str]]:
-    """The color and the meaning of each kind of mark."""
-    return [
-        (kind.color, kind.label)
-        for kind in RunEventKind
-        if any(one.kind is kind for one in moments)
-    ]
+        entries.append((_hex(_CONE), f"friction cone, coefficient {' and '.join(numbers)}"))
+    return [*entries, ("#bbbbbb", f"grid of {floor.cell:g} m")]
 
 
 def _hex(color: Rgba) -> str:
@@ -210,7 +200,7 @@ def _hex(color: Rgba) -> str:
 def _add_cone(
     meshcat: Meshcat, constraint: Constraint, cone: DrawnFrictionCone, side: float
 ) -> None:
-    """Adds the friction cone of a contact, with a side of that length; its tip is the origin."""
+    """Adds the friction cone of a contact; `side` is its slant height in m, its tip the origin."""
     angle = np.arctan(cone.coefficient)
     radius = side * np.sin(angle)
     shape = MeshcatCone(side * np.cos(angle), radius, radius)
@@ -218,7 +208,7 @@ def _add_cone(
 
 
 def _add_flashes(meshcat: Meshcat, course: RunMotion, radius: float) -> dict[int, str]:
-    """Adds a ball for each constraint with impacts, which shows them; row -> path."""
+    """Adds a ball for each constraint with impacts; returns constraint index -> path in Meshcat."""
     paths = {
         row: path_of(constraint, "impact")
         for row, constraint in enumerate(course.acting.constraints)
@@ -237,9 +227,9 @@ def _draw_paths(
     color: Rgba,
     radius: float,
 ) -> None:
-    """A line through the points of each constraint, m, shape (frames, constraints, 3)."""
-    for number, constraint in enumerate(wrenches.constraints):
-        line = points[:, number]
+    """Draws a line through the points of each constraint, m, shape (frames, constraints, 3)."""
+    for row, constraint in enumerate(wrenches.constraints):
+        line = points[:, row]
         if len(line) > 1:
             vertices, faces = _tube(line, radius)
             meshcat.SetTriangleMesh(
@@ -251,40 +241,39 @@ def _draw_paths(
 
 
 def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
-    """A thin tube around a line through points, m, shape (k, 3).
+    """Returns a thin tube around a line through points, m, shape (k, 3).
 
     Returns:
-        Its vertices, a ring of `_SIDES` around each point after the other, and its triangles, all
-        of a piece of the line before those of the next.
+        Its vertices, ring after ring of `_SIDES` vertices around the points, shape
+        (k * _SIDES, 3), and its triangles, segment after segment of the line.
     """
-    along = np.gradient(points, axis=0)
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 1.0])
-    # Two directions normal to the line.
-    aside = np.where(np.abs(along[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    first = np.cross(along, aside)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    across = np.stack([first, np.cross(along, first)], axis=1)
-    turn = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    rings = points[:, None] + radius * np.column_stack([np.cos(turn), np.sin(turn)]) @ across
-    near = np.arange(_SIDES)
-    far = np.roll(near, -1)
-    piece = np.vstack(
+    tangent = np.gradient(points, axis=0)
+    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = np.where(length > 0.0, tangent / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 1.0])
+    other = np.where(np.abs(tangent[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    normal = np.cross(tangent, other)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normals = np.stack([normal, np.cross(tangent, normal)], axis=1)
+    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    rings = points[:, None] + radius * np.column_stack([np.cos(angle), np.sin(angle)]) @ normals
+    corner = np.arange(_SIDES)
+    following = np.roll(corner, -1)
+    segment = np.vstack(
         [
-            np.column_stack([near, far, near + _SIDES]),
-            np.column_stack([far, far + _SIDES, near + _SIDES]),
+            np.column_stack([corner, following, corner + _SIDES]),
+            np.column_stack([following, following + _SIDES, corner + _SIDES]),
         ]
     )
-    faces = piece + _SIDES * np.arange(len(points) - 1)[:, None, None]
+    faces = segment + _SIDES * np.arange(len(points) - 1)[:, None, None]
     return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def _with_overlay(page: str, course: RunMotion, said: dict[str, Any]) -> str:
-    """Meshcat's page with what is said of the run, the sizes of the forces, and growing paths."""
+def _with_overlay(page: str, course: RunMotion, texts: dict[str, Any]) -> str:
+    """Returns Meshcat's page with texts, sizes of forces, and paths that grow with time."""
     constraints = course.acting.constraints
     sizes = np.linalg.norm([wrench.forces for wrench in course.wrenches], axis=2)
     data = {
-        **said,
+        **texts,
         "rate": FRAME_RATE,
         "start": course.start_time,
         "end": course.start_time + float(course.times[-1]),
@@ -303,7 +292,7 @@ def _with_overlay(page: str, course: RunMotion, said: dict[str, Any]) -> str:
     # A name may contain text that ends a script.
     text = json.dumps(data).replace("<", "\\u003c")
     overlay = _OVERLAY.read_text("utf-8").replace('"DATA"', text)
-    name = html.escape(said["title"])
+    name = html.escape(texts["title"])
     page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{name}</title>", page, count=1)
     head, end, tail = page.rpartition("</body>")
     return f"{head}{overlay}{end}{tail}" if end else page + overlay

@@ -1,4 +1,4 @@
-"""The layout of axes in a figure, and their labels."""
+"""The layout of axes in figures, their labels and their scales."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Of a figure, in inches: the axes' height, or the side of square ones, what is left and right of
-# them for the numbers of their scale, between rows, below the last and above the first; of a
-# legend, a line, what stands before a label, and a letter of it.
+# In inches: the height of axes, or the side of square axes; the space to their left, to their
+# right, between rows, below the last row, and above the first row.
 _AXES, _SQUARE, _LEFT, _RIGHT, _GAP, _BOTTOM, _TITLE = 1.4, 3.6, 0.85, 0.2, 0.5, 0.55, 0.25
+
+# In inches: the height of a legend's line, the width of its sample of a curve, and of a letter.
 _LINE, _HANDLE, _LETTER = 0.2, 0.65, 0.075
 
 _RAISED = str.maketrans(
@@ -30,18 +31,18 @@ def grid(
     titles: Sequence[str],
     labels: Sequence[str] = (),
     notes: Sequence[str] = (),
-    noted: str = "",
+    notes_title: str = "",
 ) -> tuple[Figure, list[Axes]]:
-    """Axes over time in two columns; a single last one fills its row.
+    """Returns a figure and its axes over time, in two columns; a single last one fills its row.
 
-    Their places are computed beforehand, since automatic layout takes longer than drawing. Axes
-    below each other share their tick labels.
+    The positions are computed here, since Matplotlib's automatic layout takes longer than drawing.
+    Of axes in one column only the lowest have tick labels.
 
     Args:
-        titles: Their titles.
-        labels: The entries of a legend above all axes, for which room is left.
+        titles: The titles of the axes.
+        labels: The labels of a legend, for which space is reserved above all axes.
         notes: Notes below all axes.
-        noted: The text before the notes.
+        notes_title: The text before the notes.
     """
     from drake_dae.pictures.shown import ShownFigure
 
@@ -50,9 +51,9 @@ def grid(
     rows = -(-count // columns)
     width = 6.0 * columns if count or not notes else 12.0
     top = _TITLE + (_LINE * legend_shape(labels, width)[0] + 0.15 if labels else 0.1)
-    # An entry is not broken at the end of a line.
+    # No line break within a note.
     entries = ", ".join(note.replace(" ", "\u00a0") for note in notes)
-    text = fill(noted + _plain(entries), int(width / _LETTER) - 6) if notes else ""
+    text = fill(notes_title + _plain(entries), int(width / _LETTER) - 6) if notes else ""
     below = (_BOTTOM if count else 0.1) + _LINE * len(text.splitlines())
     height = below + rows * _AXES + max(rows - 1, 0) * _GAP + top
     figure = ShownFigure(figsize=(width, height))
@@ -70,13 +71,14 @@ def grid(
         wspace=(_LEFT + _RIGHT) / (width / columns - _LEFT - _RIGHT),
         hspace=_GAP / _AXES,
     )
-    numbered = count - count % columns  # Axes above a wide one have another scale.
+    # The axes above a wide one are narrower, and keep their tick labels.
+    numbered = count - count % columns
     axes: list[Axes] = []
     for i, title in enumerate(titles):
         row, column = divmod(i, columns)
-        place = cells[row, :] if i == count - 1 and column == 0 else cells[row, column]
-        axis = figure.add_subplot(place, sharex=axes[0] if axes else None)
-        axis.set_title(title, y=1.0, fontsize=10)  # With y there is no search for room.
+        cell = cells[row, :] if i == count - 1 and column == 0 else cells[row, column]
+        axis = figure.add_subplot(cell, sharex=axes[0] if axes else None)
+        axis.set_title(title, y=1.0, fontsize=10)  # With y, Matplotlib does not search a position.
         axis.tick_params(axis="x", labelbottom=row == rows - 1 or i + columns >= numbered)
         axis.grid(True, alpha=0.3)
         axes.append(axis)
@@ -85,11 +87,11 @@ def grid(
 
 
 def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """Square axes in up to three columns.
+    """Returns a figure and its square axes, in up to three columns.
 
     Args:
-        titles: Their titles.
-        labels: The entries of a legend above all axes, for which room is left.
+        titles: The titles of the axes.
+        labels: The labels of a legend, for which space is reserved above all axes.
     """
     from drake_dae.pictures.shown import ShownFigure
 
@@ -101,8 +103,8 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
     height = rows * (_SQUARE + _BOTTOM) + (rows - 1) * _TITLE + top
     figure = ShownFigure(figsize=(width, height))
     axes: list[Axes] = []
-    for number, title in enumerate(titles):
-        row, column = divmod(number, columns)
+    for i, title in enumerate(titles):
+        row, column = divmod(i, columns)
         left = column * cell + _LEFT
         bottom = height - top - (row + 1) * _SQUARE - row * (_BOTTOM + _TITLE)
         box = (left / width, bottom / height, _SQUARE / width, _SQUARE / height)
@@ -115,9 +117,9 @@ def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[
 
 
 def decades(axis: Axes, floor: float) -> None:
-    """Scales a logarithmic axis from the floor up, with few numbers.
+    """Sets the range of a logarithmic axis, from a third of `floor` upward, and a few tick labels.
 
-    They are plain text, since Matplotlib's mathematical labels take longer than the curves.
+    The labels are plain text: Matplotlib draws its mathematical labels slower than the curves.
     """
     low, high = floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor)
     axis.set_ylim(low, high)
@@ -128,32 +130,32 @@ def decades(axis: Axes, floor: float) -> None:
 
 
 def short(value: float, digits: int = 3) -> str:
-    """A number for a line of text, as 4e-10."""
+    """Returns a number as short text, as 4e-10."""
     mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
     return f"{mantissa}e{int(exponent)}" if exponent else mantissa
 
 
 def labelled(signal: Signal) -> str:
-    """A signal's name with its unit."""
+    """Returns a signal's name with its unit, as Matplotlib's text."""
     name = _plain(signal.name)
     return f"{name} [{signal.unit}]" if signal.unit else name
 
 
 def _plain(text: str) -> str:
-    """Text without mathematics for Matplotlib."""
+    """Returns a text in which Matplotlib does not read $ as mathematics."""
     return text.replace("$", r"\$")
 
 
 def legend(figure: Figure, axis: Axes) -> None:
-    """One legend above all axes."""
+    """Adds one legend above all axes, with the labels of the curves in `axis`."""
     handles, labels = axis.get_legend_handles_labels()
     columns = legend_shape(labels, figure.get_figwidth())[1]
-    place = (0.5, 1.0 - 0.05 / figure.get_figheight())
+    anchor = (0.5, 1.0 - 0.05 / figure.get_figheight())
     figure.legend(
         handles,
         labels,
         loc="upper center",
-        bbox_to_anchor=place,
+        bbox_to_anchor=anchor,
         borderaxespad=0.0,
         ncols=columns,
         fontsize=9,
@@ -161,7 +163,7 @@ def legend(figure: Figure, axis: Axes) -> None:
 
 
 def legend_shape(labels: Sequence[str], width: float) -> tuple[int, int]:
-    """Rows and columns of a legend that is no wider than a figure."""
+    """Returns the rows and columns of a legend that fits into a figure of this width, in inches."""
     if sum(_HANDLE + _LETTER * len(label) for label in labels) <= width - 0.2:
         return 1, len(labels)
     entry = _HANDLE + _LETTER * max(map(len, labels))
@@ -170,12 +172,12 @@ def legend_shape(labels: Sequence[str], width: float) -> tuple[int, int]:
 
 
 def flatten(axis: Axes, values: FloatArray, noise: float, margin: float) -> None:
-    """Shows a signal that varies by less than the noise as a flat line."""
+    """Sets the range of an axis so that a signal that varies less than `noise` is a flat line."""
     low, high = float(np.min(values)), float(np.max(values))
     if high - low < noise:
         axis.set_ylim((low + high) / 2 - margin, (low + high) / 2 + margin)
 
 
 def round_off(values: FloatArray) -> float:
-    """The round-off of a signal of this size, at least 1e-16 for a logarithmic axis."""
+    """Returns the round-off of a signal's largest value, at least 1e-16 for a logarithmic axis."""
     return float(np.finfo(float).eps * max(np.max(np.abs(values), initial=0.0), 0.45))

@@ -1,10 +1,10 @@
-"""Pages that a notebook shows in its own."""
+"""HTML pages that a notebook displays."""
 
 import html
 
 
 class InlinePage(str):
-    """An HTML page as text; a notebook shows it in its place."""
+    """An HTML page as text; a notebook displays it in a frame."""
 
     def _repr_html_(self) -> str:
         page = html.escape(str(self), quote=True)

@@ -1,4 +1,4 @@
-"""What happens in a run at one moment: impacts, touches, limits, sliding."""
+"""The events of a run that pictures mark: impacts, contact changes, limits, sliding."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from drake_dae.simulation.summary import Limits
 from drake_dae.systems.plants.contact_events import ContactChange
 
 APART = 0.01
-"""Of moments of one kind and place that follow each other within this fraction of the run, the
-first is shown; of impacts all are."""
+"""Events with the same text that follow each other within this fraction of the run are shown as
+one; impacts are all shown."""
 
 
 class RunEventKind(Enum):
-    """The kind of a moment: its label in a legend, and its color."""
+    """The kind of an event: its label in a legend, and its color."""
 
     IMPACT = "impact", "#ffbf1a"
     TOUCH = "touch", "#2ca02c"
@@ -33,12 +33,12 @@ class RunEventKind(Enum):
 
 @dataclass(frozen=True)
 class RunEvent:
-    """Something that happens in a run.
+    """An event of a run, as pictures mark it.
 
     Attributes:
-        time: When, in s.
+        time: The time in s.
         kind: Its kind.
-        text: What happens, in words.
+        text: A description, as "wall: impact".
     """
 
     time: float
@@ -46,32 +46,38 @@ class RunEvent:
     text: str
 
 
-def moments_of(record: Record, limits: Limits | None = None) -> list[RunEvent]:
-    """The moments that a record shows, in order.
+def events_of(record: Record, limits: Limits | None = None) -> list[RunEvent]:
+    """Returns the events of a recorded run, sorted by time.
 
     Args:
         record: A record with control, state and constraint_force.
         limits: The limits of the robot.
     """
-    found = [*_contacts(record), *_limits(record, limits or Limits())]
-    return ordered(record, found)
+    return sorted_events(record, [*_contacts(record), *_limits(record, limits or Limits())])
 
 
-def ordered(record: Record, moments: Sequence[RunEvent]) -> list[RunEvent]:
-    """Moments in order, without repetitions shortly after, except those of impacts."""
+def sorted_events(record: Record, events: Sequence[RunEvent]) -> list[RunEvent]:
+    """Returns events sorted by time, without repetitions within `APART`, except impacts."""
     if not record.time.size:
         return []
     apart = APART * float(record.time[-1] - record.time[0])
-    last, found = dict[tuple[RunEventKind, str], float](), list[RunEvent]()
-    for moment in sorted(moments, key=lambda one: one.time):
-        key = moment.kind, moment.text
-        if moment.kind is RunEventKind.IMPACT or moment.time - last.get(key, -np.inf) > apart:
-            found.append(moment)
-        last[key] = moment.time
-    return found
+    last_times, shown = dict[tuple[RunEventKind, str], float](), list[RunEvent]()
+    for event in sorted(events, key=lambda event: event.time):
+        key = event.kind, event.text
+        if event.kind is RunEventKind.IMPACT or event.time - last_times.get(key, -np.inf) > apart:
+            shown.append(event)
+        last_times[key] = event.time
+    return shown
+
+
+def event_kinds(events: Sequence[RunEvent]) -> list[RunEventKind]:
+    """Returns the kinds of events that occur, in the order of `RunEventKind`."""
+    occurring = {event.kind for event in events}
+    return [kind for kind in RunEventKind if kind in occurring]
 
 
 def _contacts(record: Record) -> Iterator[RunEvent]:
+    """Yields when contacts close, open or are struck."""
     if "mode" in record.signals:
         hits = {id(event) for event in impacts(record.events)}
         kinds = {
@@ -86,31 +92,32 @@ def _contacts(record: Record) -> Iterator[RunEvent]:
     elif "contact_force" in record.signals:  # Compliant contact opens and closes without events.
         forces = record.signals["constraint_force"]
         for signal, values in zip(forces.signals, forces.values.T, strict=True):
-            pushes = values > 0.0
+            is_closed = values > 0.0
             name = signal.name.removesuffix(".force")
             for kind, changed in (
-                (RunEventKind.TOUCH, pushes[1:] & ~pushes[:-1]),
-                (RunEventKind.OPENING, pushes[:-1] & ~pushes[1:]),
+                (RunEventKind.TOUCH, is_closed[1:] & ~is_closed[:-1]),
+                (RunEventKind.OPENING, is_closed[:-1] & ~is_closed[1:]),
             ):
                 for time in record.time[1:][changed]:
                     yield RunEvent(float(time), kind, f"{name}: {kind.label}")
 
 
 def _limits(record: Record, limits: Limits) -> Iterator[RunEvent]:
-    """When a control or a joint comes to its limit."""
-    rows: list[tuple[str, Booleans]] = []
+    """Yields when a control or a joint reaches its limit."""
+    at_limits: list[tuple[str, Booleans]] = []
     controls = record.signals["control"]
     if limits.control is not None:
-        at = np.abs(controls.values) >= limits.control * (1.0 - 1e-9)
+        at_limit = np.abs(controls.values) >= limits.control * (1.0 - 1e-9)
         if "excess" in record.signals:
-            at |= record["excess"] != 0.0
-        rows += [(one.name, at[:, i]) for i, one in enumerate(controls.signals)]
+            at_limit |= record["excess"] != 0.0
+        at_limits += [(signal.name, at_limit[:, i]) for i, signal in enumerate(controls.signals)]
     for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and key in record.signals:
-            found = record.signals[key]
-            for one, values, low, high in zip(found.signals, found.values.T, *bounds, strict=False):
-                rows.append((one.name, (values <= low) | (values >= high)))
-    for name, reached in rows:
+            states = record.signals[key]
+            columns = zip(states.signals, states.values.T, *bounds, strict=False)
+            for signal, values, low, high in columns:
+                at_limits.append((signal.name, (values <= low) | (values >= high)))
+    for name, reached in at_limits:
         begins = reached & ~np.concatenate([[False], reached[:-1]])
         for time in record.time[begins]:
             yield RunEvent(float(time), RunEventKind.LIMIT, f"{name} is at its limit")

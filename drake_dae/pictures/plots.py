@@ -31,14 +31,14 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from drake_dae.pictures.scene.run_motion import ContactPath
 
 PATHS = "path.png"
-"""The plot of points that move on surfaces, if there are any."""
+"""The plot of contact points that move on surfaces; omitted if there are none."""
 
 PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png", PATHS)
 """The files that `save_plots` writes."""
 
 HELD = 1e-4
-"""An output with a constant reference counts as held, and is not drawn, if its relative error is
-below this."""
+"""An output with a constant reference is listed as held instead of drawn, if its error relative to
+its size is at most this."""
 
 _DPI = 110
 
@@ -50,24 +50,27 @@ def save_plots(
     folder: str | Path,
     paths: Sequence[ContactPath] = (),
     accuracy: float | None = None,
-    moments: Sequence[RunEvent] = (),
+    events: Sequence[RunEvent] = (),
 ) -> list[Path]:
-    """Draws a run into PNG files: outputs, errors, constraint residual, controls, paths.
+    """Writes the plots of a run as PNG files: outputs, errors, residual, controls, paths.
 
     Args:
         record: A record with desired_output, controlled_output, constraint_residual and control.
-        predicted: The tracking error by theory, shape (k, p).
-        limits: The largest |u|, shape (p,), infinite or None where there is none.
+        predicted: The predicted tracking error, shape (k, p).
+        limits: The largest |u|, shape (p,), inf for an actuator without a limit; None without any.
         folder: The folder to write to.
-        paths: The paths of points on surfaces; without any there is no such file.
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
-        moments: What happens in the run, marked on the axes of time.
+        paths: The paths of contact points on surfaces; if empty, no such plot is written.
+        accuracy: The accuracy of the integrator; None with fixed steps.
+        events: The events of the run, marked on the time axes.
+
+    Returns:
+        The files.
     """
     figures = [
-        plot_outputs(record, predicted, moments),
-        plot_errors(record, predicted, accuracy, moments),
-        plot_residual(record, moments),
-        plot_controls(record, limits, moments),
+        plot_outputs(record, predicted, events),
+        plot_errors(record, predicted, accuracy, events),
+        plot_residual(record, events),
+        plot_controls(record, limits, events),
     ]
     for figure in figures:
         mark_phases(figure, record)
@@ -79,35 +82,35 @@ def save_plots(
     return files
 
 
-def plot_outputs(record: Record, predicted: FloatArray, moments: Sequence[RunEvent] = ()) -> Figure:
-    """Controlled outputs, with their references dashed; held ones are a line of text.
+def plot_outputs(record: Record, predicted: FloatArray, events: Sequence[RunEvent] = ()) -> Figure:
+    """Plots the controlled outputs, with dashed references; lists held outputs below as text.
 
     Args:
         record: A record with controlled_output and desired_output.
-        predicted: The tracking error by theory, shape (k, p).
-        moments: What happens in the run.
+        predicted: The predicted tracking error, shape (k, p).
+        events: The events of the run.
     """
     values = record["controlled_output"]
     desired = record["desired_output"]
     signals = record.signals["controlled_output"].signals
     size = output_sizes(record, predicted)
-    off = np.max(np.abs(values - desired), axis=0, initial=0.0)
-    held = (np.ptp(desired, axis=0) == 0.0) & (off <= HELD * size)
-    drawn = np.flatnonzero(~held)
+    error = np.max(np.abs(values - desired), axis=0, initial=0.0)
+    is_held = (np.ptp(desired, axis=0) == 0.0) & (error <= HELD * size)
+    drawn = np.flatnonzero(~is_held)
     figure, axes = grid(
         [labelled(signals[i]) for i in drawn],
-        ("actual", "reference", *mark_labels(record, moments)) if len(drawn) else (),
+        ("actual", "reference", *mark_labels(record, events)) if len(drawn) else (),
         [
             f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
-            + (f" (within {short(off[i], 1)})" if off[i] > ROUND_OFF * size[i] else "")
-            for i in np.flatnonzero(held)
+            + (f" (within {short(error[i], 1)})" if error[i] > ROUND_OFF * size[i] else "")
+            for i in np.flatnonzero(is_held)
         ],
         "held: ",
     )
     for axis, i in zip(axes, drawn, strict=False):
         axis.plot(record.time, values[:, i], color="C0", label="actual")
         axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
-    mark_events(axes, record, moments)
+    mark_events(axes, record, events)
     if len(drawn):
         legend(figure, axes[0])
     return figure
@@ -117,31 +120,31 @@ def plot_errors(
     record: Record,
     predicted: FloatArray,
     accuracy: float | None = None,
-    moments: Sequence[RunEvent] = (),
+    events: Sequence[RunEvent] = (),
 ) -> Figure:
-    """|z - r| of every output on a log scale, over the predicted error.
+    """Plots |z - r| of each output on a log scale, over the predicted error.
 
-    With an accuracy, the region below it is grey: there errors come from the integrator. An output
-    with neither predicted nor actual error is a line of text.
+    Errors below the integrator's accuracy are in a grey region. An output whose predicted and
+    actual errors are below it all the time is listed below as text.
 
     Args:
         record: A record with controlled_output and desired_output.
-        predicted: The tracking error by theory, shape (k, p).
-        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
-        moments: What happens in the run.
+        predicted: The predicted tracking error, shape (k, p).
+        accuracy: The accuracy of the integrator; None with fixed steps.
+        events: The events of the run.
     """
     values = record["controlled_output"]
     errors = np.abs(values - record["desired_output"])
     signals = record.signals["controlled_output"].signals
     size = output_sizes(record, predicted)
-    blurred = (accuracy or 0.0) * size
+    accurate_to = (accuracy or 0.0) * size
     largest = np.max(np.maximum(errors, np.abs(predicted)), axis=0, initial=0.0)
-    drawn = np.flatnonzero((largest > blurred) | (accuracy is None))
+    drawn = np.flatnonzero((largest > accurate_to) | (accuracy is None))
     label = "below the integrator's accuracy" if accuracy is not None else "round-off"
     titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
     figure, axes = grid(
         titles,
-        ("predicted", "actual", label, *mark_labels(record, moments)) if len(drawn) else (),
+        ("predicted", "actual", label, *mark_labels(record, events)) if len(drawn) else (),
         [
             f"{signals[i].name} ("
             + (
@@ -168,35 +171,35 @@ def plot_errors(
         if accuracy is None:
             axis.axhline(floor, color="0.5", linestyle=":", label=label)
         else:
-            axis.axhspan(floor / 3.0, blurred[i], color="0.88", zorder=0.5, label=label)
+            axis.axhspan(floor / 3.0, accurate_to[i], color="0.88", zorder=0.5, label=label)
         decades(axis, floor)
-    mark_events(axes, record, moments)
+    mark_events(axes, record, events)
     if len(drawn):
         legend(figure, axes[0])
     return figure
 
 
-def plot_residual(record: Record, moments: Sequence[RunEvent] = ()) -> Figure:
-    """Constraint outputs and their derivatives, after each step and before the projection."""
+def plot_residual(record: Record, events: Sequence[RunEvent] = ()) -> Figure:
+    """Plots the constraint functions and their derivatives after each step, before projection."""
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
     title = "|constraint residual|, before each step's projection"
-    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record, moments)))
+    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record, events)))
     floor = round_off(np.ones(1))
     for i, label in enumerate(labels):
         axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     decades(axis, floor)
-    mark_events([axis], record, moments)
+    mark_events([axis], record, events)
     legend(figure, axis)
     return figure
 
 
 def plot_controls(
-    record: Record, limits: FloatArray | None = None, moments: Sequence[RunEvent] = ()
+    record: Record, limits: FloatArray | None = None, events: Sequence[RunEvent] = ()
 ) -> Figure:
-    """Controls, with the actuators' limits if these are within the plot."""
+    """Plots the controls, with those limits of the actuators that are near the values."""
     values = record["control"]
     signals = record.signals["control"].signals
     bounds = np.full(len(signals), np.inf) if limits is None else limits
@@ -205,9 +208,9 @@ def plot_controls(
             labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
             for signal, bound in zip(signals, bounds, strict=True)
         ],
-        marks := mark_labels(record, moments),
+        marks := mark_labels(record, events),
     )
-    mark_events(axes, record, moments)
+    mark_events(axes, record, events)
     if axes and marks:
         legend(figure, axes[0])
     for i, axis in enumerate(axes):
@@ -223,10 +226,7 @@ def plot_controls(
 
 
 def plot_paths(paths: Sequence[ContactPath]) -> Figure:
-    """The actual paths of points on their surfaces, over the desired ones.
-
-    They are drawn as seen from the free side.
-    """
+    """Plots the actual over the desired paths of points on surfaces, seen from the free side."""
     figure, axes = squares(
         [f"path on {labelled(Signal(path.name))}" for path in paths], ("desired", "actual", "start")
     )
@@ -237,7 +237,7 @@ def plot_paths(paths: Sequence[ContactPath]) -> Figure:
             (path.actual[:1], {"color": "C0", "marker": "o", "linestyle": "", "label": "start"}),
         ):
             axis.plot(*points.T, **style)
-        # Equal scales in both directions, also if the path is a line.
+        # Both directions have the same scale, also if the path is a line.
         both = np.vstack([path.actual, path.desired])
         middle = (np.min(both, axis=0) + np.max(both, axis=0)) / 2.0
         half = 0.55 * float(np.max(np.ptp(both, axis=0))) or 1e-3

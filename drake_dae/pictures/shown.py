@@ -1,4 +1,4 @@
-"""Figures that a notebook shows in its own."""
+"""Figures that a notebook displays."""
 
 from io import BytesIO
 
@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows, whether or not it has Matplotlib's inline mode."""
+    """A figure that a notebook displays, with or without Matplotlib's inline mode."""
 
     def _repr_png_(self) -> bytes:
         file = BytesIO()

@@ -1,4 +1,4 @@
-"""Animations of several runs beside each other, with one clock."""
+"""A page with the animations of several runs side by side, at the same time."""
 
 import html
 import json
@@ -11,14 +11,14 @@ _TEMPLATE = Path(__file__).with_name("side_by_side.html")
 
 
 def side_by_side(pages: Mapping[str, Path], duration: float, folder: Path) -> str:
-    """A page that shows the animations of runs at the same time after their starts.
+    """Returns a page that shows the animations of runs side by side, all at the same run time.
 
-    It names the files of the animations, and holds none.
+    The page refers to the files of the animations, and does not contain them.
 
     Args:
-        pages: The name of each run -> the page of its animation.
+        pages: Name of a run -> the file of its animation.
         duration: The duration of the longest run, in s.
-        folder: The folder that the page is for.
+        folder: The folder that the page will be written to.
     """
     runs = [
         (name, quote(os.path.relpath(page.resolve(), folder.resolve()).replace(os.sep, "/")))

@@ -1,4 +1,4 @@
-"""The page of a study: a table to sort, parallel coordinates, and its runs side by side."""
+"""The page of a study: a sortable table, parallel coordinates, and its runs side by side."""
 
 import html
 import json
@@ -14,50 +14,50 @@ _TEMPLATE = Path(__file__).with_name("page.html")
 
 @dataclass(frozen=True)
 class PageText:
-    """What a page says of a study besides its table.
+    """The texts of a study's page besides its table.
 
     Attributes:
-        title: The title.
-        said: How many runs ended how, in words.
-        names: What is special about each run.
-        again: For each run the command that makes its folder; none where nothing is known.
+        title: The title of the page.
+        outcomes: The number of runs with each outcome, as text.
+        names: The text that distinguishes each run from the others.
+        commands: For each run the command that writes its folder; empty if these are unknown.
         duration: The duration of the runs, in s.
     """
 
     title: str
-    said: str
+    outcomes: str
     names: Sequence[str]
-    again: Sequence[str]
+    commands: Sequence[str]
     duration: float
 
 
 def study_page(
     table: Mapping[str, Sequence[Any]], keys: Sequence[str], figures: Sequence[str], text: PageText
 ) -> str:
-    """One HTML page without anything from outside, as text.
+    """Returns a self-contained HTML page, as text.
 
-    It shows the pictures of a run where the page's folder has a folder "run<number>" of it.
+    It shows the pictures of a run if its own folder has a folder "run<number>" with them.
 
     Args:
-        table: What `Study.table` returns.
-        keys: The keys that vary.
+        table: The columns that `Study.table` returns.
+        keys: The varied keys.
         figures: The names of the figures.
-        text: What the page says besides.
+        text: The other texts of the page.
     """
     columns = [
         *({"name": key, "kind": "key", "values": table[key]} for key in keys),
         {"name": "outcome", "kind": "end", "values": table["outcome"]},
         *({"name": name, "kind": "figure", "values": table[name]} for name in figures),
     ]
-    ends = list(zip(table["outcome"], table["reason"], strict=True))
+    endings = list(zip(table["outcome"], table["reason"], strict=True))
     data = {
         "title": text.title,
-        "said": text.said,
+        "said": text.outcomes,
         "columns": columns,
         "names": list(text.names),
-        "bad": [outcome != Outcome.FINISHED for outcome, _ in ends],
-        "ends": [f"{outcome}: {reason}" if reason else outcome for outcome, reason in ends],
-        "again": list(text.again),
+        "bad": [outcome != Outcome.FINISHED for outcome, _ in endings],
+        "ends": [f"{outcome}: {reason}" if reason else outcome for outcome, reason in endings],
+        "again": list(text.commands),
         "duration": text.duration,
     }
     # A name may contain text that ends a script.

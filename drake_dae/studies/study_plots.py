@@ -1,4 +1,4 @@
-"""Plots of a study: the distribution of its figures, and their dependence on two keys."""
+"""Plots of a study: the distributions of its figures, and their dependence on two keys."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.studies.results import Outcome
 
 MOST_PLOTS = 24
-"""The largest number of figures in a plot, the first ones that vary."""
+"""The largest number of figures in a plot; the first ones that vary are drawn."""
 
 
 def save_study_plots(
@@ -21,41 +21,39 @@ def save_study_plots(
     figures: Sequence[str],
     folder: Path,
 ) -> list[Path]:
-    """Draws `histograms.png`, and `map.png` if a key with numbers varies.
+    """Writes `histograms.png`, and also `map.png` if a numeric key varies.
 
     Args:
-        table: What `Study.table` returns.
-        keys: The keys that vary.
+        table: The columns that `Study.table` returns.
+        keys: The varied keys.
         figures: The names of the figures.
         folder: The folder to write to.
 
     Returns:
-        What was written; nothing where no figure varies.
+        The files; an empty list if no figure varies.
     """
     columns = {name: _numbers(table[name]) for name in (*keys, *figures)}
-    varying = [name for name in columns if _varies(columns[name])]
-    drawn = [name for name in figures if name in varying][:MOST_PLOTS]
-    axes = [key for key in keys if key in varying][:2]
+    varying = {name: column for name, column in columns.items() if _varies(column)}
+    drawn = {name: varying[name] for name in [n for n in figures if n in varying][:MOST_PLOTS]}
+    axes = {key: varying[key] for key in [k for k in keys if k in varying][:2]}
     pictures = {}
     if drawn:
-        pictures["histograms.png"] = plot_histograms({name: columns[name] for name in drawn})
+        pictures["histograms.png"] = plot_histograms(drawn)
     if drawn and axes:
         is_finished = np.array([outcome == Outcome.FINISHED for outcome in table["outcome"]])
-        pictures["map.png"] = plot_map(
-            {key: columns[key] for key in axes}, {n: columns[n] for n in drawn}, is_finished
-        )
+        pictures["map.png"] = plot_map(axes, drawn, is_finished)
     for name, figure in pictures.items():
         figure.savefig(folder / name, dpi=100)
     return [folder / name for name in pictures]
 
 
 def plot_histograms(figures: Mapping[str, FloatArray]) -> Figure:
-    """How often each figure has which values; the median is dashed."""
+    """Plots a histogram of each figure over the runs, with a dashed line at the median."""
     figure, axes = _grid(figures)
     for axis, values in zip(axes, figures.values(), strict=True):
-        known = values[np.isfinite(values)]
-        axis.hist(known, bins=int(np.clip(np.sqrt(known.size), 5, 50)), color="C0")
-        axis.axvline(float(np.median(known)), color="C1", linestyle="--")
+        finite = values[np.isfinite(values)]
+        axis.hist(finite, bins=int(np.clip(np.sqrt(finite.size), 5, 50)), color="C0")
+        axis.axvline(float(np.median(finite)), color="C1", linestyle="--")
         axis.set_ylabel("runs", fontsize=8)
     return figure
 
@@ -63,40 +61,40 @@ def plot_histograms(figures: Mapping[str, FloatArray]) -> Figure:
 def plot_map(
     keys: Mapping[str, FloatArray], figures: Mapping[str, FloatArray], is_finished: Booleans
 ) -> Figure:
-    """Each figure over two keys, as colours, or over one key, as points.
+    """Plots each figure over two keys, as colours, or over one key, as points.
 
-    Where several runs have the same values of the keys, the worst is seen: the least margin or
-    force, the largest error. A run that did not finish is a red cross.
+    If several runs have the same values of the keys, the worst one is on top: the least margin or
+    force, or the largest error. A red cross is a run that did not finish.
     """
     figure, axes = _grid(figures)
     for axis, (title, values) in zip(axes, figures.items(), strict=True):
         badness = -values if title.startswith(("margin", "least")) else np.abs(values)
         order = np.argsort(np.where(np.isfinite(values), badness, -np.inf), kind="stable")
-        names, places = list(keys), [column[order] for column in keys.values()]
-        shown, finished = values[order], is_finished[order]
+        names, coordinates = list(keys), [column[order] for column in keys.values()]
+        values, failed = values[order], ~is_finished[order]
         axis.set_xlabel(_text(names[0]), fontsize=8)
         if len(names) == 1:
-            axis.plot(places[0], shown, ".", color="C0")
-            axis.plot(places[0][~finished], shown[~finished], "x", color="C3")
+            axis.plot(coordinates[0], values, ".", color="C0")
+            axis.plot(coordinates[0][failed], values[failed], "x", color="C3")
             continue
         axis.set_ylabel(_text(names[1]), fontsize=8)
-        colours = _coloured(axis, places, shown)
-        axis.plot(places[0][~finished], places[1][~finished], "x", color="C3")
+        colours = _draw_colours(axis, coordinates[0], coordinates[1], values)
+        axis.plot(coordinates[0][failed], coordinates[1][failed], "x", color="C3")
         figure.colorbar(colours, ax=axis)
     return figure
 
 
-def _coloured(axis: Axes, places: Sequence[FloatArray], shown: FloatArray) -> Any:
-    """A full grid as cells, anything else as points."""
-    levels = [np.unique(place[np.isfinite(place)]) for place in places]
+def _draw_colours(axis: Axes, x: FloatArray, y: FloatArray, values: FloatArray) -> Any:
+    """Draws values as cells if the runs form a full grid, otherwise as points."""
+    levels = [np.unique(column[np.isfinite(column)]) for column in (x, y)]
     cells = np.full([level.size for level in levels], np.nan)
-    for x, y, value in zip(*places, shown, strict=True):
-        if np.isfinite([x, y, value]).all():
-            cells[np.searchsorted(levels[0], x), np.searchsorted(levels[1], y)] = value
-    # Of random runs hardly two have the same value.
-    if cells.size <= shown.size:
+    is_finite = np.isfinite([x, y, values]).all(axis=0)
+    for column, row, value in zip(x[is_finite], y[is_finite], values[is_finite], strict=True):
+        cells[np.searchsorted(levels[0], column), np.searchsorted(levels[1], row)] = value
+    # Random values differ in all runs, so that the grid would have more cells than runs.
+    if cells.size <= values.size:
         return axis.pcolormesh(*levels, np.ma.masked_invalid(cells.T), shading="nearest")
-    return axis.scatter(places[0], places[1], c=shown, s=12)
+    return axis.scatter(x, y, c=values, s=12)
 
 
 def _grid(figures: Mapping[str, FloatArray]) -> tuple[Figure, list[Axes]]:
@@ -117,13 +115,13 @@ def _text(name: str) -> str:
 
 
 def _numbers(column: Sequence[Any]) -> FloatArray:
-    """A column as numbers; nan where it has none. A list with one number is that number."""
+    """Returns a column as numbers, from numbers or lists of one number; nan for other entries."""
     flat = [entry[0] if isinstance(entry, list) and len(entry) == 1 else entry for entry in column]
     is_number = [isinstance(e, (int, float)) and not isinstance(e, bool) for e in flat]
     return np.array([e if yes else np.nan for e, yes in zip(flat, is_number, strict=True)], float)
 
 
 def _varies(values: FloatArray) -> bool:
-    """Whether a column has different numbers, by more than round-off."""
-    known = values[np.isfinite(values)]
-    return known.size > 1 and bool(np.ptp(known) > 1e-9 * np.max(np.abs(known)))
+    """Whether the numbers of a column differ by more than round-off."""
+    finite = values[np.isfinite(values)]
+    return finite.size > 1 and bool(np.ptp(finite) > 1e-9 * np.max(np.abs(finite)))

@@ -1,1 +1,1 @@
-"""The book: pages that teach, each of which runs. `python examples/book` makes its site."""
+"""The book: pages whose code blocks all run. `python examples/book` builds its site."""

@@ -1,4 +1,4 @@
-"""Makes the site of the book: runs its pages, writes the reference, calls Sphinx."""
+"""Builds the site of the book: runs its pages, writes the reference pages, calls Sphinx."""
 
 import argparse
 import hashlib
@@ -19,11 +19,11 @@ from book.pages import pages, run_page  # noqa: E402
 from drake_dae.cli import main as command  # noqa: E402
 
 NO_FIGURE = "<p>This figure needs zig: pip install 'drake_dae[compiler]'; drake-dae page {name}</p>"
-"""What is shown where the page of a scenario could not be made."""
+"""The replacement for the live page of a scenario that could not be written."""
 
 
 def main() -> int:
-    """Makes the site; a page runs again only if it, or the library, has changed."""
+    """Builds the site; a page runs again only if its file or the library has changed."""
     parser = argparse.ArgumentParser(prog="python examples/book", description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("build/book"), help="the folder")
     out = parser.parse_args().out
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
-    """Makes the pages of scenarios that pages of the book frame, with one bundle for all."""
+    """Writes the live pages of scenarios that pages of the book show in a frame."""
     folder = out / "site" / "live"
     folder.mkdir(parents=True, exist_ok=True)
     names = {name for text in texts for name in re.findall(r'src="\.\./live/(\w+)\.html"', text)}
@@ -72,9 +72,9 @@ def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
             stamp.write_text(library)
 
 
-def _run(page: Path, place: Path, library: str) -> None:
-    """Runs a page in a folder of its name, beside the place of its copy."""
-    folder, stamp = place.with_suffix(""), place.with_suffix(".stamp")
+def _run(page: Path, copy: Path, library: str) -> None:
+    """Runs a page in a folder of its name, beside its copy."""
+    folder, stamp = copy.with_suffix(""), copy.with_suffix(".stamp")
     state = f"{library} {_digest(page)}"
     if not (stamp.exists() and stamp.read_text() == state):
         print(f"runs {page.relative_to(BOOK)}", flush=True)

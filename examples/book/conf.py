@@ -1,4 +1,4 @@
-"""Sphinx's settings of the book; `make docs` builds it."""
+"""The Sphinx configuration of the book, which `make docs` builds."""
 
 import re
 from typing import Any
@@ -40,7 +40,7 @@ _MATRIX = re.compile(r"<mo>&#x00028;</mo>(<mtable>.*?</mtable>)<mo>&#x00029;</mo
 
 
 def _mathml(node: nodes.Element, display: str) -> str:
-    """MathML; the style draws parentheses around a matrix, since few fonts have tall ones."""
+    """Returns MathML; book.css draws the parentheses of matrices: few fonts have tall ones."""
     return _MATRIX.sub(r'<mrow class="matrix">\1</mrow>', convert(node.astext(), display=display))
 
 
@@ -59,9 +59,10 @@ _SECTION = re.compile(r"\s*(Args|Attributes|Raises|Returns|Yields|Warns):$")
 
 
 def _plain_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text: what is indented, as ports and equations, stays so."""
-    found: list[str] = []
-    indent = -1  # Of the line that a literal block follows; -1 outside of one, -2 in a section.
+    """Converts a plain text docstring to reStructuredText; indented text is a literal block."""
+    converted: list[str] = []
+    # The indentation of the line before a literal block; -1 outside of one, -2 in a section.
+    indent = -1
     for i, line in enumerate(lines):
         depth = len(line) - len(line.lstrip())
         if _SECTION.match(line):
@@ -74,11 +75,11 @@ def _plain_text(app: Any, what: str, name: str, value: Any, options: Any, lines:
             deeper = len(following) - len(following.lstrip()) > depth
             if indent == -1 and line.strip() and deeper and not _ITEM.match(line):
                 line = line.rstrip() + (":" if line.rstrip().endswith(":") else " ::")
-                found += [line, ""]
+                converted += [line, ""]
                 indent = depth
                 continue
-        found.append(line)
-    lines[:] = found
+        converted.append(line)
+    lines[:] = converted
 
 
 _ARRAY_LIKE = re.compile(r"_Buffer \| .*?_NestedSequence\[complex \| bytes \| str\]")
@@ -87,19 +88,19 @@ _ARRAY_LIKE = re.compile(r"_Buffer \| .*?_NestedSequence\[complex \| bytes \| st
 def _signature(
     app: Any, what: str, name: str, value: Any, options: Any, text: str | None, result: str | None
 ) -> tuple[str | None, str | None]:
-    """NumPy's union of all that makes an array has a name."""
+    """Replaces NumPy's long union of types by the name ArrayLike."""
     return text and _ARRAY_LIKE.sub("ArrayLike", text), result and _ARRAY_LIKE.sub(
         "ArrayLike", result
     )
 
 
 def _bases(app: Any, name: str, value: Any, options: Any, bases: list[Any]) -> None:
-    """That a class is an object goes without saying."""
+    """Omits `object` from the list of base classes."""
     bases[:] = [base for base in bases if base is not object]
 
 
 def setup(app: Any) -> None:
-    """Equations are MathML, which browsers show without a script or a font."""
+    """Registers these functions; equations are MathML, which needs no script and no font."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
     app.connect("autodoc-process-docstring", _plain_text, priority=400)
     app.connect("autodoc-process-signature", _signature)

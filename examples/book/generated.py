@@ -1,4 +1,4 @@
-"""The reference pages that follow from the code: public names, keys and commands."""
+"""The reference pages generated from the code: public names, keys, commands, errors, equations."""
 
 import ast
 import contextlib
@@ -33,11 +33,11 @@ TOPICS = {
     "pictures": "Pictures",
     "errors": "Errors",
 }
-"""Room of the library -> title of the part of the reference that has its public names."""
+"""Folder of the library -> title of the section with its public names."""
 
 
 def generated_pages() -> dict[str, str]:
-    """Path below the book -> text of the page."""
+    """Returns path relative to the book's folder -> text of the page."""
     return {
         "reference/names.md": names_page(),
         "reference/keys.md": keys_page(),
@@ -48,7 +48,7 @@ def generated_pages() -> dict[str, str]:
 
 
 def public_names() -> dict[str, str]:
-    """Public name -> module that it stands in."""
+    """Returns public name -> its module."""
     stub = ast.parse(Path(drake_dae.__file__).with_suffix(".pyi").read_text("utf-8"))
     return {
         alias.asname or alias.name: f"drake_dae.{node.module}"
@@ -59,42 +59,42 @@ def public_names() -> dict[str, str]:
 
 
 def uses() -> dict[str, list[Path]]:
-    """Public name -> the pages and examples that run with it."""
-    names, found = set(public_names()), defaultdict(list)
+    """Returns public name -> the pages and examples whose code uses it."""
+    names, users = set(public_names()), defaultdict(list)
     sources = {page: "\n".join(b.text for b in blocks(page)) for page in pages()}
     for path in sorted(ROOT.glob("examples/*.py")):
         sources[path] = path.read_text("utf-8")
     for path, text in sources.items():
         for name in sorted(names & set(re.findall(r"\b[A-Za-z_]\w+\b", text))):
-            found[name].append(path)
-    return found
+            users[name].append(path)
+    return users
 
 
 def names_page() -> str:
-    """All public names by topic: signature, docstring, and the pages that run with it."""
-    modules, used, by_topic = public_names(), uses(), defaultdict(list)
+    """Returns a page of all public names by topic: signature, docstring, and pages that use it."""
+    modules, users, by_topic = public_names(), uses(), defaultdict(list)
     for name, module in modules.items():
         by_topic[module.split(".")[1]].append(name)
     lines = ["# Public names", "", "Each is a name of `drake_dae`: `import drake_dae as dd`."]
     for topic, title in TOPICS.items():
         lines += ["", f"## {title}", ""]
         for name in sorted(by_topic[topic], key=str.lower):
-            lines += _entry(name, modules[name], used.get(name, []))
+            lines += _entry(name, modules[name], users.get(name, []))
     return "\n".join(lines) + "\n"
 
 
-def _entry(name: str, module: str, used: list[Path]) -> list[str]:
+def _entry(name: str, module: str, users: list[Path]) -> list[str]:
     value = getattr(drake_dae, name)
     kind = "autoclass" if isinstance(value, type) else "autofunction"
     members = ["   :members:", "   :show-inheritance:"] if kind == "autoclass" else []
-    links = ", ".join(_link(path) for path in used)
+    links = ", ".join(_link(path) for path in users)
     return [
         f"(name-{name})=",
         "```{eval-rst}",
         f".. {kind}:: {module}.{name}",
         *members,
         "```",
-        *([f"Used in: {links}", ""] if used else [""]),
+        *([f"Used in: {links}", ""] if users else [""]),
     ]
 
 
@@ -106,7 +106,7 @@ def _link(path: Path) -> str:
 
 
 def commands_page() -> str:
-    """What `--help` prints of each command."""
+    """Returns a page with the help text of each command."""
     names = re.search(r"\{([\w,]+)\}", _help([]))
     assert names is not None
     lines = ["# Commands", "", "```text", _help([]).strip(), "```"]
@@ -127,7 +127,7 @@ def _help(arguments: list[str]) -> str:
 
 
 def equations_page() -> str:
-    """Where each equation of the paper is computed, and which test proves it."""
+    """Returns a table of the paper's equations: the line that computes each, and its test."""
     from equations import table
 
     return (

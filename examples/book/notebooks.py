@@ -1,4 +1,4 @@
-"""Pages of the book as Jupyter notebooks: what a page runs, in cells."""
+"""Conversion of the book's pages to Jupyter notebooks."""
 
 import json
 import re
@@ -13,12 +13,12 @@ _IFRAME = re.compile(r"<iframe.*?</iframe>", re.DOTALL)
 
 
 def has_code(page: Path) -> bool:
-    """Whether a page has Python code, so that a notebook of it is of use."""
+    """Whether a page has Python code; only such pages become notebooks."""
     return any(block.language == "python" for block in blocks(page))
 
 
 def notebook(page: Path) -> str:
-    """A page as a notebook, JSON of format 4.5; what it prints comes when it is run."""
+    """Returns a page as a notebook without outputs, JSON of format 4.5."""
     text, end, cells = page.read_text("utf-8"), 0, []
     lines = text.splitlines(keepends=True)
     for block in blocks(page):
@@ -30,18 +30,18 @@ def notebook(page: Path) -> str:
         elif not (block.language == "text" and block.follows):
             cells.append(_cell("markdown", f"```{block.language}\n{block.text}```"))
     cells.append(_cell("markdown", _prose(text[end:])))
-    kept = [cell for cell in cells if cell["source"]]
-    for number, cell in enumerate(kept):
+    cells = [cell for cell in cells if cell["source"]]
+    for number, cell in enumerate(cells):
         cell["id"] = f"cell{number}"
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    about = {"kernelspec": kernel, "language_info": {"name": "python"}}
+    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     return json.dumps(
-        {"cells": kept, "metadata": about, "nbformat": 4, "nbformat_minor": 5}, indent=1
+        {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}, indent=1
     )
 
 
 def _source(block: Block) -> str:
-    """The code of a cell; empty for a block that only is shown."""
+    """Returns the code of a block's cell; empty for a block that does not run."""
     if block.language == "python":
         return block.text.rstrip("\n")
     if block.language == "console":
@@ -52,7 +52,7 @@ def _source(block: Block) -> str:
 
 
 def _prose(text: str) -> str:
-    """Links to pages and live figures lead nowhere from a notebook; commands make pictures."""
+    """Returns text without links to pages, pictures and frames, which a notebook does not have."""
     return _LINK.sub(r"\1", _PICTURE.sub("", _IFRAME.sub("", text))).strip()
 
 

@@ -1,15 +1,16 @@
-"""Pages of the book: Markdown files whose blocks are run from the first to the last.
+"""Pages of the book: Markdown files whose code blocks run in order.
 
-What the fences of a page mean:
+The kinds of blocks:
 
-- ```python: run in the page's namespace. A ```text block right after it is what it prints.
-- ```console: lines that begin with "$ " are commands; the lines after one are what it prints.
-- ```yaml, ```xml and others whose first line is a comment with a file's name write that file.
-- Everything else, such as ```sh, is only shown.
+- ```python runs in the page's namespace. A ```text block right after it is its expected output.
+- ```console: lines that begin with "$ " are commands; the lines after a command are its expected
+  output.
+- ```yaml, ```xml and others whose first line is a comment with a file name write that file.
+- All others, such as ```sh, do not run.
 
-What is printed has to agree with the page: words and integers exactly, white space aside; other
-numbers within one unit of the last digit that the page shows; "..." stands for anything. Where that
-makes the place of a number ambiguous, the first place counts.
+The output must agree with the page: words and integers exactly, apart from white space; other
+numbers within one unit of the last digit on the page; "..." matches any text. If "..." can match in
+several ways, the shortest match counts.
 """
 
 import contextlib
@@ -41,22 +42,28 @@ _BARE = " --set write.plots=false --set write.animation=false"
 
 
 class PageError(Exception):
-    """A block that fails, or prints something else than the page shows."""
+    """A block fails, or its output differs from the page."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its text, and its first line in the file."""
+    """A fenced block.
+
+    Attributes:
+        language: The word after the fence, as "python".
+        text: The lines between the fences.
+        line: The number of its first line in the file.
+        follows: Whether only white space separates it from the block before.
+    """
 
     language: str
     text: str
     line: int
     follows: bool
-    """Whether nothing but white space is between the block before and this one."""
 
 
 def pages() -> list[Path]:
-    """All pages that may be run."""
+    """Returns all pages that can run."""
     return [
         BOOK / "index.md",
         *(path for kind in KINDS for path in sorted((BOOK / kind).glob("*.md"))),
@@ -64,19 +71,19 @@ def pages() -> list[Path]:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The fenced blocks of a page, in their order."""
+    """Returns the fenced blocks of a page, in order."""
     text = page.read_text("utf-8")
-    found, end = [], 0
+    fenced, end = [], 0
     for match in _FENCE.finditer(text):
         line = text.count("\n", 0, match.start()) + 2
         follows = not text[end : match.start()].strip()
-        found.append(Block(match[1], match[2], line, follows))
+        fenced.append(Block(match[1], match[2], line, follows))
         end = match.end()
-    return found
+    return fenced
 
 
 def file_of(block: Block) -> tuple[str, str]:
-    """Name and text of the file that a block writes; the name is empty if it writes none."""
+    """Returns name and text of the file that a block writes; both are empty if it writes none."""
     match = _FILE.match(block.text)
     return (match[1], block.text[match.end() :]) if match else ("", "")
 
@@ -86,11 +93,11 @@ def run_page(page: Path, folder: Path, pictures: bool = True) -> None:
 
     Args:
         page: The page.
-        folder: Where its files are written.
+        folder: The working folder of its code.
         pictures: Whether runs write plots and animations, which take a fifth of the time.
 
     Raises:
-        PageError: If a block fails or prints something else; the message has the block's line.
+        PageError: A block fails, or its output differs; the message has the block's line.
     """
     namespace: dict[str, Any] = {"__name__": "__main__"}
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,17 +111,19 @@ def run_page(page: Path, folder: Path, pictures: bool = True) -> None:
                         compare(following.text, printed)
                 elif block.language == "console":
                     _run_commands(block, "" if pictures else _BARE)
-                elif (named := file_of(block))[0]:
-                    Path(named[0]).write_text(named[1], "utf-8")
+                else:
+                    name, text = file_of(block)
+                    if name:
+                        Path(name).write_text(text, "utf-8")
             except Exception as error:
                 raise PageError(f"{page.relative_to(BOOK)}, line {block.line}: {error}") from error
 
 
 def compare(shown: str, printed: str) -> None:
-    """Compares what was printed with what a page shows.
+    """Checks that the printed output agrees with the output that a page shows.
 
     Raises:
-        PageError: If they differ.
+        PageError: They differ.
     """
     pattern, numbers, end = "", [], 0
     for part in _PART.finditer(shown.strip()):
@@ -133,19 +142,19 @@ def compare(shown: str, printed: str) -> None:
     match = re.fullmatch(pattern, printed.strip(), re.DOTALL)
     if match is None:
         raise PageError(f"the page shows\n{shown}\nbut this was printed:\n{printed}")
-    for number, found in zip(numbers, match.groups(), strict=True):
-        if abs(float(found) - float(number)) > 1.0000001 * _unit(number):
-            raise PageError(f"the page shows {number}, but {found} was printed in\n{printed}")
+    for number, output in zip(numbers, match.groups(), strict=True):
+        if abs(float(output) - float(number)) > 1.0000001 * _unit(number):
+            raise PageError(f"the page shows {number}, but {output} was printed in\n{printed}")
 
 
 def _unit(number: str) -> float:
-    """One unit of the last digit of a number."""
+    """Returns one unit of the last digit of a number."""
     digits, _, exponent = number.lower().partition("e")
     return 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
 
 
 def _run_python(block: Block, page: Path, namespace: dict[str, Any]) -> str:
-    # As many lines before the code as in the page: a traceback names the page's line.
+    # Empty lines before the code give a traceback the line numbers of the page.
     code = compile("\n" * (block.line - 1) + block.text, str(page), "exec")
     with _printed() as printed:
         exec(code, namespace)
@@ -153,7 +162,7 @@ def _run_python(block: Block, page: Path, namespace: dict[str, Any]) -> str:
 
 
 def _run_commands(block: Block, more: str) -> None:
-    """Runs commands, and gives `simulate` more options."""
+    """Runs commands, `drake-dae simulate` with `more` appended, and checks their output."""
     for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
         lines = part.splitlines()
         last = next(i for i, line in enumerate(lines) if not line.endswith("\\"))
@@ -168,11 +177,11 @@ def _run_commands(block: Block, more: str) -> None:
 
 
 def _run_command(command: str) -> tuple[int, str]:
-    """The exit code of a command, and what it prints; `drake-dae` runs in this process."""
+    """Returns the exit code and the output of a command; `drake-dae` runs in this process."""
     words = shlex.split(command)
     if words[0] == "drake-dae" and not set("|<>&;*$") & set(command):
         with _printed() as printed, warnings.catch_warnings():
-            warnings.simplefilter("default")  # As on a command line: a page may show them.
+            warnings.simplefilter("default")  # A page may show warnings, as on a command line.
             return main(words[1:]), printed.getvalue()
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     finished = subprocess.run(

@@ -1,10 +1,10 @@
-"""All scenarios on one page: picture, motion, bench, idea, figures. `make gallery` writes it.
+"""A page with the pictures, animations, benches and figures of scenarios; see `make gallery`.
 
     python examples/gallery [--out FOLDER] [NAME or FILE ...]
 
-Without names: the shipped scenarios, those of examples/tasks, and robots of three vendors, for
-which `drake-dae new` writes the scenario. A run is made again only if its scenario, or the library,
-has changed.
+Without names it contains the shipped scenarios, the scenarios in examples/tasks, and robots of
+three manufacturers, for which `drake-dae new` writes the scenario. A scenario runs again only if
+its file or the library has changed.
 """
 
 import argparse
@@ -31,10 +31,10 @@ VENDORS = {
     "ur5": "ur_description/urdf/ur5_robot.urdf",  # Universal Robots
     "kinova": "kinova_description/robots/kinova.urdf",  # Kinova
 }
-"""Name -> file of a robot in the package example-robot-data."""
+"""Name of a robot -> its file in the package example-robot-data."""
 
 SLOW = "its C takes minutes to compile; drake-dae live runs it here"
-"""Why a robot with a dozen contact forces has no page."""
+"""The reason why a robot with a dozen contact forces has no bench."""
 
 MISSING = """<article><h2>{name}</h2>
 <p>This robot is in the package example-robot-data, which is not installed:
@@ -42,7 +42,7 @@ MISSING = """<article><h2>{name}</h2>
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Writes the page; returns 1 if a run failed or missed its task without meaning to."""
+    """Writes the page, and returns 0; exits with a message if a command fails."""
     parser = argparse.ArgumentParser(prog="python examples/gallery", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("build/gallery"), help="the folder")
     parser.add_argument("names", nargs="*", help="names of shipped scenarios, or files")
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if settings and data is None:
             cards.append(MISSING.format(name=path.stem))
         else:
-            cards.append(_made(path, options.out, settings))
+            cards.append(_make_card(path, options.out, settings))
     for name, file in {} if options.names else VENDORS.items():
         if data is None:
             cards.append(MISSING.format(name=name))
@@ -66,8 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = options.out / "vendors" / f"{name}.yaml"
         path.parent.mkdir(exist_ok=True)
         path.unlink(missing_ok=True)
-        _printed("new", data / "robots" / file, "--out", path)
-        cards.append(_made(path, options.out, []))
+        _output_of("new", data / "robots" / file, "--out", path)
+        cards.append(_make_card(path, options.out, []))
     page = (HERE / "page.html").read_text("utf-8").replace("<!-- cards -->", "\n".join(cards))
     (options.out / "index.html").write_text(page, "utf-8")
     print(f"open {options.out / 'index.html'}")
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def robot_data() -> Path | None:
-    """The folder of the package example-robot-data; None where it is not installed."""
+    """Returns the folder of the package example-robot-data; None if it is not installed."""
     try:
         package = distribution("example-robot-data")
     except PackageNotFoundError:
@@ -83,30 +83,30 @@ def robot_data() -> Path | None:
     return Path(str(package.locate_file("cmeel.prefix/share/example-robot-data")))
 
 
-def _made(path: Path, out: Path, settings: list[str]) -> str:
-    """The card of a scenario, with its run and its bench."""
+def _make_card(path: Path, out: Path, settings: list[str]) -> str:
+    """Runs a scenario, writes its bench, and returns its card."""
     options = [option for setting in settings for option in ("--set", setting)]
-    told = _run(path, out / path.stem, options)
-    told["bench"] = SLOW if options else _bench(path, out / path.stem)
-    return _card(path, out / path.stem, told)
+    summary = _run(path, out / path.stem, options)
+    bench_problem = SLOW if options else _write_bench(path, out / path.stem)
+    return _card(path, out / path.stem, summary, bench_problem)
 
 
 def _run(path: Path, folder: Path, options: list[str]) -> dict:
-    """What `simulate --json` tells of a run; made if there is none of this scenario yet."""
+    """Returns the summary that `simulate --json` prints; runs the scenario if something changed."""
     stamp = folder.with_suffix(".json")
     state = _digest(path, *sorted(Path(drake_dae.__file__).parent.rglob("*.py")))
-    if stamp.exists() and (found := json.loads(stamp.read_text("utf-8")))["state"] == state:
-        return found["told"]
+    if stamp.exists() and (last := json.loads(stamp.read_text("utf-8")))["state"] == state:
+        return last["summary"]
     print(f"runs {path.stem}", flush=True)
     shutil.rmtree(folder, ignore_errors=True)
-    told = json.loads(_printed("simulate", path, "--out", folder, "--json", *options))
-    _printed("render", folder, "--out", folder / "strip.png")
-    stamp.write_text(json.dumps({"state": state, "told": told}), "utf-8")
-    return told
+    summary = json.loads(_output_of("simulate", path, "--out", folder, "--json", *options))
+    _output_of("render", folder, "--out", folder / "strip.png")
+    stamp.write_text(json.dumps({"state": state, "summary": summary}), "utf-8")
+    return summary
 
 
-def _bench(path: Path, folder: Path) -> str:
-    """Writes the scenario as a page, where it can be steered; returns why it cannot, or nothing."""
+def _write_bench(path: Path, folder: Path) -> str:
+    """Writes the page on which users steer the scenario; returns the problem if that fails."""
     if (folder / "bench.html").exists():
         return ""
     bundle = folder.parent / "meshcat.js"
@@ -118,15 +118,15 @@ def _bench(path: Path, folder: Path) -> str:
     return lines[-1].removeprefix("error: ") if code else ""
 
 
-def _card(path: Path, folder: Path, told: dict) -> str:
-    """A scenario as HTML; all that comes from its file is text."""
+def _card(path: Path, folder: Path, summary: dict, bench_problem: str) -> str:
+    """Returns a scenario's part of the page, with all text from its file escaped."""
     scenario = load_scenario(path)
-    job = told["job"]
-    said = "; ".join([*job["problems"], *job["remarks"]][:1])
-    figures = f"simulated {told['simulated_time']:g} s in {told['wall_time']:.2g} s"
-    if told["off_prediction"] is not None:
-        figures += f", off prediction by {told['off_prediction']:.1e} {told['unit']}"
-    bench = html.escape(told["bench"] and f"No page to steer it: {told['bench']}")
+    job = summary["job"]
+    remark = "; ".join([*job["problems"], *job["remarks"]][:1])
+    figures = f"simulated {summary['simulated_time']:g} s in {summary['wall_time']:.2g} s"
+    if summary["off_prediction"] is not None:
+        figures += f", off prediction by {summary['off_prediction']:.1e} {summary['unit']}"
+    bench = html.escape(bench_problem and f"No page to steer it: {bench_problem}")
     name, at = html.escape(path.stem), html.escape(folder.name)
     link = "" if bench else f'<a href="{at}/bench.html">steer it</a> '
     return (
@@ -134,7 +134,7 @@ def _card(path: Path, folder: Path, told: dict) -> str:
         f"<p>{html.escape(scenario.description)}</p>\n"
         f'<a href="{at}/animation.html"><img src="{at}/strip.png" loading="lazy" '
         f'alt="{name} at four moments of its run"></a>\n'
-        f'<p><b class="{job["outcome"]}">{job["outcome"]}</b>: {html.escape(said)}</p>\n'
+        f'<p><b class="{job["outcome"]}">{job["outcome"]}</b>: {html.escape(remark)}</p>\n'
         f"<p>{html.escape(figures)}</p>\n"
         f"<p>{bench}</p>\n"
         f'<p>{link}<a href="{at}/animation.html">animation</a> '
@@ -145,8 +145,8 @@ def _card(path: Path, folder: Path, told: dict) -> str:
     )
 
 
-def _printed(*arguments: object) -> str:
-    """What a command of `drake-dae` prints to standard output."""
+def _output_of(*arguments: object) -> str:
+    """Returns the standard output of a command of `drake-dae`; exits if the command fails."""
     out, error = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         code = command([str(argument) for argument in arguments])

@@ -35,7 +35,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.pictures.moments import moments_of
+from drake_dae.pictures.moments import events_of
 from drake_dae.pictures.plots import plot_controls, plot_outputs
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.simulation.open_contacts import contact_notes, open_spans
@@ -245,8 +245,8 @@ def part_of(record, rows):
 def test_pictures_mark_open_contacts_and_impacts(run):
     loop, context, record, predicted, *_ = run
     hits = [event.time for event in record.events if any(event.impulses)]
-    moments = moments_of(record)
-    figures = plot_outputs(record, predicted, moments), plot_controls(record, moments=moments)
+    events = events_of(record)
+    figures = plot_outputs(record, predicted, events), plot_controls(record, events=events)
     for figure in figures:
         for axis in figure.axes:
             marks = [line for line in axis.lines if line.get_linewidth() == 0.8]

@@ -8,7 +8,7 @@ from runs import scenario
 
 from drake_dae.dae.system.signals import Signal
 from drake_dae.pictures.event_marks import mark_phases
-from drake_dae.pictures.moments import RunEvent, RunEventKind, moments_of, ordered
+from drake_dae.pictures.moments import RunEvent, RunEventKind, events_of, sorted_events
 from drake_dae.pictures.plots import plot_controls
 from drake_dae.pictures.scene.friction import friction_cones, slips
 from drake_dae.pictures.scene.run_motion import follow
@@ -36,7 +36,7 @@ def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there(
     control = np.clip(20.0 * np.sin(TIMES), -15.0, 15.0)  # At 15 first from asin(0.75) on.
     joint = np.minimum(TIMES, 4.0)
     limits = Limits(np.array([15.0]), (np.array([-1.0]), np.array([4.0])))
-    found = moments_of(record(control=control, state=joint), limits)
+    found = events_of(record(control=control, state=joint), limits)
     assert {one.kind for one in found} == {RunEventKind.LIMIT}
     drive = [one.time for one in found if "control0" in one.text]
     wanted = [np.arcsin(0.75) + k * np.pi for k in range(4)]
@@ -44,7 +44,7 @@ def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there(
     assert len(drive) >= 3
     (stop,) = [one for one in found if "state0" in one.text]
     assert stop.time == pytest.approx(4.0)
-    assert moments_of(record(control=control, state=joint)) == []
+    assert events_of(record(control=control, state=joint)) == []
 
 
 def test_events_of_contacts_are_marked_by_their_kind():
@@ -53,7 +53,7 @@ def test_events_of_contacts_are_marked_by_their_kind():
         ContactEvent(t, kind, ("tip",), (), (1.0,) if kind is ContactChange.IMPACT else ())
         for t, kind in zip((1.0, 2.0, 3.0), kinds, strict=True)
     ]
-    found = moments_of(record(events, mode=np.ones(101), gap=np.zeros(101)))
+    found = events_of(record(events, mode=np.ones(101), gap=np.zeros(101)))
     assert [(one.time, one.kind) for one in found] == [
         (1.0, RunEventKind.OPENING),
         (2.0, RunEventKind.IMPACT),
@@ -63,7 +63,7 @@ def test_events_of_contacts_are_marked_by_their_kind():
 
 def test_compliant_contact_touches_and_opens_where_its_force_begins_and_ends():
     force = np.where((TIMES > 2.05) & (TIMES < 5.05), 3.0, 0.0)
-    found = moments_of(record(constraint_force=force, contact_force=np.zeros((101, 3))))
+    found = events_of(record(constraint_force=force, contact_force=np.zeros((101, 3))))
     assert [(round(one.time, 9), one.kind) for one in found] == [
         (2.1, RunEventKind.TOUCH),
         (5.1, RunEventKind.OPENING),
@@ -74,7 +74,7 @@ def test_of_moments_that_follow_each_other_at_once_the_first_is_kept():
     chatter = [RunEvent(1.0 + 0.01 * k, RunEventKind.TOUCH, "tip: touch") for k in range(20)]
     other = RunEvent(1.05, RunEventKind.OPENING, "tip: contact opens")
     late = RunEvent(5.0, RunEventKind.TOUCH, "tip: touch")
-    assert ordered(record(), [late, other, *chatter]) == [chatter[0], other, late]
+    assert sorted_events(record(), [late, other, *chatter]) == [chatter[0], other, late]
 
 
 def test_marks_stand_at_their_times_with_one_entry_in_the_legend():

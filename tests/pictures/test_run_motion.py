@@ -51,7 +51,7 @@ def test_wheels_turn_in_the_desired_course_as_they_turned():
     course = follow(loop, record, loop.diagram.CreateDefaultContext())
     names = [signal.name for signal in loop.plant.dae.state_signals]
     axles = [names.index("left_axle"), names.index("right_axle")]
-    assert len(course.wanted) == len(course.states)
+    assert len(course.desired) == len(course.states)
     assert np.ptp(course.states[:, axles], axis=0).min() > 0.01
-    np.testing.assert_allclose(course.wanted[:, axles], course.states[:, axles], atol=1e-9)
-    assert np.abs(course.wanted - course.states)[:, names.index("rod")].max() > 0.01
+    np.testing.assert_allclose(course.desired[:, axles], course.states[:, axles], atol=1e-9)
+    assert np.abs(course.desired - course.states)[:, names.index("rod")].max() > 0.01

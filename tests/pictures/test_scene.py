@@ -8,7 +8,7 @@ from runs import scenario
 from drake_dae.pictures.film import _HEIGHT, _TOP, _WIDTH, _Scene
 from drake_dae.pictures.scene.floor import floor_below
 from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
-from drake_dae.pictures.scene.labels import label_box, overlap, to_be_seen
+from drake_dae.pictures.scene.labels import label_box, overlap, reserved_pixels
 from drake_dae.pictures.scene.run_motion import follow, run_points
 from drake_dae.pictures.scene.surroundings import scene_points, surroundings
 from drake_dae.scenario.build import build_scenario
@@ -95,7 +95,7 @@ def test_labels_do_not_cover_tools_arrows_or_each_other():
         heads[1:] = np.where(random.random((len(heads) - 1, 1)) < 0.4, heads[0], heads[1:])
         tails = heads + random.uniform(-60.0, 60.0, heads.shape)
         arrows = [np.array(pair) for pair in zip(heads, tails, strict=True)]
-        kept, boxes = to_be_seen(arrows), []
+        kept, boxes = reserved_pixels(arrows), []
         for head, tail in arrows:
             size = np.array([random.uniform(40.0, 120.0), 16.0])
             boxes.append(label_box(size, head, tail, boxes, kept, WITHIN))

@@ -44,7 +44,7 @@ def test_each_surface_is_drawn_once(name, names):
     found = seen(run)
     if names is not None:
         assert [one.constraint.name for one in found] == names
-    places = [(one.stands @ one.picture.pose).GetAsMatrix4() for one in found]
+    places = [(one.pose @ one.picture.pose).GetAsMatrix4() for one in found]
     pairs = [(a, b) for i, a in enumerate(places) for b in places[:i]]
     assert not any(np.allclose(a, b, atol=1e-9) for a, b in pairs)
 
@@ -55,7 +55,7 @@ def test_a_wall_is_as_long_as_the_way_along_it():
     run, _ = course("cart_wall", "duration=4.0")
     (one,) = seen(run)
     touched = run.points[:, 0]
-    local = (one.stands @ one.picture.pose).inverse().multiply(touched.T)
+    local = (one.pose @ one.picture.pose).inverse().multiply(touched.T)
     half = np.array([one.picture.form.width(), one.picture.form.depth()]) / 2
     assert np.ptp(touched[:, 0]) > 0.5
     assert np.all(np.abs(local[:2]) <= half[:, None])

@@ -24,18 +24,18 @@ _PIECE = 32
 """The number of points in a piece of a growing path."""
 
 _NEGLIGIBLE = 1e-6
-"""A moment is negligible below so much of the largest force at the length of the longest arrow."""
+"""A moment is negligible below this fraction of the largest force times the length of the longest
+arrow."""
 
 LEAST_SCALE = 1e-3
-"""The scale of an arrow without force: a transformation must not be zero."""
+"""The scale of an arrow without force; Meshcat cannot draw a scale of 0."""
 
 
 class ForceArrows:
-    """Draws the force of each constraint on a robot: an arrow whose tip is where it acts.
+    """Draws each constraint force on a robot as an arrow whose tip is at the point of application.
 
-    It points in the direction of the force, from a surface to its free side, and so does not cover
-    the tool. A moment has its own arrow with two heads, along its axis. Lengths are relative to the
-    largest force so far.
+    The arrow has the direction of the force on the robot. A moment is an arrow with two heads,
+    along its axis. The longest arrow is that of the largest force until now.
 
     Args:
         meshcat: The Meshcat to draw in.
@@ -43,8 +43,8 @@ class ForceArrows:
         length: The length of the longest arrow, m.
 
     Attributes:
-        largest_force, largest_moment: The force and moment of the longest arrow, N and N m.
-        has_moment: Whether some moment is not negligible beside the forces.
+        largest_force, largest_moment: The force and moment of the longest arrows, N and N m.
+        has_moment: Whether some moment has not been negligible compared with the forces.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
@@ -59,10 +59,10 @@ class ForceArrows:
                 _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, MOMENT_COLOR)
 
     def draw(self, wrenches: Wrenches, time: float) -> None:
-        """Draws the arrows.
+        """Draws the arrows, with a new scale if a force or moment is the largest until now.
 
         Args:
-            wrenches: The wrenches at this moment.
+            wrenches: The present wrenches.
             time: The time in a recording, s.
         """
         self.measure([wrenches])
@@ -71,34 +71,34 @@ class ForceArrows:
             point, force, moment = wrenches.points[row], wrenches.forces[row], wrenches.moments[row]
             self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
             if with_moment:
-                turned = moment / self.largest_moment
-                self._draw_arrow(path_of(constraint, "moment"), point, turned, time)
+                arrow = moment / self.largest_moment
+                self._draw_arrow(path_of(constraint, "moment"), point, arrow, time)
 
     def place(self, parameters: FloatArray, time: float) -> None:
-        """Moves exogenous surfaces to their present poses.
+        """Moves surfaces with exogenous parameters to their present poses.
 
         Args:
-            parameters: Values of all parameters.
+            parameters: The values of all parameters.
             time: The time in a recording, s.
         """
         dae = self._model.dae
         moving = {p.name for p in dae.exogenous.moving}
         for constraint in self._model.constraints:
             if not moving.isdisjoint(p.name for p in constraint.parameters):
-                stands = constraint.placement(own_values(constraint, dae, parameters))
-                self._meshcat.SetTransform(path_of(constraint, "surface"), stands, time)
+                pose = constraint.placement(own_values(constraint, dae, parameters))
+                self._meshcat.SetTransform(path_of(constraint, "surface"), pose, time)
 
     def measure(self, course: Sequence[Wrenches]) -> None:
-        """Adapts the scale to these wrenches."""
+        """Enlarges the scale so that these wrenches fit."""
         for wrenches in course:
             force, moment = (
                 float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
                 for rows in (wrenches.forces, wrenches.moments)
             )
             self.largest_force = max(self.largest_force, force)
-            least = _NEGLIGIBLE * self._length * self.largest_force
-            self.has_moment = self.has_moment or moment > least
-            self.largest_moment = max(self.largest_moment, moment, least)
+            negligible = _NEGLIGIBLE * self._length * self.largest_force
+            self.has_moment = self.has_moment or moment > negligible
+            self.largest_moment = max(self.largest_moment, moment, negligible)
 
     def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
         size = float(np.linalg.norm(arrow))
@@ -110,7 +110,7 @@ class ForceArrows:
 
 
 class GrowingPaths:
-    """Draws growing paths of the points of application of constraints.
+    """Draws the paths of the constraints' points of application while the robot runs.
 
     Args:
         meshcat: The Meshcat to draw in.
@@ -123,7 +123,7 @@ class GrowingPaths:
         self._number, self._time = 0, -np.inf
 
     def add(self, points: FloatArray, time: float) -> None:
-        """Appends the present points; an earlier time than the last starts again.
+        """Appends the present points; a time before the last one clears the paths first.
 
         Args:
             points: The points of application, m, shape (k, 3).
@@ -138,25 +138,25 @@ class GrowingPaths:
         for row, constraint in enumerate(self._constraints):
             path = f"/paths/{constraint.name}/actual/{self._number}"
             self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
-        # In pieces, since a line is sent completely with each new point.
+        # In pieces, since Meshcat sends a whole line again with each new point.
         if len(self._piece) > _PIECE:
             self._piece, self._number = [points], self._number + 1
 
 
 class ConstraintForceVisualizer(LeafSystem):
-    """Draws the constraint forces of a robot while it runs, and the paths of their points.
+    """Draws the constraint forces and the paths of their points while a robot runs.
 
     Input ports:
         link_state: (q, v).
         constraint_force: lambda, shape (m,).
-        exogenous: The plant's port of that name, with exogenous signals.
+        exogenous: The exogenous signals, as the plant's port of the same name.
 
     Args:
         arrows: The force arrows.
-        meshcat: Where to draw the paths.
+        meshcat: The Meshcat that draws the paths.
         model: The robot.
-        places: The indices of the entries of `exogenous` among the parameters.
-        period: Time between pictures in s.
+        places: The index among all parameters of each entry of `exogenous`.
+        period: The time between pictures in s.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -183,14 +183,11 @@ class ConstraintForceVisualizer(LeafSystem):
         self.DeclareForcedPublishEvent(weakly(self._publish))
 
     def _publish(self, context: Context) -> EventStatus:
-        state, force, time = (
-            self._link_state.Eval(context),
-            self._force.Eval(context),
-            context.get_time(),
-        )
+        time = context.get_time()
         if self._places and self._exogenous.HasValue(context):
             self._values[self._places] = self._exogenous.Eval(context)
             self._arrows.place(self._values, time)
+        state, force = self._link_state.Eval(context), self._force.Eval(context)
         wrenches = self._wrenches(state, force, self._values)
         self._arrows.draw(wrenches, time)
         self._paths.add(wrenches.points, time)
@@ -198,24 +195,24 @@ class ConstraintForceVisualizer(LeafSystem):
 
 
 def path_of(constraint: Constraint, what: str) -> str:
-    """The path of a constraint's surface, force or moment in the scene."""
+    """Returns the Meshcat path of a constraint's "surface", "force", "moment" and the like."""
     return f"/contact/{constraint.name}/{what}"
 
 
 def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
-    """An arrow along z that ends at the origin, with one head behind the other."""
-    # A MeshcatCone has its tip at the origin: rotated, it points along +z.
-    turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
+    """Adds an arrow along z whose tip is at the origin, with one or two heads in a row."""
+    # A MeshcatCone opens along +z from its tip at the origin: turned, it points along +z.
+    half_turn = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
     head, names = 0.2 * length, ["head", "second_head"][:heads]
     for number, name in enumerate(names):
         cone = f"{path}/arrow/{name}"
         meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
-        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, -number * head]))
+        meshcat.SetTransform(cone, RigidTransform(half_turn, [0.0, 0.0, -number * head]))
     shaft = length - heads * head
     meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
     middle = np.array([0.0, 0.0, shaft / 2 - length])
     meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
-    # Drawn over everything, since the force in a joint acts inside bodies.
+    # The arrow is drawn over everything, since a force in a joint acts inside bodies.
     for part in (*names, "shaft"):
         mesh = f"{path}/arrow/{part}/<object>"
         meshcat.SetProperty(mesh, "material.depthTest", False)

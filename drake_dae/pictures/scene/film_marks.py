@@ -21,27 +21,28 @@ CONE, MOMENT = "#e8b81a", "#8c33bf"
 """Colors of friction cones and of moments, as in the animation."""
 
 NEGLIGIBLE = 1e-6
-"""A moment is negligible below so much of the largest force at the length of the longest arrow."""
+"""Moments are drawn if the largest is above this fraction of the largest force times the length of
+the longest arrow."""
 
-SAID = 1.0
-"""So long an event is named, in s."""
+EVENT_DURATION = 1.0
+"""The time for which an event's name is shown, in s."""
 
-_RIM = 24  # The corners of a drawn cone.
+_RIM = 24  # The number of points on the rim of a drawn cone.
 
 
 class FilmMarks:
-    """What a film draws of a run besides links, paths and forces.
+    """Draws the friction cones, moments and events of a run into the pictures of a film.
 
-    A friction cone encloses the arrow of the force that it allows, as long as there is a force. A
-    moment is an arrow with two heads along its axis, through the point of its force. Below stands
-    the time of the whole run, with the beginning of each phase and a mark for each event.
+    A friction cone is drawn while its contact has a force. A moment is an arrow with two heads
+    along its axis, through the point of application. A time bar at the bottom has a mark for the
+    beginning of each phase and for each event.
 
     Args:
         course: The motion of the robot.
         project: Points in the world, m, shape (k, 3) -> their pixels, shape (k, 2).
         length: The length of the longest arrow of a force, in m.
-        moments: What happens in the run.
-        phases: When the phases of a task begin, in s.
+        events: The events of the run.
+        phases: The times at which the phases of a task begin, in s.
     """
 
     def __init__(
@@ -49,34 +50,35 @@ class FilmMarks:
         course: RunMotion,
         project: Callable[[FloatArray], FloatArray],
         length: float,
-        moments: Sequence[RunEvent] = (),
+        events: Sequence[RunEvent] = (),
         phases: Sequence[float] = (),
     ) -> None:
         self._course, self._project, self._length = course, project, length
-        self._events, self._phases, self._cones = moments, phases, friction_cones(course)
-        forces, turns = (
+        self._events, self._phases, self._cones = events, phases, friction_cones(course)
+        largest_force, largest_moment = (
             max(
-                np.linalg.norm(getattr(one, kind), axis=1).max(initial=0.0)
-                for one in course.wrenches
+                np.linalg.norm(getattr(wrench, kind), axis=1).max(initial=0.0)
+                for wrench in course.wrenches
             )
             for kind in ("forces", "moments")
         )
-        self._largest = float(turns) if turns > NEGLIGIBLE * length * forces else 0.0
+        is_drawn = largest_moment > NEGLIGIBLE * length * largest_force
+        self._largest_moment = float(largest_moment) if is_drawn else 0.0
 
     @property
     def scale(self) -> str:
-        """What the scale of the picture says of moments and cones."""
-        said = [f"longest moment {self._largest:.3g} N m"] if self._largest else []
+        """The text about the scale of moments, and about the cones."""
+        texts = [f"longest moment {self._largest_moment:.3g} N m"] if self._largest_moment else []
         numbers = sorted({f"{cone.coefficient:.3g}" for cone in self._cones})
-        return ", ".join([*said, *([f"cone {' and '.join(numbers)}"] if numbers else [])])
+        return ", ".join([*texts, *([f"cone {' and '.join(numbers)}"] if numbers else [])])
 
     def draw(self, axis: Axes, number: int, width: float, height: float) -> str:
-        """Draws what belongs to a moment of the run; returns what has just happened, in words.
+        """Draws the marks of a frame, and returns a text with the events of the last second.
 
         Args:
-            axis: The axes of a picture, in pixels.
-            number: Which of the moments of the course.
-            width, height: The size of the picture.
+            axis: The axes of the picture, in pixels.
+            number: The index of the frame.
+            width, height: The size of the picture, in pixels.
         """
         course, wrench = self._course, self._course.wrenches[number]
         for cone in self._cones:
@@ -85,46 +87,46 @@ class FilmMarks:
                 pixels = self._project(corners)
                 hull = pixels[ConvexHull(pixels).vertices]
                 axis.fill(*hull.T, facecolor=CONE, alpha=0.3, edgecolor=CONE, linewidth=0.8)
-        for row in range(len(wrench.points)) if self._largest else ():
-            tail, second, head = self.moment(wrench.points[row], wrench.moments[row])
-            if np.linalg.norm(wrench.moments[row]) > 0.02 * self._largest:
+        shape: dict[str, Any] = {"color": MOMENT, "arrowstyle": "-|>", "linewidth": 2}
+        for point, moment in zip(wrench.points, wrench.moments, strict=True):
+            if self._largest_moment and np.linalg.norm(moment) > 0.02 * self._largest_moment:
+                tail, second, head = self.moment(point, moment)
                 for end in (second, head):
-                    shape: dict[str, Any] = {"color": MOMENT, "arrowstyle": "-|>", "linewidth": 2}
                     pixels = self._project(np.array([tail, end]))
                     axis.annotate("", pixels[1], pixels[0], arrowprops=shape)
         time = course.start_time + course.times[number]
         self._draw_time(axis, float(time), width, height)
-        recent = [one.text for one in self._events if 0.0 <= time - one.time < SAID]
+        recent = [e.text for e in self._events if 0.0 <= time - e.time < EVENT_DURATION]
         return ", ".join(recent[-2:])
 
     def cone(self, point: FloatArray, normal: FloatArray, coefficient: float) -> FloatArray:
-        """The tip and the rim of a cone, which opens against the normal, m, shape (k, 3)."""
+        """Returns the tip and points on the rim of a cone that opens against the normal, (k, 3)."""
         angle, turn = np.arctan(coefficient), 2.0 * np.pi * np.arange(_RIM) / _RIM
         first, second = tangents(normal)
-        around = np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second)
-        rim = np.cos(angle) * normal + np.sin(angle) * around
+        radial = np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second)
+        rim = np.cos(angle) * normal + np.sin(angle) * radial
         return np.vstack([point, point - 0.5 * self._length * rim])
 
     def moment(
         self, point: FloatArray, moment: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The tail and both heads of the arrow of a moment, m."""
-        arrow = 0.6 * self._length * moment / max(self._largest, 1e-300)
+        """Returns the tail and both heads of the arrow of a moment, m."""
+        arrow = 0.6 * self._length * moment / max(self._largest_moment, 1e-300)
         return point - arrow, point - 0.2 * arrow, point
 
     def _draw_time(self, axis: Axes, time: float, width: float, height: float) -> None:
-        """The run so far, over all of it, with its phases and events."""
-        begin, passed = self._course.start_time, float(self._course.times[-1])
-        if not (self._events or self._phases) or passed <= 0.0:
+        """Draws the time bar with the elapsed time, the phases and the events."""
+        start, duration = self._course.start_time, float(self._course.times[-1])
+        if not (self._events or self._phases) or duration <= 0.0:
             return
         y, left, right = height - 10.0, 12.0, width - 12.0
 
-        def at(moment: float) -> float:
-            return left + (right - left) * min(max((moment - begin) / passed, 0.0), 1.0)
+        def x_of(time: float) -> float:
+            return left + (right - left) * min(max((time - start) / duration, 0.0), 1.0)
 
         axis.plot([left, right], [y, y], color="0.8", linewidth=3.0, solid_capstyle="butt")
-        axis.plot([left, at(time)], [y, y], color="0.45", linewidth=3.0, solid_capstyle="butt")
-        for moment in self._phases:
-            axis.plot([at(moment)] * 2, [y - 4.0, y + 4.0], color="0.3", linewidth=1.0)
-        for one in self._events:
-            axis.plot(at(one.time), y, marker="v", markersize=6, color=one.kind.color)
+        axis.plot([left, x_of(time)], [y, y], color="0.45", linewidth=3.0, solid_capstyle="butt")
+        for phase in self._phases:
+            axis.plot([x_of(phase)] * 2, [y - 4.0, y + 4.0], color="0.3", linewidth=1.0)
+        for event in self._events:
+            axis.plot(x_of(event.time), y, marker="v", markersize=6, color=event.kind.color)

@@ -1,4 +1,4 @@
-"""The grid below a robot: it shows where down is, and how large things are."""
+"""The grid below a robot, which shows the horizontal plane and the scale."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +9,16 @@ from drake_dae.arrays import FloatArray
 from drake_dae.pictures.scene.surroundings import DrawnSurface
 
 _CELLS = 8.0
-"""About so many cells a scene is wide."""
+"""The approximate number of cells in the width of a scene."""
 
 _NEAR = 0.1
-"""The grid is drawn on a level surface that is so near, relative to the size of the scene."""
+"""The grid is on a horizontal surface if its height differs from the scene's lowest point by less
+than this fraction of the scene's size."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """A level grid of square cells.
+    """A horizontal grid of square cells.
 
     Attributes:
         height: Its z, in m.
@@ -32,37 +33,36 @@ class Floor:
 
     @property
     def lines(self) -> tuple[FloatArray, FloatArray]:
-        """The begin and the end of each line, m, shape (k, 3)."""
-        (x, far_x), (y, far_y), z = *zip(self.low, self.high, strict=True), self.height
-        along = np.linspace(x, far_x, round((far_x - x) / self.cell) + 1)
-        across = np.linspace(y, far_y, round((far_y - y) / self.cell) + 1)
-        ends = [((each, y, z), (each, far_y, z)) for each in along.tolist()]
-        ends += [((x, each, z), (far_x, each, z)) for each in across.tolist()]
-        begins, finishes = zip(*ends, strict=True)
-        return np.array(begins), np.array(finishes)
+        """The begins and the ends of all lines, m, shape (k, 3) each."""
+        (low_x, high_x), (low_y, high_y) = zip(self.low, self.high, strict=True)
+        xs = np.linspace(low_x, high_x, round((high_x - low_x) / self.cell) + 1)
+        ys = np.linspace(low_y, high_y, round((high_y - low_y) / self.cell) + 1)
+        begins = [*((x, low_y, self.height) for x in xs), *((low_x, y, self.height) for y in ys)]
+        ends = [*((x, high_y, self.height) for x in xs), *((high_x, y, self.height) for y in ys)]
+        return np.array(begins), np.array(ends)
 
 
-def floor_below(points: FloatArray, touched: Sequence[DrawnSurface] = ()) -> Floor:
-    """The floor of a scene: a little below its points, or on a level surface near these.
+def floor_below(points: FloatArray, surfaces: Sequence[DrawnSurface] = ()) -> Floor:
+    """Returns the floor of a scene: slightly below its points, or on a horizontal surface nearby.
 
     Args:
         points: Points that enclose the scene, m, shape (k, 3).
-        touched: The drawn surfaces.
+        surfaces: The drawn surfaces.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     cell = _round_length(size / _CELLS)
     height = float(low[2]) - 0.003 * size
-    for one in touched:
-        level = one.level
+    for surface in surfaces:
+        level = surface.level
         if level is not None and abs(level - low[2]) < _NEAR * size:
             height = level + 0.003 * size
     first, last = np.floor(low[:2] / cell) - 1, np.ceil(high[:2] / cell) + 1
-    ends = [tuple((cell * end).tolist()) for end in (first, last)]
-    return Floor(height, cell, *ends)
+    corners = [tuple((cell * corner).tolist()) for corner in (first, last)]
+    return Floor(height, cell, *corners)
 
 
 def _round_length(length: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is no longer."""
+    """Returns the largest length of 1, 2 or 5 times a power of ten that is at most `length`."""
     power = 10.0 ** np.floor(np.log10(length) + 1e-9)
     return float(power * max(step for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))

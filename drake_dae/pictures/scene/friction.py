@@ -1,4 +1,4 @@
-"""Friction in pictures: the cone of each contact, and when it begins to slide."""
+"""Friction in pictures: the friction cones of contacts, and when contacts slide and stick."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class DrawnFrictionCone:
-    """The directions that the force of a contact may have: |F_t| <= mu F_n.
+    """The friction cone of a contact, |F_t| <= mu F_n.
 
     Attributes:
-        row: The place of its constraint among those that act at a point.
-        coefficient: mu.
-        normals: The unit normal toward the free side at each moment, in the world, shape (k, 3).
+        row: The index of its constraint among those that act at a point.
+        coefficient: mu, the coefficient of friction.
+        normals: The unit normal toward the free side in each frame, in the world, shape (k, 3).
     """
 
     row: int
@@ -28,23 +28,23 @@ class DrawnFrictionCone:
 
 
 def friction_cones(course: RunMotion) -> list[DrawnFrictionCone]:
-    """The cones of all contacts with friction, by what the plant has, not the law."""
-    normals, found = course.normals, []
+    """Returns the cones of all contacts with friction, with the plant's coefficients."""
+    normals, cones = course.normals, []
     for row, constraint in enumerate(course.acting.constraints):
         coefficient = course.friction.get(constraint.name, 0.0)
         lengths = np.linalg.norm(normals[:, row], axis=1, keepdims=True)
         if coefficient > 0.0 and sum(constraint.is_unilateral) == 1 and lengths.all():
-            found.append(DrawnFrictionCone(row, coefficient, normals[:, row] / lengths))
-    return found
+            cones.append(DrawnFrictionCone(row, coefficient, normals[:, row] / lengths))
+    return cones
 
 
 def slips(course: RunMotion) -> list[RunEvent]:
-    """When contacts with friction begin to slide, and when they stick again.
+    """Returns the events at which contacts with friction begin to slide, and stick again.
 
-    Regularized friction creeps below the speed at which it is counted as sliding here, the
-    stiction tolerance of its constraint. A contact without force does not slide.
+    A contact slides if its speed is above the stiction tolerance of its constraint, since
+    regularized friction always creeps, and if it has a force.
     """
-    model, found = course.model, list[RunEvent]()
+    model, events = course.model, list[RunEvent]()
     kinematics = model.links.kinematics()
     for row, constraint in enumerate(course.acting.constraints):
         velocity = constraint.sliding(kinematics)
@@ -60,23 +60,26 @@ def slips(course: RunMotion) -> list[RunEvent]:
         )
         nq, nv = model.links.q.numel(), model.links.v.numel()
         values = [
-            [float(each.item()) for each in speed(x[:nq], x[nq : nq + nv], own)]
-            for x, own in zip(course.states, course.parameters, strict=True)
+            [float(value.item()) for value in speed(x[:nq], x[nq : nq + nv], parameters)]
+            for x, parameters in zip(course.states, course.parameters, strict=True)
         ]
         speeds, least = np.array(values).T
-        touching = np.linalg.norm([each.forces[row] for each in course.wrenches], axis=1) > 0.0
-        found += _changes(constraint.name, course, (speeds > least) & touching, touching)
-    return found
+        forces = [wrench.forces[row] for wrench in course.wrenches]
+        touches = np.linalg.norm(forces, axis=1) > 0.0
+        events += _changes(constraint.name, course, (speeds > least) & touches, touches)
+    return events
 
 
 def _changes(
     name: str, course: RunMotion, slides: Sequence[bool], touches: Sequence[bool]
 ) -> list[RunEvent]:
-    found, times = list[RunEvent](), course.start_time + course.times
-    for place in range(len(times)):
-        before = slides[place - 1] if place else False
-        if slides[place] and not before:
-            found.append(RunEvent(float(times[place]), RunEventKind.SLIDE, f"{name} slides"))
-        elif before and not slides[place] and touches[place]:
-            found.append(RunEvent(float(times[place]), RunEventKind.STICK, f"{name} sticks"))
-    return found
+    """Returns the events at which a contact begins to slide or sticks again."""
+    events, slid_before = list[RunEvent](), False
+    times = (course.start_time + course.times).tolist()
+    for time, is_sliding, is_touching in zip(times, slides, touches, strict=True):
+        if is_sliding and not slid_before:
+            events.append(RunEvent(time, RunEventKind.SLIDE, f"{name} slides"))
+        elif slid_before and not is_sliding and is_touching:
+            events.append(RunEvent(time, RunEventKind.STICK, f"{name} sticks"))
+        slid_before = is_sliding
+    return events

@@ -1,4 +1,4 @@
-"""Forms as Drake's renderer takes them."""
+"""Conversion of shapes for Drake's renderer."""
 
 import numpy as np
 from pydrake.common import MemoryFile
@@ -6,12 +6,12 @@ from pydrake.geometry import InMemoryMesh, Mesh, Shape, TriangleSurfaceMesh
 
 
 def rendered(form: Shape | TriangleSurfaceMesh) -> Shape:
-    """A form as what is rendered: a mesh as the text of an .obj file."""
+    """Returns a shape that Drake renders; a triangle mesh becomes an .obj file in memory."""
     if isinstance(form, Shape):
         return form
     points = np.array(form.vertices())
     faces = np.array([[triangle.vertex(k) for k in range(3)] for triangle in form.triangles()])
-    # The renderer needs normals at the vertices: the mean of those of adjacent triangles.
+    # The renderer needs normals at the vertices: the mean of the adjacent triangles' normals.
     corners, normals = points[faces], np.zeros_like(points)
     for k in range(3):
         edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -21,39 +21,40 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4
-"""A contact point whose path is shorter than this fraction of its distance has no path to draw."""
+"""A path on a surface is omitted if its extent is below this fraction of the largest coordinate of
+all contact points."""
 
-_PLACES = 60
-"""The number of states for the extent of a run."""
+_EXTENT_STATES = 60
+"""The approximate number of states from which the extent of a run is computed."""
 
 
 class ShownLoop(Protocol):
-    """A diagram with a plant and its geometry, as a `ClosedLoop`."""
+    """A diagram with a plant and its geometry, such as a `ClosedLoop`."""
 
     @property
     def plant(self) -> Plant:
-        """What was simulated."""
+        """The simulated plant."""
 
     @property
     def scene_graph(self) -> SceneGraph | None:
-        """The geometry of a robot, or None."""
+        """The geometry of the robot's links, or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunMotion:
-    """A run of a robot at k equidistant times.
+    """The motion of a robot in a run, at the times of k frames.
 
     Attributes:
-        plant: What was simulated.
+        plant: The simulated plant.
         model: The robot.
-        times: The moments in s after the start, shape (k,).
-        start_time: When the run began, in s.
+        times: The times of the frames, in s after the start, shape (k,).
+        start_time: The time at which the run starts, in s.
         states: x, shape (k, n).
         parameters: The values of all parameters, shape (k, number of parameters).
-        wrenches: The wrenches of the constraints.
-        wanted: Link states at rest with the desired outputs, as long as they are reachable, shape
-            (j, nq + nv) with j <= k.
-        acting: The constraint wrenches, for the parameters at the start.
+        wrenches: The constraint wrenches in each frame.
+        desired: Link states at rest (q, 0) with the desired outputs, until these are out of reach,
+            shape (j, nq + nv) with j <= k.
+        acting: The function of the constraint wrenches, for the parameters at the start.
         flashes: The brightness of each constraint's flash at an impact, 0 to 1, shape (k,
             constraints).
         friction: Name of a constraint -> its coefficient of friction in the plant.
@@ -66,7 +67,7 @@ class RunMotion:
     states: FloatArray
     parameters: FloatArray
     wrenches: Sequence[Wrenches]
-    wanted: FloatArray
+    desired: FloatArray
     acting: ConstraintWrenches
     flashes: FloatArray
     friction: Mapping[str, float]
@@ -77,18 +78,18 @@ class RunMotion:
         return np.array([wrench.points for wrench in self.wrenches])
 
     @property
-    def wanted_points(self) -> FloatArray:
+    def desired_points(self) -> FloatArray:
         """The points of application for the desired outputs, m, shape (j, constraints, 3)."""
-        none = np.zeros(len(self.model.dae.force_signals))
-        pairs = zip(self.wanted, self.parameters, strict=False)
-        found = [self.acting(state, none, own).points for state, own in pairs]
-        return np.array(found).reshape(len(found), len(self.acting.constraints), 3)
+        no_force = np.zeros(len(self.model.dae.force_signals))
+        pairs = zip(self.desired, self.parameters, strict=False)
+        points = [self.acting(state, no_force, parameters).points for state, parameters in pairs]
+        return np.array(points).reshape(len(points), len(self.acting.constraints), 3)
 
     def arrow_tails(self, length: float) -> FloatArray:
-        """Where arrows of the forces begin, m, shape (k times constraints, 3).
+        """Returns the tails of the arrows of all forces, m, shape (k * constraints, 3).
 
         Args:
-            length: The length of the longest one, in m.
+            length: The length of the longest arrow, in m.
         """
         forces = np.array([wrench.forces for wrench in self.wrenches])
         largest = np.max(np.linalg.norm(forces, axis=2), initial=1e-6)
@@ -96,29 +97,29 @@ class RunMotion:
 
     @property
     def normals(self) -> FloatArray:
-        """The normals of the surfaces, of any length, in the world, shape (k, constraints, 3).
+        """The normals of the surfaces in the world, not of unit length, (k, constraints, 3).
 
-        At rest there is no friction, so that a force is along the normal.
+        They are computed as the forces at rest: without friction a force is along the normal.
         """
         model, links = self.model, self.model.links
-        ones = [np.array(constraint.is_unilateral, float) for constraint in model.constraints]
-        push = np.concatenate([np.zeros(0), *ones])
+        unit_forces = [np.array(item.is_unilateral, float) for item in model.constraints]
+        force = np.concatenate([np.zeros(0), *unit_forces])
         nq, nv = links.q.numel(), links.v.numel()
-        rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
-        pairs = zip(rest, self.parameters, strict=True)
-        return np.array([self.acting(state, push, own).forces for state, own in pairs])
+        at_rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
+        pairs = zip(at_rest, self.parameters, strict=True)
+        return np.array([self.acting(state, force, values).forces for state, values in pairs])
 
 
 @dataclass(frozen=True, eq=False)
 class ContactPath:
-    """The path of a point on a surface, as seen along the (mean) normal.
+    """The path of a contact point on a surface, in the plane normal to the surface's mean normal.
 
     Attributes:
         name: The constraint's name.
         actual: The path along two axes of the surface, m, shape (k, 2).
         desired: The desired path, m, shape (j, 2).
-        points_left: Whether the first axis points to the left for an observer on the free side,
-            with the second axis up.
+        points_left: Whether an observer on the free side who sees the second axis upward sees the
+            first axis to the left.
     """
 
     name: str
@@ -130,20 +131,20 @@ class ContactPath:
 def follow(
     loop: ShownLoop, record: Record, context: Context, rate: float = FRAME_RATE
 ) -> RunMotion:
-    """The course of a run of a robot.
+    """Returns the motion of a robot in a recorded run.
 
     Args:
         loop: A loop of a `RobotPlant`.
         record: The record of a run of this loop.
-        context: The context of its diagram, for the parameters; not changed.
-        rate: Moments per second.
+        context: The context of its diagram, which contains the parameters; not changed.
+        rate: Frames per second.
 
     Raises:
-        ModelError: There is no robot.
+        ModelError: The plant is not a robot.
     """
-    plant, own_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
+    plant, plant_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
     model = plant.robot("a picture of a run")
-    parameters = plant.parameters(own_context)
+    parameters = plant.parameters(plant_context)
     acting = ConstraintWrenches(model, parameters)
     times = frame_times(record.time[-1] - record.time[0], rate)
     states = _interpolated(record, "state", times)
@@ -153,117 +154,126 @@ def follow(
     if "exogenous" in record.signals:
         values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
     wrenches = [acting(*row) for row in zip(states, forces, values, strict=True)]
-    if "contact_force" in record.signals:  # With the friction of the plant, not the law's.
+    if "contact_force" in record.signals:  # This has the plant's friction, not that of the law.
         shape = (len(times), len(acting.constraints), 3)
-        whole = _interpolated(record, "contact_force", times).reshape(shape)
-        wrenches = [replace(one, forces=own) for one, own in zip(wrenches, whole, strict=True)]
-    wanted = _desired_states(model, states, desired, values)
-    begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
-    bright = flashes(record.events, names, begin + times)
-    friction = plant.friction(own_context)
+        contact_forces = _interpolated(record, "contact_force", times).reshape(shape)
+        wrenches = [
+            replace(wrench, forces=force)
+            for wrench, force in zip(wrenches, contact_forces, strict=True)
+        ]
+    start_time, names = float(record.time[0]), [item.name for item in acting.constraints]
     return RunMotion(
-        plant, model, times, begin, states, values, wrenches, wanted, acting, bright, friction
+        plant,
+        model,
+        times,
+        start_time,
+        states,
+        values,
+        wrenches,
+        _desired_states(model, states, desired, values),
+        acting,
+        flashes(record.events, names, start_time + times),
+        plant.friction(plant_context),
     )
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
-    """The moments to show, in s after the start; the last one is the end or the next after it."""
+    """Returns the times of frames, in s after the start; the last is at the end or just after."""
     return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
 
 
 def contact_paths(course: RunMotion) -> list[ContactPath]:
-    """The paths of moving contact points, each on its surface.
+    """Returns the paths of moving contact points on their surfaces.
 
-    They are projected along the surface's mean normal: for a plane its own coordinates, for a
-    curved surface those of a tangent plane, relative to its reference point.
+    The points are relative to the surface's reference point, and projected along the surface's mean
+    normal. On a plane these are the plane's coordinates; on a curved surface those of a tangent
+    plane.
     """
     dae = course.model.dae
     size = float(np.max(np.abs(course.points), initial=0.0))
-    pushes = course.normals
-    found = []
+    world_normals, desired_points = course.normals, course.desired_points
+    paths = []
     for row, constraint in enumerate(course.acting.constraints):
         if not any(constraint.is_unilateral):
             continue
-        stands = [constraint.placement(own_values(constraint, dae, p)) for p in course.parameters]
+        poses = [constraint.placement(own_values(constraint, dae, p)) for p in course.parameters]
         actual, desired = (
-            np.array([stand.inverse() @ p for stand, p in zip(stands, points, strict=False)])
-            for points in (course.points[:, row], course.wanted_points[:, row])
+            np.array([pose.inverse() @ p for pose, p in zip(poses, points, strict=False)])
+            for points in (course.points[:, row], desired_points[:, row])
         )
-        way = np.vstack([actual, desired.reshape(-1, 3)])
-        if np.max(np.ptp(way, axis=0)) <= STILL * size:
+        desired = desired.reshape(-1, 3)
+        if np.max(np.ptp(np.vstack([actual, desired]), axis=0)) <= STILL * size:
             continue
         normals = [
-            stand.rotation().inverse() @ push
-            for stand, push in zip(stands, pushes[:, row], strict=True)
+            pose.rotation().inverse() @ normal
+            for pose, normal in zip(poses, world_normals[:, row], strict=True)
         ]
-        # A path all around the surface has no mean normal.
+        # The normals of a path all around a surface have the mean 0; then the first is used.
         normal = next(n for n in (np.mean(normals, axis=0), normals[0]) if np.linalg.norm(n) > 1e-3)
         axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
         points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
-        found.append(
-            ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left)
-        )
-    return found
+        paths.append(ContactPath(constraint.name, actual @ axes, desired @ axes, points_left))
+    return paths
 
 
 def run_points(course: RunMotion, scene_graph: SceneGraph | None) -> FloatArray:
-    """Points that enclose the robot and its paths over the run, m, shape (k, 3).
+    """Returns points that enclose the robot and its paths over the run, m, shape (k, 3).
 
     Args:
         course: The motion of the robot.
         scene_graph: The geometry of its links, or None.
     """
-    some = course.states[:: max(1, len(course.states) // _PLACES)]
-    paths = [course.points.reshape(-1, 3), course.wanted_points.reshape(-1, 3)]
-    return np.vstack([scene_points(course.model, course.acting, some, scene_graph), *paths])
+    states = course.states[:: max(1, len(course.states) // _EXTENT_STATES)]
+    paths = [course.points.reshape(-1, 3), course.desired_points.reshape(-1, 3)]
+    return np.vstack([scene_points(course.model, course.acting, states, scene_graph), *paths])
 
 
 def run_view(
     course: RunMotion, scene_graph: SceneGraph | None, view: ViewAngles, arrow: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The eye of a camera that shows a whole run, and the point that it looks at, m.
+    """Returns the position of a camera that shows a whole run, and a point on its axis, m.
 
     Args:
         course: The motion of the robot.
         scene_graph: The geometry of its links, or None.
-        view: What the camera shows.
+        view: The angles of view of the camera.
         arrow: The length of the longest arrow of a force, in m.
     """
-    seen = run_points(course, scene_graph)
-    middle = len(course.times) // 2
-    now = scene_points(course.model, course.acting, course.states[middle][None], scene_graph)
-    normals = course.normals[middle]
+    points = np.vstack([run_points(course, scene_graph), course.arrow_tails(arrow)])
+    frame = len(course.times) // 2
+    robot = scene_points(course.model, course.acting, course.states[frame][None], scene_graph)
+    normals = course.normals[frame]
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(lengths > 0.0, lengths, 1.0)
-    direction = direction_of(now, course.points[middle], normals)
-    return framed(np.vstack([seen, course.arrow_tails(arrow)]), direction, view)
+    return framed(points, direction_of(robot, course.points[frame], normals), view)
 
 
 def _interpolated(record: Record, name: str, times: FloatArray) -> FloatArray:
-    """A signal at times after the start, shape (k, size): straight lines between the steps."""
-    moments = record.time - record.time[0]
-    rows = [np.interp(times, moments, column) for column in record[name].T]
-    return np.array(rows).reshape(-1, len(times)).T
+    """Returns a signal at times after the start, interpolated linearly, shape (k, size)."""
+    recorded = record.time - record.time[0]
+    columns = [np.interp(times, recorded, column) for column in record[name].T]
+    return np.array(columns).reshape(-1, len(times)).T
 
 
 def _desired_states(
     model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
 ) -> FloatArray:
-    """Link states at rest with the desired outputs, as long as they are within reach.
+    """Returns link states at rest (q, 0) with the desired outputs, until these are out of reach.
 
     Args:
         model: The robot.
-        states, desired, values: x, z and the parameters at each moment, one row each.
+        states, desired, values: x, the desired outputs and the parameters, one row for each frame.
     """
     nq, nv = model.links.q.numel(), model.links.v.numel()
-    q, found = states[0, :nq], []
-    # With rolling constraints the configuration is not determined; the actual one is used.
-    moves = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
+    q, desired_states = states[0, :nq], []
+    # With rolling constraints the outputs do not determine q, so that each initial guess follows
+    # the actual motion.
+    steps = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
     try:
-        wanted = desired[:, : len(model.position_signals)]
-        for row, own, move in zip(wanted, values, moves, strict=True):
-            q = model.configuration(row, q + move, own)
-            found.append(np.concatenate([q, np.zeros(nv)]))
+        positions = desired[:, : len(model.position_signals)]
+        for position, parameters, step in zip(positions, values, steps, strict=True):
+            q = model.configuration(position, q + step, parameters)
+            desired_states.append(np.concatenate([q, np.zeros(nv)]))
     except InconsistentStateError:
-        pass  # The reference becomes unreachable: its path ends there.
-    return np.array(found).reshape(-1, nq + nv)
+        pass  # The desired path ends where it is out of reach.
+    return np.array(desired_states).reshape(-1, nq + nv)

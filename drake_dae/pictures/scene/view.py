@@ -35,20 +35,20 @@ FRAME_RATE = 32.0
 """Frames per second of the live view and of the recording."""
 
 _ON_REQUEST = 1e9
-"""A publish period so long that only a forced publish draws."""
-
+"""A publish period, in s, so long that only a forced publish draws."""
 
 CAMERA_ANGLE = 0.7
 """The vertical angle of view, in rad."""
 
 ASPECT = 4.0 / 3.0
-"""The ratio of width and height that the camera is placed for; a wider window shows more."""
+"""The width of a window divided by its height, from which the camera's position is computed; a
+wider window shows more."""
 
 PIECE = 0.6
-"""The side of a drawn piece of an unbounded surface, relative to the size of the scene."""
+"""The side of a drawn piece of an unbounded surface, as a fraction of the scene's size."""
 
 ARROW = 0.2
-"""The length of the longest arrow, relative to the size of the scene."""
+"""The length of the longest arrow, as a fraction of the scene's size."""
 
 _FLOOR_COLOR = Rgba(0.8, 0.8, 0.8, 1.0)
 
@@ -57,7 +57,10 @@ _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 @checked(ModelError)
 def start_meshcat(host: str = "localhost") -> Meshcat:
-    """A Meshcat server, by default reachable only from this machine.
+    """Starts a Meshcat server, which by default only this computer can reach.
+
+    Args:
+        host: The network interface that the server listens on, as "localhost" or "*" for all.
 
     Raises:
         OSError: There is no free port.
@@ -73,7 +76,7 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
 
 
 def start_unwatched_meshcat() -> Meshcat:
-    """A Meshcat server for a page that is written: Drake does not print its address.
+    """Starts a Meshcat server that only writes a page: Drake does not print its address.
 
     Raises:
         OSError: There is no free port.
@@ -99,9 +102,9 @@ def add_live_view(
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The plant; nothing is drawn if it is not a robot.
-        scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
+        scene_graph: The geometry of the links' MultibodyPlant, or None.
         meshcat: The Meshcat to draw in.
-        exogenous: The plant's port of that name, if any.
+        exogenous: The port that is connected to the plant's input `exogenous`, if any.
     """
     if plant.model is None:
         return
@@ -124,7 +127,7 @@ def add_live_view(
 def draw_scene(
     plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
 ) -> ForceArrows:
-    """Draws the static parts, and returns the force arrows.
+    """Draws the static parts of a robot's scene, and returns the force arrows.
 
     Args:
         plant: The robot.
@@ -139,22 +142,22 @@ def draw_scene(
     wrenches = ConstraintWrenches(model)
     _, size = scene_extent(model, wrenches, state, scene_graph)
     points = wrenches(state, np.zeros(len(dae.force_signals))).points[None]
-    touched = surroundings(model, wrenches, points, dae.parameter_values, PIECE * size)
-    draw_surroundings(meshcat, touched)
-    seen = scene_points(model, wrenches, state[None], scene_graph)
-    draw_floor(meshcat, floor_below(seen, touched))
-    direction = direction_of(seen, points[0], np.zeros_like(points[0]))
-    look_at(meshcat, *framed(seen, direction, ViewAngles.of(CAMERA_ANGLE, ASPECT)))
+    surfaces = surroundings(model, wrenches, points, dae.parameter_values, PIECE * size)
+    draw_surroundings(meshcat, surfaces)
+    robot = scene_points(model, wrenches, state[None], scene_graph)
+    draw_floor(meshcat, floor_below(robot, surfaces))
+    direction = direction_of(robot, points[0], np.zeros_like(points[0]))
+    look_at(meshcat, *framed(robot, direction, ViewAngles.of(CAMERA_ANGLE, ASPECT)))
     return ForceArrows(meshcat, model, ARROW * size)
 
 
 def look_at(meshcat: Meshcat, eye: FloatArray, at: FloatArray) -> None:
-    """Places the camera.
+    """Sets the pose of the camera.
 
     Args:
         meshcat: The Meshcat.
-        eye: The place of the camera, m, shape (3,).
-        at: The point that it looks at, m, shape (3,).
+        eye: The position of the camera, m, shape (3,).
+        at: The point that the camera looks at, m, shape (3,).
     """
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", float(np.rad2deg(CAMERA_ANGLE)))
     meshcat.SetCameraPose(eye, at)
@@ -162,33 +165,34 @@ def look_at(meshcat: Meshcat, eye: FloatArray, at: FloatArray) -> None:
 
 def draw_floor(meshcat: Meshcat, floor: Floor) -> None:
     """Draws the grid below a robot."""
-    begin, end = (np.asfortranarray(each.T) for each in floor.lines)
+    begin, end = (np.asfortranarray(points.T) for points in floor.lines)
     meshcat.SetLineSegments("/floor", begin, end, 1.0, _FLOOR_COLOR)
 
 
 def view_of_links(
     plant: Plant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
 ) -> Diagram | None:
-    """Drake's own view of a robot, posed by our link state; its plant is not simulated.
+    """Returns a diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
+
+    The links' MultibodyPlant computes the poses of the links, and is not simulated.
 
     Args:
         plant: The robot.
-        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
-            has a copy of it.
+        scene_graph: The geometry of the links' MultibodyPlant, or None. The diagram has a copy.
         meshcat: The Meshcat to draw in.
-        period: Time between pictures in s; if None they are drawn on request.
+        period: The time between pictures in s; by default only a forced publish draws.
 
     Returns:
-        A diagram with (q, v) as its input, or None if the links have no geometry.
+        The diagram, or None if the links have no geometry.
     """
-    drawn = plant.robot("a view").links.plant
-    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
+    links = plant.robot("a view").links.plant
+    if scene_graph is None or links is None or links.get_source_id() is None:
         return None
     builder = DiagramBuilder()
     scene = builder.AddSystem(scene_graph.Clone())
-    pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
+    pose = builder.AddSystem(MultibodyPositionToGeometryPose(links, input_multibody_state=True))
     builder.ExportInput(pose.get_input_port(), "link_state")
-    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
+    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))
     parameters = MeshcatVisualizerParams(publish_period=period)
     MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
     diagram = builder.Build()
@@ -196,15 +200,15 @@ def view_of_links(
     return diagram
 
 
-def draw_surroundings(meshcat: Meshcat, seen: Sequence[DrawnSurface]) -> None:
-    """Draws the surfaces in contact with a robot.
+def draw_surroundings(meshcat: Meshcat, surfaces: Sequence[DrawnSurface]) -> None:
+    """Draws the surfaces that a robot touches.
 
     Args:
         meshcat: The Meshcat to draw in.
-        seen: The surfaces.
+        surfaces: The surfaces.
     """
-    for one in seen:
-        path = path_of(one.constraint, "surface")
-        meshcat.SetObject(f"{path}/form", one.picture.form, rgba=_SURFACE_COLOR)
-        meshcat.SetTransform(f"{path}/form", one.picture.pose)
-        meshcat.SetTransform(path, one.stands)
+    for surface in surfaces:
+        path = path_of(surface.constraint, "surface")
+        meshcat.SetObject(f"{path}/form", surface.picture.form, rgba=_SURFACE_COLOR)
+        meshcat.SetTransform(f"{path}/form", surface.picture.pose)
+        meshcat.SetTransform(path, surface.pose)

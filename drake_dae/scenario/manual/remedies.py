@@ -1,4 +1,4 @@
-"""The codes of errors, and what to do about each: `drake-dae explain`, and a page of the book."""
+"""The codes of errors with their remedies, for `drake-dae explain` and a page of the book."""
 
 import re
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ import yaml  # type: ignore[import-untyped]
 
 _HEAD = """# Error codes
 
-The command ends the message of an error with a code, as `[E12]`; `drake-dae explain E12` prints the
-entry of this page. The code is that of the kind of message, or else that of the exception's class.
+On the command line the message of an error ends with a code, as `[E12]`. `drake-dae explain E12`
+prints the entry of this page. A code belongs to a kind of message, or else to an exception class.
 
 ```python
 import numpy as np
@@ -23,18 +23,18 @@ import drake_dae as dd
 
 @dataclass(frozen=True)
 class Remedy:
-    """What to do about one kind of error.
+    """The remedy for one kind of error, with an example that raises it.
 
     Attributes:
-        title: What is wrong, in a few words.
-        remedy: What to do.
-        words: The words that stand in each such message, "..." for anything; empty if the code is
-            that of a class.
-        kind: The name of the class of which this is the code; empty if words decide.
-        command: Arguments of `drake-dae` that make this error; empty if Python does.
-        python: Python code that makes it, after the imports of the page.
-        files: Name -> text of what the example needs, in the folder where it runs.
-        environment: Variables of the shell in which the command runs.
+        title: The problem in a few words.
+        remedy: The steps that solve it.
+        words: The words that each such message contains, where "..." matches any text; empty if
+            the code belongs to a class.
+        kind: The name of the class that the code belongs to; empty if `words` is set.
+        command: Arguments of `drake-dae` that raise this error; empty if the example is in Python.
+        python: Python code that raises it, after the imports of the page.
+        files: Name -> text of each file that the example needs in its folder.
+        environment: Environment variables of the command.
     """
 
     title: str
@@ -49,13 +49,13 @@ class Remedy:
 
 @cache
 def remedies() -> dict[str, Remedy]:
-    """Code -> remedy, in the order of the page."""
+    """Returns code -> remedy, in the order of the page."""
     text = (files(__package__) / "errors.yaml").read_text("utf-8")
     return {code: Remedy(**keys) for code, keys in yaml.safe_load(text).items()}
 
 
 def code_of(message: str, error: type[BaseException]) -> str:
-    """The code of a message of an error; "" if its class has none."""
+    """Returns the code of an error from its message and class; "" if there is none."""
     for code, remedy in remedies().items():
         if remedy.words and _pattern(remedy.words).search(message):
             return code
@@ -64,19 +64,19 @@ def code_of(message: str, error: type[BaseException]) -> str:
 
 
 def remedy_section(code: str) -> str:
-    """The entry of a code, in Markdown."""
+    """Returns the entry of a code, in Markdown."""
     remedy = remedies()[code]
-    said = f"`{remedy.words}`" if remedy.words else f"Any other `{remedy.kind}`."
+    message = f"`{remedy.words}`" if remedy.words else f"Any other `{remedy.kind}`."
     example = f"```python\n{remedy.python}```" if remedy.python else _commands(remedy)
-    written = "".join(f"`{name}`:\n\n```text\n{text}```\n\n" for name, text in remedy.files.items())
+    shown = "".join(f"`{name}`:\n\n```text\n{text}```\n\n" for name, text in remedy.files.items())
     return (
-        f"## {code}: {remedy.title}\n\n*Message*: {said}\n\n*Remedy*: {remedy.remedy}\n\n"
-        f"*Example*:\n\n{written}{example}\n"
+        f"## {code}: {remedy.title}\n\n*Message*: {message}\n\n*Remedy*: {remedy.remedy}\n\n"
+        f"*Example*:\n\n{shown}{example}\n"
     )
 
 
 def remedies_page() -> str:
-    """The entries of all codes, in Markdown."""
+    """Returns the entries of all codes, in Markdown."""
     return _HEAD + "\n".join(map(remedy_section, remedies()))
 
 
