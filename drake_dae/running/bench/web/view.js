@@ -17,9 +17,10 @@ class View {
     viewer.scene.add(this.push);
     new ResizeObserver(() => {
       viewer.set_3d_pane_size();
-      /* The camera stands for a pane of 4 to 3; one that is narrower shows as much of the robot. */
+      /* The camera is placed for a pane of 4 to 3. A narrower pane shows as much of the robot. One
+         sixth remains free, since the robot moves and is dragged. */
       const { camera, dom_element: pane } = viewer;
-      camera.zoom = Math.min(1, (0.7 * pane.clientWidth) / Math.max(pane.clientHeight, 1));
+      camera.zoom = 0.83 * Math.min(1, (0.7 * pane.clientWidth) / Math.max(pane.clientHeight, 1));
       camera.updateProjectionMatrix();
       viewer.set_dirty();
     }).observe(viewer.dom_element);
