@@ -1,7 +1,7 @@
 """A run under way without machine code: where it is, and its record so far."""
 
 from collections.abc import Callable
-from math import isnan
+from math import isfinite, isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -92,13 +92,15 @@ class RunStepper:
     Args:
         functions: The diagram.
         problem: The run.
+        tableau: The method of its steps.
 
     Attributes:
         rows: States whose rows are not computed yet.
     """
 
-    def __init__(self, functions: DiagramFunctions, problem: RunProblem) -> None:
-        self.functions, self.problem = functions, problem
+    def __init__(self, functions: DiagramFunctions, problem: RunProblem, tableau: Tableau) -> None:
+        self.functions, self.problem, self._tableau = functions, problem, tableau
+        self._stages = functions.stages(tableau)
         self.state, self.held = problem.state, problem.held
         self.time = self.before = self.mark = float(problem.times[0])
         self.event = self.steps = 0
@@ -114,6 +116,20 @@ class RunStepper:
         if values.size and isnan(values[0]) and time < self.trial_time and np.isfinite(state).all():
             self.trial_time, self.trial = time, state.copy()
         return values
+
+    def stages(self, step: float, first: FloatArray) -> FloatArray:
+        """Returns the derivatives at all stages of a step, shape (s, n); nan without a value.
+
+        Args:
+            step: The step in s.
+            first: The derivative at the accepted state.
+        """
+        inputs = self.time, self.state, self.held, self.problem.parameters, first, step
+        rates, finite = self._stages(*inputs)
+        if isfinite(finite[0]):
+            return rates.reshape(self._tableau.c.size, first.size).copy()
+        # One after the other, to note the trial that has no value.
+        return stage_rates(self.rate, self._tableau, self.time, self.state, step, first)
 
     def accepted_rate(self) -> FloatArray:
         """Returns the derivative at the accepted state."""

@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 from math import isfinite
 
+import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.compiler.compiled import ARGUMENTS
 from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Tableau
 from drake_dae.running.rollout.stepping.called import BufferedFunction
 from drake_dae.running.rollout.stepping.many import VectorizedFunction
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
@@ -65,6 +68,7 @@ class DiagramFunctions:
             for rate in compiled.rates
             if rate.stepped is None
         ]
+        self._stages: dict[bytes, BufferedFunction] = {}
         self._guard = BufferedFunction(compiled.guard) if compiled.guards else None
         self._watch = BufferedFunction(compiled.watch) if compiled.watched else None
         self.watched_rates = compiled.watched_rates
@@ -75,6 +79,30 @@ class DiagramFunctions:
         """Returns the derivative of the state, as a new array; nan where it has no value."""
         rate, valid = self._rate(time, state, held, parameters)
         return rate.copy() if isfinite(valid[0]) else np.full_like(rate, np.nan)
+
+    def stages(self, tableau: Tableau) -> BufferedFunction:
+        """Returns the derivatives at the stages of a Runge-Kutta step as one function.
+
+        It takes the arguments of all functions, the derivative at the first stage, and the step in
+        s. It returns the derivatives, shape (s, n), and a number that is finite if all have values.
+        """
+        key = tableau.a.tobytes()
+        if key not in self._stages:
+            compiled = self.program.compiled
+            inputs = [ca.MX.sym(name, compiled.sizes[name]) for name in ARGUMENTS]
+            time, state, held, parameters = inputs
+            first, step, finite = ca.MX.sym("first", state.numel()), ca.MX.sym("step"), ca.MX(0.0)
+            rates = [first]
+            for row, part in zip(tableau.a[1:].tolist(), tableau.c[1:].tolist(), strict=True):
+                pairs = zip(row, rates, strict=False)
+                change = sum((weight * rate for weight, rate in pairs if weight), ca.MX(0.0))
+                stage = compiled.rate(time + part * step, state + step * change, held, parameters)
+                rates.append(stage[0])
+                finite += stage[1]
+            outputs = [ca.densify(ca.horzcat(*rates)), ca.densify(finite)]
+            function = ca.Function("stages", [*inputs, first, step], outputs)
+            self._stages[key] = BufferedFunction(function)
+        return self._stages[key]
 
     def projected(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray

@@ -14,7 +14,6 @@ from drake_dae.running.rollout.stepping.course import (
     Dop853Step,
     RunEnded,
     RunStepper,
-    stage_rates,
 )
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 
@@ -27,7 +26,7 @@ MOST_FAILURES = 100
 
 def run(functions: DiagramFunctions, settings: Settings, problem: RunProblem) -> Run:
     """Runs a diagram until its end, or to where it cannot go on."""
-    course = RunStepper(functions, problem)
+    course = RunStepper(functions, problem, settings.tableau or DOP)
     try:
         if settings.tableau is None:
             _run_controlled(course, settings)
@@ -92,7 +91,7 @@ def _controlled_step(
         size = end - course.time
         if not size > SHORTEST * abs(course.time) or failures > MOST_FAILURES:
             raise RunEnded(RunEnding.STUCK)
-        rates = stage_rates(course.rate, DOP, course.time, course.state, size, first)
+        rates = course.stages(size, first)
         reached = course.state + size * (DOP.b @ rates)
         larger = np.maximum(np.abs(course.state), np.abs(reached))
         unit = settings.absolute + larger * settings.relative
@@ -160,9 +159,7 @@ def _run_fixed(course: RunStepper, settings: Settings, tableau: Tableau) -> None
             raise RunEnded(RunEnding.PAUSED)
         course.update()
         course.look()
-        rates = stage_rates(course.rate, tableau, start, course.state, end - start)
-        if np.isnan(rates[0]).any():
-            raise RunEnded(RunEnding.INVALID)
+        rates = course.stages(end - start, course.accepted_rate())
         state = course.state + (end - start) * (tableau.b @ rates)
         course.next = end
         if not np.isfinite(state).all():
