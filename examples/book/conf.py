@@ -1,6 +1,7 @@
 """The Sphinx configuration of the book, which `make docs` builds."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
@@ -26,7 +27,7 @@ html_copy_source = False
 html_show_sphinx = False
 html_static_path = ["_static"]
 html_css_files = ["book.css"]
-html_search_scorer = "search.js"
+html_search_scorer = str(Path(__file__).with_name("search.js"))  # Sphinx opens it as given.
 html_math_renderer = "mathml"
 napoleon_use_ivar = True
 add_module_names = False
