@@ -15,13 +15,19 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
+from drake_dae.errors import (
+    DrakeDaeError,
+    InconsistentStateError,
+    ModelError,
+    describe_os_error,
+)
 from drake_dae.files import read_text
 from drake_dae.running.bench.any_diagram import parts_of_diagram, vector_outputs
 from drake_dae.running.bench.description import TICK, Bench, shown_function
 from drake_dae.running.bench.inputs import Inputs, with_input_values
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import check_config
+from drake_dae.systems.blocks.failures import cannot_go_on
 from drake_dae.trace.functions import TracedFunction
 
 MOST_BYTES = 100_000_000
@@ -115,7 +121,7 @@ class HandRun:
         self._simulator.set_target_realtime_rate(0.0)
         self._simulator.Initialize()
         self.count = 0
-        self._failure: Exception | None = None
+        self._failure: DrakeDaeError | None = None
         self._log: list[tuple[int, str, float]] = []
         self._rows = list[tuple[float, dict[str, FloatArray]]]()
         self._record_row()
@@ -149,7 +155,12 @@ class HandRun:
             raise self._failure
         try:
             self._simulator.AdvanceTo(self._start + (self.count + 1) * self.tick)
-        except (DrakeDaeError, RuntimeError) as error:
+        except (InconsistentStateError, RuntimeError) as error:  # As `simulate` reports it.
+            context = self._simulator.get_context()
+            state = context.get_continuous_state_vector().CopyToVector()
+            self._failure = cannot_go_on(context.get_time(), state, str(error))
+            raise self._failure from error
+        except DrakeDaeError as error:
             self._failure = error
             raise
         self.count += 1

@@ -110,7 +110,7 @@ class _Changes:
         )
 
     def is_missed(self, time: float, state: FloatArray, held: FloatArray) -> bool:
-        """Whether blocks do not react to a change, whose guards are zero but for round-off."""
+        """Whether blocks ignore a change, since their guards differ from zero by round-off."""
         before = self.context.Clone()
         try:
             reacted, held_after, goes_on = self.react(time, state, held)

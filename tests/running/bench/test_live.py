@@ -13,7 +13,7 @@ from runs import scenario
 
 from drake_dae import Commands, build_commanded, live, replay
 from drake_dae.cli import main
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.bench.live import Server
 from drake_dae.running.bench.run import HandRun
 
@@ -198,6 +198,20 @@ def test_the_command_runs_commands_again(tmp_path, built, capsys):
     with np.load(tmp_path / "again" / "record.npz") as again:
         np.testing.assert_array_equal(again["state"], run.record()["state"])
     assert run.record()["constraint_force"][-1, 0] > 30.0
+
+
+@pytest.mark.slow
+def test_a_loop_that_is_steered_out_of_reach_says_when_and_why():
+    own = build_commanded(scenario("planar_3rrr"))
+    run = HandRun(own.loop, own.context, scenario("planar_3rrr").integrator)
+    run.set({run.inputs.names.index("reference.platform_x"): 5.0})
+
+    def steer():
+        for _ in range(400):
+            run.advance()
+
+    with pytest.raises(SimulationError, match=r"cannot go on at t = .*a reference is out of reach"):
+        steer()
 
 
 @pytest.mark.thorough
