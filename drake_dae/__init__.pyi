@@ -81,6 +81,7 @@ from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel
 from .robots.constraints.welds import WeldedFrames as WeldedFrames
+from .robots.force_outputs import FaceForces as FaceForces
 from .robots.force_outputs import ForceCombination as ForceCombination
 from .robots.force_outputs import ForceOutput as ForceOutput
 from .robots.force_outputs import NamedForce as NamedForce

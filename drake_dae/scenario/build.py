@@ -123,7 +123,7 @@ def build_loop(
     # The law, and its exogenous signals.
     check_adaptive(scenario)
     task, sampling = scenario.task, scenario.sampling
-    opens = "" if task is None else opening_contact(scenario, model).name
+    opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
     references: list[Reference] = []
     if motion is not None:
@@ -207,7 +207,7 @@ def make_plant(
     model: RobotModel,
     structure: Structure,
     feedback: bool = False,
-    opens: str = "",
+    opens: Sequence[str] = (),
     pushed: bool = False,
 ) -> Plant:
     """Makes the plant of a scenario.
@@ -217,7 +217,7 @@ def make_plant(
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
         feedback: Whether the plant may evaluate the law itself.
-        opens: The contact that a task opens and closes; empty without a task.
+        opens: The contacts that a task opens and closes; empty without a task.
         pushed: Whether the links of Drake's own plant can be pushed while it runs.
 
     Raises:

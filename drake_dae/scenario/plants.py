@@ -35,7 +35,7 @@ class RobotToSimulate:
     Attributes:
         model, structure: The robot, and the structure of its system.
         feedback: Whether the plant may evaluate the law itself.
-        opens: The contact that a task opens and closes; empty without a task.
+        opens: The contacts that a task opens and closes; empty without a task.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -45,7 +45,7 @@ class RobotToSimulate:
     model: RobotModel
     structure: Structure
     feedback: bool
-    opens: str
+    opens: Sequence[str]
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
@@ -101,8 +101,8 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        if robot.opens:  # In a task its contact opens, without bouncing.
-            return Unilateral({robot.opens: 0.0}).plant(robot)
+        if robot.opens:  # In a task its contacts open, without bouncing.
+            return Unilateral(dict.fromkeys(robot.opens, 0.0)).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
 
 

@@ -34,15 +34,10 @@ _FORCE = 10.0
 
 def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
     """The gains of a task without contact, soft along the distance: see `TaskController`."""
-    constraint = opening_contact(scenario, model)
-    names = [signal.name for signal in model.dae.constraint_input_signals]
-    index = names.index(constraint.force_signals[0].name)
-    distance, rate = (
-        model.dae.constraint_output_signals[index].name,
-        contact.position_rate / _SOFTER,
-    )
+    rate = contact.position_rate / _SOFTER
     gains = {signal.name: contact.position_gains(2) for signal in model.position_signals}
-    gains[distance] = [rate**2, 2.0 * rate]
+    for point in opening_contact(scenario, model):
+        gains[point.residual_signals[0].name] = [rate**2, 2.0 * rate]
     return parts.Coefficients(
         outputs={name: [rounded(gain) for gain in values] for name, values in gains.items()}
     )

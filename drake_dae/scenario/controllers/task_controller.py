@@ -56,31 +56,35 @@ def task_controller(
             "cannot filter, and would take for a touch"
         )
         raise ScenarioError(("sampling", text))
-    (force,) = [signal.name for signal in opening_contact(scenario, model).force_signals]
+    points = opening_contact(scenario, model)
+    forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
-        free_system = open_contact(law.system, force)
+        free_system = open_contact(law.system, forces)
     with at("task.gains" if task.gains else "gains"):
         free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
     with at("task"):
-        return TaskController(task.make(noise), law, free_law, sample_period=period)
+        # The noise of the sum over the points.
+        return TaskController(task.make(noise * len(points) ** 0.5), law, free_law, sample_period=period)
 
 
-def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
-    """The constraint that opens and closes."""
+def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
+    """The constraint that opens and closes, or those of the points of a face."""
     assert scenario.task is not None
     fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
-    name = scenario.task.contact
+    given = scenario.task.contact
+    names = [given] if isinstance(given, str) and given else list(given)
     with at("task.contact"):
-        if name:
-            if name in fitting:
-                return fitting[name]
-            raise ModelError(
-                f"'{name}' is not a unilateral constraint with one force; these are "
-                f"{', '.join(fitting) or 'none'}"
-            )
-        if len(fitting) != 1:
+        for name in names:
+            if name not in fitting:
+                raise ModelError(
+                    f"'{name}' is not a unilateral constraint with one force; these are "
+                    f"{', '.join(fitting) or 'none'}"
+                )
+        if len(set(names)) < len(names):
+            raise ModelError(f"a point is named twice: {', '.join(names)}")
+        if not names and len(fitting) != 1:
             raise ModelError(
                 "needed, since the unilateral constraints with one force are "
-                f"{', '.join(fitting) or 'none'}"
+                f"{', '.join(fitting) or 'none'}; give one, or a list of the points of a face"
             )
-    return next(iter(fitting.values()))
+    return tuple(c for name, c in fitting.items() if not names or name in names)

@@ -63,7 +63,8 @@ Output = Annotated[
     Choice(_WRITTEN),
 ]
 ForceOutput = Annotated[
-    str | force_outputs.Squeeze | force_outputs.ForceCombination, Choice(_WRITTEN)
+    str | force_outputs.Squeeze | force_outputs.FaceForces | force_outputs.ForceCombination,
+    Choice(_WRITTEN),
 ]
 Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,

@@ -19,11 +19,13 @@ class ScenarioTask:
 
     It starts at rest at start.positions, or in contact near them if the first phase requires
     contact. While the contact is open, its distance, such as "wall.distance", is an output in place
-    of its force. With ideal constraints in `plant` the contact opens and closes without bouncing.
+    of its force, and each distance of a face. With ideal constraints in `plant` the contact opens and closes without bouncing.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.
         contact: The name of the constraint that opens and closes; not needed if there is only one.
+            Or the list of the points of a face, whose force and moments are outputs by
+            `!FaceForces`.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s at the beginning for which a task without contact measures the bias
@@ -37,7 +39,7 @@ class ScenarioTask:
     """
 
     phases: Sequence[Phase]
-    contact: str = ""
+    contact: str | Sequence[str] = ""
     contact_force: float = 0.5
     patience: float = 0.25
     tare_time: float = 0.0

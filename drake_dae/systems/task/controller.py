@@ -77,8 +77,8 @@ class TaskController(Diagram, Controller):
     Output ports:
         control: u, shape (p,).
         phase: The index of the phase in the task, shape (1,); after the last one their number.
-        desired_output: The desired positions, force and distance, shape (p + 1,). In contact the
-            distance is zero, otherwise the force.
+        desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
+            of k points. In contact the distances are zero, otherwise the forces.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
@@ -87,7 +87,9 @@ class TaskController(Diagram, Controller):
 
     Args:
         task: The phases.
-        law: The law in contact. Its force, "wall.force" for example, is one of its outputs.
+        law: The law in contact. Its force, "wall.force" for example, is one of its outputs. The
+            contact may be a face of several points, whose force and moments are outputs; see
+            `FaceForces`.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
         sample_period: The period at which guards are evaluated and errors are integrated, in s; 0
             for continuously.
@@ -95,11 +97,10 @@ class TaskController(Diagram, Controller):
     Attributes:
         task, law, free_law, sample_period: The arguments.
         supervisor, controller, free_controller: The blocks in it.
-        place: The index of the output that is the force or the distance.
-        force: The index of the contact's force among the constraint forces.
+        contact: The contact that opens and closes.
         output_signals: Names and units of `desired_output`.
         outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
-            derivative of the distance, shape (p + 2,).
+            derivatives of the distances, shape (p + 2 k,).
 
     Raises:
         ModelError: The laws do not belong together, or a phase has a reference that does not fit.
@@ -116,14 +117,16 @@ class TaskController(Diagram, Controller):
         self.task, self.law, self.free_law = task, law, free_law
         self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
         self.sample_period = sample_period
-        self.place, self.force = opened_contact(law, free_law)
+        self.contact = contact = opened_contact(law, free_law)
+        if contact.size == 1 and task.watches("eccentricity"):
+            raise ModelError("a guard of the eccentricity needs a contact of several points")
         self.outputs = self._trace_outputs()
-        distance = law.system.constraint_output_signals[self.force]
-        self.output_signals = (*law.system.output_signals, distance)
+        distances = [law.system.constraint_output_signals[i] for i in contact.forces]
+        self.output_signals = (*law.system.output_signals, *distances)
         builder = DiagramBuilder()
         size = law.system.num_constraints
         self.supervisor = builder.AddSystem(
-            TaskSupervisor(task, (free_law, law), self.place, self.force, size, sample_period)
+            TaskSupervisor(task, (free_law, law), contact, size, sample_period)
         )
         for name in ("estimated_state", "measured_force", "hold"):
             builder.ExportInput(self.supervisor.GetInputPort(name), name)
@@ -174,9 +177,10 @@ class TaskController(Diagram, Controller):
         self.set_name("task_controller")
 
     def _trace_outputs(self) -> TracedFunction:
-        system, chain = self.law.system, self.free_law.structure.output_chains[self.place]
+        system, chains = self.law.system, self.free_law.structure.output_chains
         force = ca.SX.sym("force", system.num_constraints)
-        outputs = ca.vertcat(system.outputs(force), chain[0], chain[1])
+        distances = [chains[place][order] for order in (0, 1) for place in self.contact.places]
+        outputs = ca.vertcat(system.outputs(force), *distances)
         return system.trace("task outputs", {"value": ca.densify(outputs)}, {"force": force})
 
     def rest_state(
@@ -216,7 +220,7 @@ class TaskController(Diagram, Controller):
         return self.supervisor.progress(self.GetSubsystemContext(self.supervisor, context)).segments
 
     def desired_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """The values of `desired_output` at times of a run, shape (k, p + 1).
+        """The values of `desired_output` at times of a run, one row each.
 
         At the time of a change it is the value of the phase before.
 
@@ -229,7 +233,7 @@ class TaskController(Diagram, Controller):
             raise ModelError(f"{self.get_name()}: the task has not begun in this context")
         return np.array(
             [
-                segments[i].desired(self.place, time)
+                segments[i].desired(self.contact, time)
                 for i, time in zip(places_at(segments, moments), moments, strict=True)
             ]
         ).reshape(moments.size, -1)
@@ -270,40 +274,42 @@ class TaskController(Diagram, Controller):
                 "at once may switch without end: make the controller with a sample_period (in a "
                 "scenario: sampling)"
             )
-        name = system.force_signals[self.force].name
-        if plant.contacts and name.split(".")[0] not in plant.contacts:
-            raise WiringError(
-                f"the contact with the force '{name}' does not open in this plant; contacts that "
-                f"open: {', '.join(plant.contacts)}"
-            )
+        for name in (system.force_signals[i].name for i in self.contact.forces):
+            if plant.contacts and name.split(".")[0] not in plant.contacts:
+                raise WiringError(
+                    f"the contact with the force '{name}' does not open in this plant; contacts "
+                    f"that open: {', '.join(plant.contacts)}"
+                )
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """The signals of a task in a record.
 
-        The outputs are the positions, the force and the distance; in contact the desired distance
-        is zero, otherwise the desired force. "distance" has the distance and its derivative,
-        "phase" is 1 for the current phase and 0 for all others, "predicted_error" is that of
+        The outputs are the positions, the forces and the distances of the contact; in contact the
+        desired distances are zero, otherwise the desired forces. "distance" has the distances, then
+        their derivatives, "phase" is 1 for the current phase and 0 for all others, "predicted_error" is that of
         `predicted_errors`.
         """
         signals = self.output_signals
         values_with_distance = function_along(
             self.outputs, {**values, "force": values["constraint_force"]}
         )
-        outputs = values_with_distance[:, :-1]
+        size = self.contact.size
+        outputs, distances = values_with_distance[:, :-size], values_with_distance[:, -2 * size :]
+        rates = (signal.derivative(1) for signal in signals[-size:])
         desired = np.zeros_like(outputs)
         segments = () if context is None else self.segments(context)
         if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
         places = values["phase"].astype(int)
         predicted = predicted_errors(
-            (self.free_law, self.law), self.place, self.force, segments, times, values
+            (self.free_law, self.law), self.contact, segments, times, {**values, "outputs": outputs}
         )
         names = self.phase_signals
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
-            "distance": (values_with_distance[:, -2:], (signals[-1], signals[-1].derivative(1))),
+            "distance": (distances, (*signals[-size:], *rates)),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
@@ -316,7 +322,7 @@ class TaskController(Diagram, Controller):
         )
         (outputs,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
         desired = self.GetOutputPort("desired_output").Eval(context)
-        return outputs[:-1], desired, self.output_signals
+        return outputs[: -self.contact.size], desired, self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray

@@ -1,6 +1,7 @@
-"""A system with one contact open: its distance is an output in place of its force."""
+"""A system with one contact open: its distances are outputs in place of its forces."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
@@ -13,37 +14,67 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 
+@dataclass(frozen=True)
+class OpeningContact:
+    """The contact of a task that opens and closes: one point, or several that form a face.
+
+    Attributes:
+        places: The indices of the outputs that are its forces, and its distances where it is open.
+        forces: The indices of its constraint forces.
+        main: The one of `places` that is its total force.
+    """
+
+    places: tuple[int, ...]
+    forces: tuple[int, ...]
+    main: int
+
+    @property
+    def size(self) -> int:
+        """The number of its points."""
+        return len(self.forces)
+
+    @property
+    def others(self) -> list[int]:
+        """The places besides `main`: moments, or further distances."""
+        return [place for place in self.places if place != self.main]
+
+
 @checked(ModelError)
-def open_contact(system: DaeSystem, force: str) -> DaeSystem:
+def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
     """A system one of whose contacts is open:
 
         x' = f + g_o v_o + h u,    0 = k_o(x),    z = (l_o(x) + m_o(x) v_o, k_i(x)),
 
-    where o are all constraints except the one, i, with the named force v_i. This constraint does
-    not hold, and the output that was its force is its distance k_i(x). State, controls, parameters
-    and the order of the outputs do not change, so that the laws of both systems can replace each
-    other at any moment.
+    where o are all constraints except those, i, with the named forces v_i: one, or those of the
+    points of a face. These constraints do not hold, and the outputs that were their forces are
+    their distances k_i(x). State, controls, parameters and the order of the outputs do not change,
+    so that the laws of both systems can replace each other at any moment.
 
     Args:
         system: The system with the contact closed, `RobotModel.dae` for example.
-        force: The name of the contact's force, "wall.force" for example.
+        force: The name of the contact's force, "wall.force" for example, or those of a face.
 
     Raises:
-        ModelError: There is no such force; it is not one of the outputs by itself; or constraints
-            share their forces.
+        ModelError: There is no such force; the outputs that depend on them are not as many, do not
+            contain their sum, or depend on other forces; or constraints share their forces.
     """
+    forces = [force] if isinstance(force, str) else list(force)
     names = [signal.name for signal in system.constraint_input_signals]
-    if force not in names:
-        raise ModelError(f"{system.name}: {unknown_name('constraint force', force, names)}")
+    for name in forces:
+        if name not in names:
+            raise ModelError(f"{system.name}: {unknown_name('constraint force', name, names)}")
     if system.sharing is not None:
         raise ModelError(
             f"{system.name}: redundant constraints share their forces, and none of them opens; "
             "leave `compliances` out"
         )
-    i, j = names.index(force), output_of_force(system, force)
-    reduced = with_constraints(system, [row for row in range(len(names)) if row != i])
+    contact = _contact(system, sorted({names.index(name) for name in forces}))
+    reduced = with_constraints(
+        system, [row for row in range(len(names)) if row not in contact.forces]
+    )
     drift, signals = ca.SX(reduced.l), list(reduced.output_signals)
-    drift[j], signals[j] = system.k[i], system.constraint_output_signals[i]
+    for j, i in zip(contact.places, contact.forces, strict=True):
+        drift[j], signals[j] = system.k[i], system.constraint_output_signals[i]
     return replace(
         reduced,
         l=drift,
@@ -52,32 +83,43 @@ def open_contact(system: DaeSystem, force: str) -> DaeSystem:
     )
 
 
-def output_of_force(system: DaeSystem, force: str) -> int:
-    """The index of the output that is a constraint force, on which no other output depends.
+def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
+    """The contact with some constraint forces.
 
     Raises:
-        ModelError: There is none, or others depend on it.
+        ModelError: The outputs that depend on them are not as many, do not contain their sum, or
+            depend on other forces.
     """
-    i = [signal.name for signal in system.constraint_input_signals].index(force)
-    depending = [j for j in range(system.num_outputs) if not system.m[j, i].is_zero()]
-    chosen = [
+    names = [signal.name for signal in system.constraint_input_signals]
+    outputs = listed(signal.name for signal in system.output_signals)
+    others = [i for i in range(len(names)) if i not in forces]
+    depending = [
+        j
+        for j in range(system.num_outputs)
+        if any(not system.m[j, i].is_zero() for i in forces)
+    ]
+    fitting = [
         j
         for j in depending
-        if system.l[j].is_zero()
-        and system.m[j, i].is_one()
-        and ca.sparsify(system.m[j, :]).nnz() == 1
+        if system.l[j].is_zero() and all(system.m[j, i].is_zero() for i in others)
     ]
-    if len(chosen) != 1 or depending != chosen:
-        outputs = listed(signal.name for signal in system.output_signals)
+    total = [j for j in fitting if all(system.m[j, i].is_one() for i in forces)]
+    if len(total) == 1 and len(depending) == len(fitting) == len(forces):
+        return OpeningContact(tuple(fitting), tuple(forces), total[0])
+    if len(forces) == 1:
         raise ModelError(
-            f"{system.name}: '{force}' must be one of the outputs by itself, so that a distance "
-            f"can be in its place where the contact is open; the outputs are {outputs}"
+            f"{system.name}: '{names[forces[0]]}' must be one of the outputs by itself, so that a "
+            f"distance can be in its place where the contact is open; the outputs are {outputs}"
         )
-    return chosen[0]
+    raise ModelError(
+        f"{system.name}: the contact of {', '.join(names[i] for i in forces)} needs {len(forces)} "
+        "outputs that depend on these forces alone, one of them their sum, so that distances can "
+        f"be in their places where it is open, such as a FaceForces; the outputs are {outputs}"
+    )
 
 
-def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
-    """The index of the output that is force or distance, and that of the constraint force.
+def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
+    """The contact that is closed in one law and open in the other.
 
     Raises:
         ModelError: The laws are not for one robot with and without the contact.
@@ -87,7 +129,7 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
         [signal.name for signal in system.constraint_input_signals] for system in (closed, free)
     )
     gone = [name for name in names if name not in others]
-    if len(gone) != 1 or (closed.num_states, closed.num_controls) != (
+    if not gone or (closed.num_states, closed.num_controls) != (
         free.num_states,
         free.num_controls,
     ):
@@ -96,13 +138,14 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
             f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
             f"{', '.join(others) or 'nothing'}"
         )
-    place, force = output_of_force(closed, gone[0]), names.index(gone[0])
-    distance = closed.constraint_output_signals[force].name
-    if free.output_signals[place].name != distance:
-        raise ModelError(
-            f"the free law must have the output '{distance}' where the law has '{gone[0]}'; make "
-            "its system by open_contact"
-        )
+    contact = _contact(closed, [names.index(name) for name in gone])
+    for place, force in zip(contact.places, contact.forces, strict=True):
+        distance = closed.constraint_output_signals[force].name
+        if free.output_signals[place].name != distance:
+            raise ModelError(
+                f"the free law must have the output '{distance}' where the law has "
+                f"'{closed.output_signals[place].name}'; make its system by open_contact"
+            )
     moving = [p.name for p in closed.exogenous.moving]
     if moving and DISTURBANCE not in moving:
         raise ModelError(
@@ -116,11 +159,15 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
             "out"
         )
     for i in range(closed.num_outputs):
-        if i != place and law.degrees[i] != free_law.degrees[i]:
+        if i not in contact.places and law.degrees[i] != free_law.degrees[i]:
             raise ModelError(
                 f"'{closed.output_signals[i].name}' has degree {law.degrees[i]} in contact and "
                 f"{free_law.degrees[i]} without, so that no reference leads from one to the other"
             )
-    if free_law.degrees[place] < 2:
-        raise ModelError(f"'{distance}' must have degree 2 or more, as where forces move it")
-    return place, force
+    for place in contact.places:
+        if free_law.degrees[place] < 2:
+            raise ModelError(
+                f"'{free.output_signals[place].name}' must have degree 2 or more, as where forces "
+                "move it"
+            )
+    return contact

@@ -12,6 +12,7 @@ from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.task.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task
@@ -43,11 +44,13 @@ class ModelMoment:
         time: The time, in s.
         state: x, shape (n,).
         parameters: All parameters of the laws' system.
+        forces: The constraint forces, those of the contact after the force filter, shape (m,).
     """
 
     time: float
     state: FloatArray
     parameters: FloatArray
+    forces: FloatArray
 
 
 @dataclass(frozen=True)
@@ -76,34 +79,46 @@ class TaskPlanner:
     Args:
         task: The phases.
         laws: The law of the free robot and the law in contact.
-        place: The index of the output that is the distance of the first and the force of the
-            second.
+        contact: The contact that opens and closes.
 
     Attributes:
         goals: The references of each phase.
         motion_function: (x, parameters) -> the distance and its derivative by the model, then all
-            outputs in m including the distance, then their derivatives.
-        moved: The number of outputs in m.
+            outputs in m including the distance, then their derivatives. Of several distances it has
+            the mean.
+        moved: The number of these outputs.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
     """
 
-    def __init__(self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], place: int) -> None:
-        self._task, self._laws, self._place = task, laws, place
+    def __init__(
+        self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], contact: OpeningContact
+    ) -> None:
+        self._task, self._laws, self._contact = task, laws, contact
         self._phases = task.plan.phases
         pairs = list(enumerate(task.contacts[:-1]))
-        self.goals = [_goals(task, index, laws[contact], place) for index, contact in pairs]
-        self._rates = [_rates(task, index, laws[contact], place) for index, contact in pairs]
-        self._nothing = [_no_goals(law) for law in laws]
-        free = laws[FREE]
-        chains = free.structure.output_chains
-        moved = [
-            chain
-            for chain, signal in zip(chains, free.system.output_signals, strict=True)
-            if signal.unit == "m"
+        self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
+        self._rates = [
+            _rates(task, index, laws[closed], contact, closed) for index, closed in pairs
         ]
-        rows = [*chains[place][:2], *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
+        self._nothing = [_no_goals(law) for law in laws]
+        free, closed = laws[FREE], laws[CONTACT].system
+        force = ca.SX.sym("force", closed.num_constraints)
+        self._forces = closed.trace(
+            "forces", {"value": closed.outputs(force)}, {"force": force}, often=False
+        )
+        chains = free.structure.output_chains
+        distance = [
+            ca.sum1(ca.vertcat(*(chains[place][order] for place in contact.places))) / contact.size
+            for order in (0, 1)
+        ]
+        moved = [
+            distance if place == contact.main else chains[place]
+            for place, signal in enumerate(free.system.output_signals)
+            if signal.unit == "m" and place not in contact.others
+        ]
+        rows = [*distance, *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
         self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
         self.moved = len(moved)
 
@@ -118,7 +133,9 @@ class TaskPlanner:
         contact = self._task.contacts[0]
         force = self._task.contact_force if contact else 0.0
         moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
-        present = self._met(now, contact, moment)
+        begun = np.zeros(self._laws[CONTACT].system.num_outputs)
+        begun[self._contact.main] = force
+        present = self._met(now, contact, begun)
         return self._started(now, 0, self._name(0), contact, BEGIN, moment, present)
 
     def following(
@@ -148,9 +165,10 @@ class TaskPlanner:
         else:
             contact = self._task.contacts[place]
         if contact != was:
-            old, present = present, self._met(now, contact, moment)
+            (measured,) = self._forces.evaluate(now.state, now.forces, now.parameters)
+            old, present = present, self._met(now, contact, measured)
             for i, first in enumerate(self._laws[contact].layout.lowest):
-                if i != self._place:
+                if i not in self._contact.places:
                     size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
                     present[first : first + size] = old[start : start + size]
         return self._started(now, place, name, contact, cause, moment, present)
@@ -186,17 +204,18 @@ class TaskPlanner:
             change, law.layout, goals.function, goals.named, rate, present, over, origin
         )
 
-    def _met(self, now: ModelMoment, contact: bool, moment: Moment) -> FloatArray:
+    def _met(self, now: ModelMoment, contact: bool, measured: FloatArray) -> FloatArray:
         """R of a law from the current outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        A force of degree 0 is the measured one.
+        Forces of degree 0 are the measured ones.
         """
         law = self._laws[contact]
         reference = np.zeros(law.layout.reference_size)
         coordinates = law.error_coordinates(now.state, reference, now.parameters)
         reference[law.layout.chained] = np.delete(coordinates, _integral_places(law))
-        if contact and law.degrees[self._place] == 0:
-            reference[law.layout.lowest[self._place]] = moment.force
+        for place in self._contact.places if contact else ():
+            if law.degrees[place] == 0:
+                reference[law.layout.lowest[place]] = measured[place]
         return reference
 
     def _name(self, place: int) -> str:
@@ -214,17 +233,29 @@ def _integral_places(law: TrackingLaw) -> list[int]:
     return places
 
 
-def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> PhaseReferences:
-    """The references of a phase."""
+def _goals(
+    task: Task, index: int, law: TrackingLaw, contact: OpeningContact, closed: bool
+) -> PhaseReferences:
+    """The references of a phase.
+
+    With a goal for the force of a face, its moments without goals go to zero; with one for the
+    first of its distances, the others go to the same.
+    """
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
     assignments, degrees = [], law.degrees
-    for name, reference in phase.goals(names[place]).items():
+    for name, reference in phase.goals(names[contact.main]).items():
         try:
             assignments.append(assigned(name, reference, names, degrees))
         except ReferenceSignalError as error:
             raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
     named = tuple(i for assignment in assignments for i in assignment.places)
+    for assignment in [a for a in assignments if list(a.places) == [contact.main]]:
+        for place in contact.others:
+            if place not in named:
+                reference = ConstantReference(0.0) if closed else assignment.reference
+                assignments.append(assigned(names[place], reference, names, degrees))
+                named += (place,)
     rest = [name for i, name in enumerate(names) if i not in named]
     assignments += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
@@ -235,11 +266,13 @@ def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> PhaseReferen
         raise ModelError(f"{task.plan.where(index)}: {error}") from error
 
 
-def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
-    """The final rates of the outputs of a phase, shape (p,)."""
+def _rates(
+    task: Task, index: int, law: TrackingLaw, contact: OpeningContact, closed: bool
+) -> FloatArray:
+    """The final rates of the outputs of a phase, shape (p,); those of all distances are equal."""
     signals, rates = law.system.output_signals, np.zeros(len(law.degrees))
     names = [signal.name for signal in signals]
-    for name, rate in task.plan.phases[index].rates(names[place]).items():
+    for name, rate in task.plan.phases[index].rates(names[contact.main]).items():
         if name not in names:
             text = unknown_name("output", name, names)
             raise ModelError(f"{task.plan.where(index)}: direction: {text}")
@@ -250,6 +283,8 @@ def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
                 "along outputs in m"
             )
         rates[names.index(name)] = rate
+    if not closed:
+        rates[contact.others] = rates[contact.main]
     return rates
 
 

@@ -11,6 +11,7 @@ from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.fade import fade
+from drake_dae.systems.task.open_contact import OpeningContact
 
 DONE, HELD = "done", "held"
 """Names in a record for the time after the last phase, and after a task that ended otherwise."""
@@ -81,17 +82,18 @@ class ReferenceSegment:
             reference += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
         return reference
 
-    def desired(self, place: int, time: float) -> FloatArray:
-        """The desired positions, force and distance at a time in s, shape (p + 1,).
+    def desired(self, contact: OpeningContact, time: float) -> FloatArray:
+        """The desired positions, forces and distances at a time in s, shape (p + k,).
 
         Args:
-            place: The index of the output that is the force in contact, and otherwise the distance.
+            contact: The contact, of k points.
             time: The time, in s.
         """
-        outputs = np.append(self.reference(time)[self.layout.lowest], 0.0)
+        outputs, places = self.reference(time)[self.layout.lowest], list(contact.places)
+        distances = np.zeros(contact.size)
         if not self.change.in_contact:
-            outputs[-1], outputs[place] = outputs[place], 0.0
-        return outputs
+            distances, outputs[places] = outputs[places], 0.0
+        return np.append(outputs, distances)
 
     def _goal(self, passed: float) -> FloatArray:
         reference = self.goal(passed).copy()

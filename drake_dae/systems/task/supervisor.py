@@ -1,5 +1,6 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
+import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -21,12 +22,14 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, Update, zero
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.task.decision import PhaseDecision
+from drake_dae.systems.task.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import CONTACT, FREE, ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, FORCE_FILTER, TracedTask
+from drake_dae.systems.task.traced import EARLY, TracedTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -42,8 +45,8 @@ class TaskSupervisor(LeafSystem):
     Output ports:
         contact_reference, free_reference: R of the active law; zero for the other one.
         phase: The index of the phase, shape (1,); the number of phases when the task is over.
-        desired_output: The desired positions, force and distance, shape (p + 1,). In contact the
-            distance is zero, otherwise the force.
+        desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
+            of k points. In contact the distances are zero, otherwise the forces.
         in_contact: 1 while the law in contact is active, shape (1,).
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
             while the other law is active, while no force is measured, just after a touch, and while
@@ -54,9 +57,8 @@ class TaskSupervisor(LeafSystem):
     Args:
         task: The phases.
         laws: The law of the free robot and the law in contact.
-        place: The index of the output that is the distance of the first and the force of the
-            second.
-        force: The index of the contact's force in `measured_force`.
+        contact: The contact that opens and closes.
+        num_forces: The number of all measured forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
 
     Attributes:
@@ -69,17 +71,16 @@ class TaskSupervisor(LeafSystem):
         self,
         task: Task,
         laws: tuple[TrackingLaw, TrackingLaw],
-        place: int,
-        force: int,
+        contact: OpeningContact,
         num_forces: int,
         sample_period: float,
     ) -> None:
         super().__init__()
         self.set_name("task")
         self._sample_period = sample_period
-        self.task, self._laws, self._place, self._force = task, laws, place, force
-        self._phases, self._plan = task.plan.phases, TaskPlanner(task, laws, place)
-        self._traced = TracedTask(task, laws, place, force, self._plan, num_forces, sample_period)
+        self.task, self._laws, self._contact = task, laws, contact
+        self._phases, self._plan = task.plan.phases, TaskPlanner(task, laws, contact)
+        self._traced = TracedTask(task, laws, contact, self._plan, num_forces, sample_period)
         system = laws[FREE].system
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
@@ -122,7 +123,7 @@ class TaskSupervisor(LeafSystem):
         for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
             size = self._laws[which].layout.reference_size
             self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
-        size = self._laws[FREE].system.num_outputs + 1
+        size = self._laws[FREE].system.num_outputs + self._contact.size
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
         for name, attribute in (("phase", "place"), ("in_contact", "in_contact")):
             calc = weakly(self._calc_change, attribute)
@@ -146,8 +147,12 @@ class TaskSupervisor(LeafSystem):
         return self._witnesses
 
     def _now(self, context: Context) -> ModelMoment:
-        parameters = context.get_numeric_parameter(0).CopyToVector()
-        return ModelMoment(context.get_time(), self._state_port.Eval(context), parameters)
+        parameters, forces = context.get_numeric_parameter(0).CopyToVector(), np.zeros(0)
+        if self.progress(context).segments:
+            forces = self._force_port.Eval(context).copy()
+            forces[list(self._contact.forces)] = self._filtered(context)[: self._contact.size]
+        time, state = context.get_time(), self._state_port.Eval(context)
+        return ModelMoment(time, state, parameters, forces)
 
     def _segment(self, context: Context) -> ReferenceSegment:
         """The current references."""
@@ -159,7 +164,12 @@ class TaskSupervisor(LeafSystem):
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
         time, change = context.get_time(), segment.change
         distance, rate, moved, rates = self._plan.motion(self._now(context))
-        desired = segment.reference(time)[segment.layout.lowest[self._place]]
+        contact, lowest = self._contact, segment.layout.lowest
+        wanted = [contact.main] if change.in_contact else list(contact.places)
+        desired = np.mean(segment.reference(time)[lowest[wanted]])
+        forces, off_center = self._filtered(context)[: contact.size], 0.0
+        if self.task.watches("eccentricity"):
+            off_center = float(eccentricity(ca.DM(forces), self.task.contact_force))
         port, signal = self._control_port, 0.0
         control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
@@ -168,7 +178,7 @@ class TaskSupervisor(LeafSystem):
                 signal = float(self.signal_ports[name].Eval(context)[0])
         return Moment(
             time=time - change.time,
-            force=float(self._filtered(context)[0]),
+            force=float(np.sum(forces)),
             distance=distance,
             rate=rate,
             wanted=float(desired),
@@ -177,13 +187,15 @@ class TaskSupervisor(LeafSystem):
             travel=float(np.linalg.norm(moved - segment.origin)),
             work=self._traced.work_of(context.get_discrete_state(self._held).value()),
             control=control,
+            eccentricity=off_center,
             signal=signal,
         )
 
     def _filtered(self, context: Context) -> FloatArray:
-        """The state of the force filter after the present sample; see `FORCE_FILTER`."""
+        """The state of the force filter after the present sample; see `TracedTask`."""
         held = context.get_discrete_state(self._held).value()
-        return self._traced.filtered(held, float(self._force_port.Eval(context)[self._force]))
+        measured = self._force_port.Eval(context)[list(self._contact.forces)]
+        return self._traced.filtered(held, measured)
 
     def _decision(self, context: Context, progress: TaskProgress) -> PhaseDecision:
         task, segment = self.task, progress.segments[-1]
@@ -231,7 +243,7 @@ class TaskSupervisor(LeafSystem):
                 self._state_port.Eval(context).copy(),
             )
         progress = TaskProgress((self._segment(context),), time - self._sample_period, time)
-        zeros = np.zeros(len(FORCE_FILTER)), np.zeros(self._traced.tally.size)
+        zeros = np.zeros(self._traced.filter_size), np.zeros(self._traced.tally.size)
         self._put(state, progress, *zeros)
         return EventStatus.Succeeded()
 
@@ -302,14 +314,14 @@ class TaskSupervisor(LeafSystem):
 
     def _calc_desired(self, context: Context, output: BasicVector) -> None:
         segment = self._segment(context)
-        output.SetFromVector(segment.desired(self._place, context.get_time()))
+        output.SetFromVector(segment.desired(self._contact, context.get_time()))
 
     def _calc_change(self, attribute: str, context: Context, output: BasicVector) -> None:
         output.SetFromVector([float(getattr(self._segment(context).change, attribute))])
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
-        force[self._force] -= self._filtered(context)[1]
+        force[list(self._contact.forces)] -= self._traced.bias(self._filtered(context))
         output.SetFromVector(force)
 
     def _holds(self, context: Context) -> bool:
@@ -324,7 +336,8 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        is_open = not begin.in_contact or self._filtered(context)[0] < self.task.contact_force
+        force = float(np.sum(self._filtered(context)[: self._contact.size]))
+        is_open = not begin.in_contact or force < self.task.contact_force
         # The force of an impact is no error to be integrated.
         settles = (
             self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over

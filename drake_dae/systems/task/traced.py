@@ -21,16 +21,14 @@ from drake_dae.systems.blocks.traced import (
 )
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
+from drake_dae.systems.task.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment, Phase
+from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.tally import GuardMemory
 from drake_dae.systems.task.planner import CONTACT, FREE, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
-
-FORCE_FILTER = ("force", "bias", "count")
-"""The state of the force filter: the force after the low-pass, the mean of the samples before the
-first touch, and the number of these samples."""
 
 NAMES = (
     "place",
@@ -41,9 +39,9 @@ NAMES = (
     "felt",
     "is_felt",
     "distance",
-    *FORCE_FILTER,
 )
-"""The first numbers of a task in a context; base, rate and fade of its current segment follow."""
+"""The first numbers of a task in a context; the force filter, then base, rate and fade of its
+current segment follow."""
 
 EARLY = 1e-12
 """A margin below this has ended, so that margins with different round-off end together."""
@@ -53,13 +51,16 @@ class TracedTask:
     """The functions of a `TaskSupervisor` of the numbers of its current segment.
 
     Args:
-        task, laws, place, force: Those of the supervisor.
+        task, laws, contact: Those of the supervisor.
         plan: The planner of its references.
         num_forces: The number of measured constraint forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
 
     Attributes:
         size: The number of these numbers.
+        filter_size: The number of those of the force filter: for each point of the contact the
+            force after the low-pass, then the mean of the samples before the first touch; then the
+            number of these samples.
         tally: The counts for the guards.
     """
 
@@ -67,61 +68,66 @@ class TracedTask:
         self,
         task: Task,
         laws: tuple[TrackingLaw, TrackingLaw],
-        place: int,
-        force: int,
+        contact: OpeningContact,
         plan: TaskPlanner,
         num_forces: int,
         sample_period: float,
     ) -> None:
-        self._task, self._laws, self._place, self._plan = task, laws, place, plan
+        self._task, self._laws, self._contact, self._plan = task, laws, contact, plan
         self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
         self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
-        sizes = [len(NAMES), count, count, rows * self._shape[1], plan.moved, self.tally.size]
+        self.filter_size = 2 * contact.size + 1
+        sizes = [len(NAMES), self.filter_size, count, count, rows * self._shape[1], plan.moved]
+        sizes.append(self.tally.size)
         ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
         self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
         self._tallied = slice(ends[-2], ends[-1])
-        self._base, self._rate, fade, self._origin, self._counts = (
+        before, self._base, self._rate, fade, self._origin, self._counts = (
             self._held[a:b] for a, b in pairwise(ends)
         )
         self._faded = ca.reshape(fade, *self._shape)
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
-        self._force_index = force
-        self._filter_places = [NAMES.index(name) for name in FORCE_FILTER]
-        before = self._held[self._filter_places]
-        self._filtered = self._filter(before, self._forces[force])
-        self._force, self._bias = self._filtered[0], self._filtered[1]
-        measured = [before, self._forces[force]]
-        self._filter_function = ca.Function("filter", measured, [self._filtered])
+        self._filter_places = slice(ends[0], ends[1])
+        measured = self._forces[list(contact.forces)]
+        self._filtered = self._filter(before, measured)
+        self._each = self._filtered[: contact.size]
+        self._force, self._count = ca.sum1(self._each), before[-1]
+        self._filter_function = ca.Function("filter", [before, measured], [self._filtered])
 
     def _filter(self, before: ca.SX, measured: ca.SX) -> ca.SX:
         """The state of the force filter after one more sample."""
-        force, bias, count = ca.vertsplit(before)
+        size = self._contact.size
+        force, bias, count = before[:size], before[size : 2 * size], before[-1]
         if self._tares:
             waits = count < self._tares - 0.5
             count = ca.if_else(waits, count + 1, count)
             bias = ca.if_else(waits, bias + (measured - bias) / count, bias)
-            unbiased = ca.if_else(waits, 0, measured - bias)
+            unbiased = ca.if_else(waits, ca.SX.zeros(size), measured - bias)
         else:
             unbiased = measured
         return ca.vertcat(force + self._task.force_gain * (unbiased - force), bias, count)
 
-    def filtered(self, held: FloatArray, measured: float) -> FloatArray:
-        """The state of the force filter after a sample; see `FORCE_FILTER`.
+    def filtered(self, held: FloatArray, measured: FloatArray) -> FloatArray:
+        """The state of the force filter after a sample, shape (filter_size,).
 
         Args:
             held: The numbers before it, shape (size,).
-            measured: The force of the contact, in N.
+            measured: The forces of the contact, in N, one for each of its points.
         """
         return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
 
+    def bias(self, filtered: FloatArray) -> FloatArray:
+        """The bias of the forces of the contact, in N, from the state of the force filter."""
+        return filtered[self._contact.size : -1]
+
     def tares(self, held: FloatArray) -> bool:
         """Whether the bias of the force is still being estimated."""
-        return bool(held[NAMES.index("count")] < self._tares - 0.5)
+        return bool(held[self._filter_places][-1] < self._tares - 0.5)
 
     def tally_of(self, held: FloatArray) -> FloatArray:
         """The counts for the guards; see `GuardMemory`."""
@@ -189,14 +195,15 @@ class TracedTask:
     def computations(self) -> tuple[Computation, ...]:
         """The computations of all vector output ports."""
         computations = []
-        desired = ca.SX.zeros(len(self._laws[FREE].degrees) + 1)
+        own, size = list(self._contact.places), self._contact.size
+        desired = ca.SX.zeros(len(self._laws[FREE].degrees) + size)
         for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
             row = self._reference(which)
             function = TracedFunction(name, {"time": self._time, "held": self._held}, {"R": row})
             computations.append(Computation.of(function, (TIME, HELD), (name,)))
-            values = ca.vertcat(row[self._laws[which].layout.lowest.tolist()], 0)
+            values = ca.vertcat(row[self._laws[which].layout.lowest.tolist()], ca.SX.zeros(size))
             if which == FREE:
-                values[-1], values[self._place] = values[self._place], 0
+                values[-size:], values[own] = values[own], ca.SX.zeros(size)
             desired += values
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
@@ -213,7 +220,7 @@ class TracedTask:
         computations.append(Computation(holds, sources, ("contact_hold",)))
         if self._tares:
             tared = ca.SX(self._forces)
-            tared[self._force_index] -= self._bias
+            tared[list(self._contact.forces)] -= self._filtered[size : 2 * size]
             function = ca.Function("tared", [self._held, self._forces], [tared])
             computations.append(Computation(function, (HELD, "measured_force"), ("tared_force",)))
         return tuple(computations)
@@ -243,9 +250,10 @@ class TracedTask:
         x, parameters = law.system.state, law.system.parameter_symbol
         motion = self._plan.motion_function.function.call([x, parameters])[0]
         first, rates = motion[2 : 2 + moved], motion[2 + moved :]
-        lowest = [
-            self._reference(which)[int(law.layout.lowest[self._place])]
-            for which, law in ((FREE, self._laws[FREE]), (CONTACT, self._laws[CONTACT]))
+        contact = self._contact
+        distances = self._reference(FREE)[law.layout.lowest[list(contact.places)].tolist()]
+        force = self._reference(CONTACT)[
+            int(self._laws[CONTACT].layout.lowest[contact.main])
         ]
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
@@ -257,12 +265,13 @@ class TracedTask:
             self._force,
             motion[0],
             motion[1],
-            lowest[0] + lowest[1],
+            ca.sum1(distances) / contact.size + force,
             motion[0] - named["distance"],
             speed=ca.norm_2(rates),
             travel=ca.norm_2(first - self._origin),
             work=self.tally.work(self._counted()),
             control=control,
+            eccentricity=eccentricity(self._each, self._task.contact_force),
         )
         return moment, inputs, tuple(sources)
 
@@ -275,7 +284,7 @@ class TracedTask:
         named, task = self._named, self._task
         moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
-        counts, tares = self._counted(), named["count"] < self._tares - 0.5
+        counts, tares = self._counted(), self._count < self._tares - 0.5
         excess = self._force - task.contact_force
 
         waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)

@@ -3,13 +3,23 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import casadi as ca
+
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 
-Watched = Literal["force", "time", "work", "control", "speed", "travel"]
+Watched = Literal["force", "time", "work", "control", "speed", "travel", "eccentricity"]
 
-UNITS = {"force": "N", "time": "s", "work": "J", "control": "", "speed": "m/s", "travel": "m"}
+UNITS = {
+    "force": "N",
+    "time": "s",
+    "work": "J",
+    "control": "",
+    "speed": "m/s",
+    "travel": "m",
+    "eccentricity": "",
+}
 """Watched quantity -> its unit; a control has its own."""
 
 
@@ -25,11 +35,15 @@ class PhaseGuard:
     - travel: the norm of the change of these outputs since the phase began, in m;
     - work: the integral of F ds since the phase began, with the contact force F and the path s of
       the tool, in J, as a sum over samples;
-    - control: the largest |u|, in its unit, N m for joints.
+    - control: the largest |u|, in its unit, N m for joints;
+    - eccentricity: of a face of k points 1 - k min lambda_i / sum lambda_i, which is 0 where all
+      forces are equal, and 1 where a point has no force: then the center of pressure is on an edge
+      of the face, and it tips.
 
     Attributes:
-        of: The watched quantity: "force", "time", "work", "control", "speed" or "travel".
-        most: The limit, in N, s, J, m/s or m, or in the unit of the control.
+        of: The watched quantity: "force", "time", "work", "control", "speed", "travel" or
+            "eccentricity".
+        most: The limit, in N, s, J, m/s or m, in the unit of the control, or a pure number.
         samples: The number of consecutive samples at or above the limit, so that noise does not
             count; more than one only in a sampled task.
 
@@ -51,3 +65,17 @@ class PhaseGuard:
         unit = f" {UNITS[self.of]}".rstrip()
         over = f", in {self.samples} samples" if self.samples > 1 else ""
         return f"a {self.of} of {value:.4g}{unit}, where its guard has {self.most:g}{unit}{over}"
+
+
+def eccentricity(forces: ca.SX, contact_force: float) -> ca.SX:
+    """The distance of the center of pressure from the center of the points of a face.
+
+    1 where it is on an edge of the triangle of three points, and one of them has no force:
+    1 - k min_i lambda_i / sum_i lambda_i. It is 0 where the force is below contact_force.
+
+    Args:
+        forces: lambda, in N, shape (k, 1).
+        contact_force: As of a `Task`.
+    """
+    count, total = forces.numel(), ca.sum1(forces)
+    return ca.if_else(total < contact_force, 0, 1 - count * ca.mmin(forces) / total)

@@ -35,13 +35,13 @@ class Moment:
 
     Attributes:
         time: The time since the phase began, in s.
-        force: The measured force of the contact, in N.
-        distance: The distance from the surface by the law's model, in m.
+        force: The measured force of the contact, in N; of a face the sum over its points.
+        distance: The distance from the surface by the law's model, in m; of a face the mean.
         rate: Its derivative, in m/s.
         wanted: The reference of the force (in contact), in N, or of the distance, in m.
         away: The increase of the distance since the phase began, in m.
-        speed, travel, work, control: See `PhaseGuard`; work and control only if a guard watches
-            them.
+        speed, travel, work, control, eccentricity: See `PhaseGuard`; work and control only if a
+            guard watches them.
         signal: The signal that the phase waits for; 0 without one.
     """
 
@@ -55,6 +55,7 @@ class Moment:
     travel: float = 0.0
     work: float = 0.0
     control: float = 0.0
+    eccentricity: float = 0.0
     signal: float = 0.0
 
 
@@ -141,7 +142,9 @@ class Phase(ABC):
         """Output name -> its reference, whose time starts with the phase.
 
         Args:
-            contact_output: The name of the force, or of the distance if the robot is free.
+            contact_output: The name of the force, or of the distance if the robot is free. With a
+                goal for the force of a face, its moments without goals go to zero; with a goal for
+                this one of its distances, the others go to the same.
         """
         return {}
 
