@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from runs import scenario
 
-from drake_dae import CsvReference, HeightMap, MeshSurface, Record, load_scenario
+from drake_dae import CsvReference, HeightMap, MeshSurface, Record, load_scenario, new_scenario
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
@@ -31,6 +31,7 @@ READERS = {
     "a mesh": ("obj", MeshSurface),
     "another mesh": ("stl", MeshSurface),
     "a scenario": ("yaml", load_scenario),
+    "a robot": ("urdf", lambda file: new_scenario(str(file))),
     "a record": ("npz", Record.load),
     "a record of a run that was killed": ("part", Record.load),
 }

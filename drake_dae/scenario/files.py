@@ -43,7 +43,8 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     Args:
         path: The file, or the name of a shipped scenario such as "two_link_wall".
         settings: Changes "key=value" with dotted keys, for example "integrator.accuracy=1e-8" or
-            "constraints.0.surface.point=[0.7, 0, 0]".
+            "constraints.0.surface.point=[0.7, 0, 0]". Relative file names are in the folder of the
+            scenario; for a shipped one, which names no such files, in the working directory.
 
     Raises:
         ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
@@ -64,17 +65,22 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
     for setting in settings:
         set_entry(data, setting, scenario_reader().free_names)
-    scenario = scenario_reader().read(data, path.absolute().parent)
+    is_shipped = path in shipped_scenarios().values()
+    try:
+        folder = Path().absolute() if is_shipped else path.absolute().parent
+    except OSError as error:
+        raise ScenarioError(("", f"the working directory is gone: {error}")) from None
+    scenario = scenario_reader().read(data, folder)
     # Absolute, so that the scenario as run can be written anywhere.
     robot = scenario.robot
     file = robot.file
     try:
-        here = path.resolve().parent
+        here = folder.resolve()
         if file and not file.startswith("package://"):
             file = str((here / file).resolve())
         packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
     except (OSError, RuntimeError, ValueError) as error:
-        # The working directory is gone; a link that leads to itself; a null byte.
+        # A link that leads to itself; a null byte.
         raise ScenarioError(("robot", f"no path: {error}")) from None
 
     def located(value: Any) -> Any:

@@ -104,7 +104,7 @@ def _grid(figures: Mapping[str, FloatArray]) -> tuple[Figure, list[Axes]]:
     axes = []
     for index, name in enumerate(figures):
         axis = figure.add_subplot(rows, columns, index + 1)
-        axis.set_title(_text(name), fontsize=9)
+        axis.set_title(_text(name), fontsize=9, pad=14)  # Above the factor of the ticks.
         axis.tick_params(labelsize=8)
         axes.append(axis)
     return figure, axes

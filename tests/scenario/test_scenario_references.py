@@ -107,9 +107,9 @@ def refusal(form):
         ),
         ("!Waypoints {points: [[0], [1]]}", ": waypoints take either times, or limits"),
         ("!Waypoints {points: [[0], [1]], times: [0, 0]}", ": times must increase from 0 or later"),
-        ("!Csv {file: none.csv, columns: [z]}", "scenarios/none.csv': No such file"),
+        ("!Csv {file: none.csv, columns: [z]}", "/none.csv': No such file"),
         ("!Csv {file: 'a\0b', columns: [z]}", ""),
-        ("!Csv {file: biped.yaml, columns: [z]}", "no column 'time'; "),
+        (f"!Csv {{file: {find_scenario('biped')}, columns: [z]}}", "no column 'time'; "),
         ("!Csv {file: a.csv, columns: z}", ".columns: expected a list, got 'z'"),
         (f"!Text {{text: é, origin: [0, 0], height: 1, {GENTLE}}}", ": text: no letter 'É'; there"),
         (
@@ -166,3 +166,19 @@ def test_the_writing_arm_writes_a_letter_with_the_given_force():
     side = np.where(np.abs(z - 0.075) < 0.025, np.abs(y - 0.1), np.abs(y - np.minimum(top, slope)))
     assert np.count_nonzero(drawn) > 40
     assert np.minimum(side, np.abs(z)).max() < 3e-3
+
+
+def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "path.csv").write_text("time,y\n0,0\n1,0.1\n2,0\n")
+    monkeypatch.chdir(tmp_path)
+    chosen = scenario("two_link_wall", "references={tool.y: !Csv {file: path.csv, columns: [y]}}")
+    assert chosen.references["tool.y"].table.shape == (3, 2)
+
+
+def test_a_reference_along_a_surface_names_the_output_that_is_missing():
+    chosen = scenario("seven_joint_pipe", "outputs.0=!PointCoordinates {frame: tool, axes: yz}")
+    remedy = r"no output 'pipe\.angle'.*add !SurfaceCoordinates \{constraint: pipe\} to outputs"
+    with pytest.raises(ScenarioError, match=remedy):
+        build_scenario(chosen)

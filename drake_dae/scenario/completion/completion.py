@@ -69,6 +69,9 @@ def complete(
     """
     bound = ConstraintSet([*constraints, *of_plant])
     outputs = [make(form, constraints) for form in scenario.outputs]
+    _check_coordinates(
+        scenario, bound, [s.name for output in outputs for s in output.signals(links)]
+    )
     size = sum(len(output.signals(links)) for output in outputs)
     steered = force_outputs(scenario.forces, bound)
     names = [signal.name for output in steered for signal in output.signals(bound)]
@@ -108,6 +111,20 @@ def complete(
         return _with_start(scenario, referred, postures, guess)
     every = [signal.name for signal in bound.force_signals]
     return _with_outputs(scenario, referred, postures, guess, every)
+
+
+def _check_coordinates(scenario: Scenario, bound: ConstraintSet, outputs: Sequence[str]) -> None:
+    """Refuses references to coordinates along a constraint that are not outputs."""
+    for constraint in bound.constraints:
+        for signal in constraint.coordinate_signals:
+            for key in scenario.references:
+                if signal.name in map(str.strip, key.split(",")) and signal.name not in outputs:
+                    text = (
+                        f"no output '{signal.name}'; it is a coordinate along the constraint "
+                        f"{constraint.name}: add !SurfaceCoordinates {{constraint: "
+                        f"{constraint.name}}} to outputs"
+                    )
+                    raise ScenarioError((f"references.{key}", text))
 
 
 def _with_start(

@@ -1,5 +1,6 @@
 """Makes a scenario for a robot from nothing but its file."""
 
+import os
 import warnings
 from dataclasses import replace
 from itertools import product
@@ -71,7 +72,7 @@ def new_scenario(
             message lists the places that were tried.
     """
     is_url = file.startswith("package://")
-    robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
+    robot = new_robot(file if is_url or not file else os.path.realpath(file), tip, point)
     links, _ = robot_links(robot.robot, SceneGraph())
     tried: list[str] = []
     usable: tuple[Scenario, NewTask, Feasibility] | None = None
@@ -90,7 +91,7 @@ def new_scenario(
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
-            return whole, scenario_text(whole, robot, task, Path(folder).resolve())
+            return whole, scenario_text(whole, robot, task, Path(os.path.realpath(folder)))
         x, y, z = task.center
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
@@ -100,7 +101,7 @@ def new_scenario(
         if report.wrong_sides:
             remarks["constraints"] = "; ".join(map(str, report.behind))
         robot = replace(robot, remarks={**robot.remarks, **remarks})
-        return whole, scenario_text(whole, robot, task, Path(folder).resolve())
+        return whole, scenario_text(whole, robot, task, Path(os.path.realpath(folder)))
     text = (
         f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
         + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
