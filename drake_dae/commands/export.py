@@ -7,7 +7,7 @@ from pathlib import Path
 from pydrake.systems.framework import Context
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ModelError
 from drake_dae.running.export.export import export_code
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.steps.controller import export_controller
@@ -23,9 +23,6 @@ def run_command(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     loop, context = build_scenario(scenario)
-    if loop.generator is None:
-        text = "exports support only `references`; `drake-dae simulate` runs a task"
-        raise ScenarioError(("task", text))
     folder = options.out or Path(
         f"{path.stem}_{'c99' if options.format == 'c' else options.format}"
     )
@@ -45,9 +42,12 @@ def run_command(options: argparse.Namespace) -> int:
 def _write_c(
     scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
 ) -> Export:
+    run = scenario.integrator, scenario.duration
+    if scenario.task is not None:
+        files = export_controller(loop, context, name, folder, *run)
+        return Export(files, ["functions of law and plant: a task has two laws"])
     files, missing = export_code(loop, context, name, folder), _left_out(scenario, loop)
     try:
-        run = scenario.integrator, scenario.duration
         files += export_controller(loop, context, name, folder, *run)
     except ModelError as error:
         missing.append(f"the whole controller as one step: {error}")

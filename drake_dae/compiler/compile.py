@@ -65,8 +65,9 @@ def compile_part(
     """Compiles the part of a diagram between some output ports and others.
 
     Systems upstream of the inputs are ignored, so they need not be traceable (for example a
-    MultibodyPlant with Drake's contact). The inputs are the last entries of the parameters; see
-    `CompiledDiagram.inputs`. Raises as `compile_diagram` does.
+    MultibodyPlant with Drake's contact). Phases of a sampled task change by updates. The inputs are
+    the last entries of the parameters; see `CompiledDiagram.inputs`. Raises as `compile_diagram`
+    does.
 
     Args:
         diagram: The diagram.
@@ -78,7 +79,7 @@ def compile_part(
         {name: leaf_port(port) for name, port in inputs.items()},
         {name: leaf_port(port) for name, port in outputs.items()},
     )
-    return _compiled(wires, list(outputs), context)
+    return _compiled(wires, list(outputs), context, reacts=True)
 
 
 def compile_open(
@@ -129,6 +130,7 @@ def _compiled(
     context: Context | None,
     twins: Mapping[System, System] | None = None,
     is_short: bool = False,
+    reacts: bool = False,
 ) -> CompiledDiagram:
     if outputs is None:
         outputs = [
@@ -140,7 +142,7 @@ def _compiled(
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
     context = context or wires.diagram.CreateDefaultContext()
-    expressions = Expressions(wires, context, twins or {}, is_short)
+    expressions = Expressions(wires, context, twins or {}, is_short, reacts)
     ports = [wires.outputs[name] for name in outputs]
     for system in wires.systems:
         # A block that ends runs counts, though no output depends on it; not in a part of a diagram.

@@ -142,7 +142,10 @@ class CompiledDiagram:
         return scales
 
     def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
-        """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,)."""
+        """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,).
+
+        The discrete state of a block with `Block.begins` is NaN.
+        """
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
             local = system.GetMyContextFromRoot(context)
@@ -150,6 +153,8 @@ class CompiledDiagram:
         for system, part in self.held:
             local, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
             held[part] = stepped.held(local) if stepped else np.concatenate(discrete_states(local))
+            if self.blocks[system].begins:
+                held[part] = np.nan
         return state, held
 
     def set_context(
@@ -201,7 +206,11 @@ class CompiledDiagram:
         initial = self.blocks[system].initial
         assert initial is not None
         call = self._expressions.call(self.blocks[system], initial)
-        return call.results[initial.outputs.index(HELD)]
+        value = call.results[initial.outputs.index(HELD)]
+        for other, part in self.held:
+            if other is not system and self.blocks[other].begins:
+                value = ca.substitute(value, self._columns["held"][part], self._initial_held(other))
+        return value
 
     def initialization(self, held: FloatArray) -> ca.Function | None:
         """(time, state, held, parameters) -> the discrete state at the start of a run.

@@ -1,7 +1,7 @@
 """The CasADi expressions of a diagram: the functions of its blocks, with connected arguments."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 from pydrake.systems.framework import Context, PortDataType, System
@@ -68,6 +68,7 @@ class Expressions:
             parameters. Both then use the controller's symbols.
         is_short: Whether the derivative of such a plant is computed by `Block.under` of its
             controller, where the controller is connected directly to the plant.
+        reacts: Whether updates make the changes of a `Guard`, where it has a `Reaction`.
 
     Attributes:
         time: The time in s.
@@ -88,7 +89,9 @@ class Expressions:
         context: Context,
         twins: Mapping[System, System] | None = None,
         is_short: bool = False,
+        reacts: bool = False,
     ) -> None:
+        self._reacts = reacts
         self.time = ca.SX.sym("time")
         self.calls: list[TracedCall] = []
         self.used: dict[System, Block] = {}
@@ -109,7 +112,14 @@ class Expressions:
     def block(self, system: System) -> Block:
         """The block of a system: its computations and updates."""
         if system not in self.used:
-            self.used[system] = system.traced() if isinstance(system, Traced) else primitive(system)
+            block = system.traced() if isinstance(system, Traced) else primitive(system)
+            if self._reacts and block.guard is not None and block.guard.reaction is not None:
+                reaction = block.guard.reaction()
+                updates = (reaction.update,)
+                block = replace(
+                    block, updates=updates, initial=reaction.begin, begins=True, guard=None
+                )
+            self.used[system] = block
         return self.used[system]
 
     def port(self, port: Port) -> ca.SX:

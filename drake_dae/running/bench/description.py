@@ -91,16 +91,17 @@ def bench_of(
         controls, slowest, compared = controls_of_diagram(loop, context), USUAL_POLE, None
         outputs: list[dict[str, Any]] = [{"name": s.name, "unit": s.unit} for s in parts.signals]
         ports, plotted, notes = parts.ports, parts.outputs, [*notes, *parts.notes]
+        desired = ""
     else:
         scene = scene_of([loop.plant], loop.scene_graph, context)
         controls = controls_of(loop, context, scene.size)
         poles = loop.controller.law.gains.poles.real
         slowest = float(np.min(-poles)) if poles.size else USUAL_POLE
         compared, plotted = prediction(loop, controls.inputs), ["controlled_output"]
-        layout, signals = loop.controller.law.layout, loop.plant.dae.output_signals
+        signals, desired, places = loop.plant.dae.output_signals, *_desired(loop)
         outputs = [
-            {"name": s.name, "unit": s.unit, "lowest": int(k)}
-            for s, k in zip(signals, layout.lowest, strict=True)
+            {"name": s.name, "unit": s.unit, "desired": k}
+            for s, k in zip(signals, places, strict=True)
         ]
         names = [name for name in OF_LOOP if loop.diagram.HasOutputPort(name)]
         ports = {name: loop.diagram.GetOutputPort(name) for name in names}
@@ -119,7 +120,7 @@ def bench_of(
         "start": context.get_time(),
         "tick": TICK,
         "size": scene.size,
-        "compares": not isinstance(loop, Diagram),
+        "desired": desired,
         "outputs": outputs,
         "bodies": [{"name": name, "path": path} for name, path in scene.links],
         "constraints": [],
@@ -134,6 +135,7 @@ def bench_of(
         },
         "prediction": compared,
         "phases": _phase_inputs(loop, inputs),
+        "phase_names": [] if isinstance(loop, Diagram) else loop.controller.phase_names,
         "inputs": [
             {"name": name, "unit": unit, "value": value}
             for name, unit, value in zip(inputs.names, inputs.units, values.tolist(), strict=True)
@@ -144,6 +146,14 @@ def bench_of(
         for key, value in _robot_data(robot, controls, context).items():
             data[key] = data[key] or value if key == "opens" else data[key] + value
     return Bench(loop, context, scene, controls, ports, plotted, data)
+
+
+def _desired(loop: ClosedLoop) -> tuple[str, list[int]]:
+    """Returns the port with the desired values of the plant's outputs, and their places there."""
+    if loop.diagram.HasOutputPort("reference"):
+        return "reference", loop.controller.law.layout.lowest.tolist()
+    # A task desires distances, too, while its contact is open.
+    return "desired_output", list(range(loop.plant.dae.num_outputs))
 
 
 def _phase_inputs(loop: ClosedLoop | Diagram, inputs: Inputs) -> list[int | None]:

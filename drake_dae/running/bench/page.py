@@ -112,7 +112,8 @@ def page_text(
     else:
         if isinstance(loop.plant, Traced) and loop.plant.traced().stepped is not None:
             raise ModelError("the plant has Drake's own contact, which cannot be exported")
-        part = loop_part(loop, context, ["known_exogenous"] if loop.exogenous is not None else [])
+        names = [n for n in ("known_exogenous", "desired_output") if diagram.HasOutputPort(n)]
+        part = loop_part(loop, context, [name for name in names if name not in loop.signals])
     bench = bench_of(loop, context, title or title_of(loop), notes)
     with tempfile.TemporaryDirectory() as folder:
         written = write_integrated(part, LOOP, context, "page", folder, config)

@@ -95,6 +95,19 @@ class Projection:
 
 
 @dataclass(frozen=True, eq=False)
+class Reaction:
+    """The changes of a block as functions, for exports: no Python makes them there.
+
+    Attributes:
+        begin: The computation of HELD at the start of a run, which does not read HELD.
+        update: The update with all changes at its instant, in place of those of the block.
+    """
+
+    begin: Computation
+    update: Update
+
+
+@dataclass(frozen=True, eq=False)
 class Guard:
     """A change of a block's states at a time that a run must locate.
 
@@ -105,11 +118,13 @@ class Guard:
         react: (context, state) -> the status of Drake's event. It reads the block's context, and
             changes a copy of its state. It stores events for a record in the context.
         in_samples: Whether it is evaluated only at the updates of the block, in place of these.
+        reaction: Returns the changes as functions; None if only `react` knows them.
     """
 
     computation: Computation
     react: Callable[[Context, State], EventStatus]
     in_samples: bool = False
+    reaction: Callable[[], Reaction] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +175,7 @@ class Block:
         moving: The indices of its parameters that come through an input port "exogenous".
         guard: Its changes at times that a run must locate; None if there are none.
         stepped: The part that Drake steps; None if all of it is traced.
+        begins: Whether `initial` gives HELD at the start of each run, whatever the context has.
         draws: Whether its update uses new random numbers.
         model: The owner of its first parameters, such as a DaeSystem; None if no other block shares
             it.
@@ -183,6 +199,7 @@ class Block:
     moving: tuple[int, ...] = ()
     guard: Guard | None = None
     stepped: DrakeStepped | None = None
+    begins: bool = False
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None

@@ -68,7 +68,8 @@ class Controller(System):
        output ports with these in `observed`, and has the input port `acting_control` for what acts
        on the plant. None if they are those of the plant.
     9. Phases. `changes` are the times at which phases of a run began, with reasons, and
-       `phase_ends` the signals for which phases wait, "" for none; both empty without phases.
+       `phase_ends` the signals for which phases wait, "" for none, and `phase_names` the names of
+       the phases and of the rest after them; all are empty without phases.
     """
 
     __slots__ = ()
@@ -77,6 +78,7 @@ class Controller(System):
     shown: tuple[str, ...] = ()
     refused: Mapping[str, str] = {}
     phase_ends: tuple[str, ...] = ()
+    phase_names: tuple[str, ...] = ()
     follows: bool = False
     takes_over: bool = False
     exogenous_layout: DerivativeLayout = DerivativeLayout(())

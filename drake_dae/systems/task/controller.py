@@ -17,6 +17,7 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.switch import LawSwitch
 from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
@@ -26,7 +27,6 @@ from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
-from drake_dae.systems.task.switch import LawSwitch
 from drake_dae.systems.task.task import Task, check_sampled
 from drake_dae.trace.functions import TracedFunction
 
@@ -77,6 +77,7 @@ class TaskController(Diagram, Controller):
     Output ports:
         control: u, shape (p,).
         phase: The index of the phase in the task, shape (1,); after the last one their number.
+        ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
             of k points. In contact the distances are zero, otherwise the forces.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
@@ -107,7 +108,7 @@ class TaskController(Diagram, Controller):
     """
 
     __slots__ = SHARED_DICTIONARY
-    takes_over, shown, refused = True, ("desired_output",), _REFUSED
+    takes_over, shown, refused = True, ("desired_output", "ending"), _REFUSED
 
     def __init__(
         self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 0.0
@@ -116,6 +117,7 @@ class TaskController(Diagram, Controller):
         check_sampled(task, sample_period)
         self.task, self.law, self.free_law = task, law, free_law
         self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
+        self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
         self.contact = contact = opened_contact(law, free_law)
         if contact.size == 1 and task.watches("eccentricity"):
@@ -170,7 +172,7 @@ class TaskController(Diagram, Controller):
         builder.ExportOutput(control, "control")
         if task.watches("control"):
             builder.Connect(control, self.supervisor.GetInputPort("control"))
-        names = ["phase", "desired_output", "contact_reference"]
+        names = ["phase", "ending", "desired_output", "contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)

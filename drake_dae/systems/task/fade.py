@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from math import factorial
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ SMOOTH = 2
 """The least number of continuous derivatives of a fade, even if a law needs fewer."""
 
 
-def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
+def fade(offset: Any, degrees: Sequence[int], over: Any) -> list[list[Any]]:
     """Polynomials that begin with given values and derivatives, and end at rest at zero.
 
     For each output i with offsets d_0, ..., d_mu the one of degree 2 n + 1, n = max(mu, SMOOTH),
@@ -20,9 +21,9 @@ def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
         p^(k)(0) = d_k (0 for k > mu),    p^(k)(over) = 0,    k = 0, ..., n.
 
     Args:
-        offset: d, output-major as a reference, shape (sum (mu_i + 1),).
+        offset: d, output-major as a reference, shape (sum (mu_i + 1),), of numbers or expressions.
         degrees: mu_1, ..., mu_p.
-        over: Its duration, in s.
+        over: Its duration, in s, a number or an expression.
 
     Returns:
         Factors of 1, x, x^2, ... with x = t / over, one row for each entry of the reference.
@@ -31,15 +32,18 @@ def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
     rows, first = [], 0
     for mu in degrees:
         n = max(mu, SMOOTH)
-        start = np.zeros(n + 1)
-        start[: mu + 1] = offset[first : first + mu + 1] * over ** np.arange(mu + 1.0)
-        factors = np.zeros(width)
-        factors[: 2 * n + 2] = start @ _basis(n)
+        factors: list[Any] = [0.0] * width
         for k in range(mu + 1):
-            rows.append(factors / over**k)
-            factors = np.append(factors[1:] * np.arange(1.0, width), 0.0)
+            start = offset[first + k] * over**k
+            factors[: 2 * n + 2] = [
+                factor + start * part
+                for factor, part in zip(factors[: 2 * n + 2], _basis(n)[k].tolist(), strict=True)
+            ]
+        for k in range(mu + 1):
+            rows.append([factor / over**k for factor in factors])
+            factors = [factors[j] * j for j in range(1, width)] + [0.0]
         first += mu + 1
-    return np.array(rows)
+    return rows
 
 
 @cache

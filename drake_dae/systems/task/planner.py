@@ -83,10 +83,12 @@ class TaskPlanner:
 
     Attributes:
         goals: The references of each phase.
+        rates: The final rates of all outputs in each phase, shape (p,).
         motion_function: (x, parameters) -> the distance and its derivative by the model, then all
             outputs in m including the distance, then their derivatives. Of several distances it has
             the mean.
         moved: The number of these outputs.
+        forces_function: (x, v, parameters) -> all outputs of the system in contact.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -99,13 +101,11 @@ class TaskPlanner:
         self._phases = task.plan.phases
         pairs = list(enumerate(task.contacts[:-1]))
         self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
-        self._rates = [
-            _rates(task, index, laws[closed], contact, closed) for index, closed in pairs
-        ]
+        self.rates = [_rates(task, index, laws[closed], contact, closed) for index, closed in pairs]
         self._nothing = [_no_goals(law) for law in laws]
         free, closed = laws[FREE], laws[CONTACT].system
         force = ca.SX.sym("force", closed.num_constraints)
-        self._forces = closed.trace(
+        self.forces_function = closed.trace(
             "forces", {"value": closed.outputs(force)}, {"force": force}, often=False
         )
         chains = free.structure.output_chains
@@ -165,7 +165,7 @@ class TaskPlanner:
         else:
             contact = self._task.contacts[place]
         if contact != was:
-            (measured,) = self._forces.evaluate(now.state, now.forces, now.parameters)
+            (measured,) = self.forces_function.evaluate(now.state, now.forces, now.parameters)
             old, present = present, self._met(now, contact, measured)
             for i, first in enumerate(self._laws[contact].layout.lowest):
                 if i not in self._contact.places:
@@ -186,7 +186,7 @@ class TaskPlanner:
         law, phases = self._laws[contact], self._phases
         rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
         if place < len(phases):
-            over, goals, rate = phases[place].over, self.goals[place], self._rates[place]
+            over, goals, rate = phases[place].over, self.goals[place], self.rates[place]
         change = PhaseChange(
             time=float(now.time),
             phase=name,

@@ -72,7 +72,7 @@ class ReferenceSegment:
         rate[list(named)] = 0.0
         segment = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over, origin)
         offset = present - segment._goal(0.0)
-        return replace(segment, faded=fade(offset, layout.degrees, over))
+        return replace(segment, faded=np.array(fade(offset, layout.degrees, over)))
 
     def reference(self, time: float) -> FloatArray:
         """R at a time in s, shape (sum (mu_i + 1),)."""

@@ -1,5 +1,7 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -29,7 +31,8 @@ from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import CONTACT, FREE, ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, TracedTask
+from drake_dae.systems.task.traced import EARLY, ENDINGS
+from drake_dae.systems.task.transition import SampledTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -48,6 +51,8 @@ class TaskSupervisor(LeafSystem):
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
             of k points. In contact the distances are zero, otherwise the forces.
         in_contact: 1 while the law in contact is active, shape (1,).
+        ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
+            rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
             while the other law is active, while no force is measured, just after a touch, and while
             `hold` is not 0.
@@ -80,7 +85,7 @@ class TaskSupervisor(LeafSystem):
         self._sample_period = sample_period
         self.task, self._laws, self._contact = task, laws, contact
         self._phases, self._plan = task.plan.phases, TaskPlanner(task, laws, contact)
-        self._traced = TracedTask(task, laws, contact, self._plan, num_forces, sample_period)
+        self._traced = SampledTask(task, laws, contact, self._plan, num_forces, sample_period)
         system = laws[FREE].system
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
@@ -125,9 +130,9 @@ class TaskSupervisor(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
         size = self._laws[FREE].system.num_outputs + self._contact.size
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
-        for name, attribute in (("phase", "place"), ("in_contact", "in_contact")):
-            calc = weakly(self._calc_change, attribute)
-            self.DeclareVectorOutputPort(name, 1, calc, by_state)
+        progress = {self.abstract_state_ticket(self._index)}
+        for name in ("phase", "in_contact", "ending"):
+            self.DeclareVectorOutputPort(name, 1, weakly(self._calc_change, name), progress)
         hold = self.input_port_ticket(self._hold_port.get_index())
         for name, calc, tickets in (
             ("free_hold", weakly(self._calc_free_hold), by_state),
@@ -316,8 +321,15 @@ class TaskSupervisor(LeafSystem):
         segment = self._segment(context)
         output.SetFromVector(segment.desired(self._contact, context.get_time()))
 
-    def _calc_change(self, attribute: str, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([float(getattr(self._segment(context).change, attribute))])
+    def _calc_change(self, name: str, context: Context, output: BasicVector) -> None:
+        segments = self.progress(context).segments
+        place, contact, chosen = 0, self.task.contacts[0], ""
+        if segments:
+            change = segments[-1].change
+            place, contact, chosen = change.place, change.in_contact, change.chosen
+        ending = ENDINGS[chosen] if place == len(self._phases) else 0.0
+        values = {"phase": place, "in_contact": contact, "ending": ending}
+        output.SetFromVector([float(values[name])])
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
@@ -352,7 +364,12 @@ class TaskSupervisor(LeafSystem):
             self,
             self._traced.computations(),
             updates,
-            guard=Guard(self._traced.guard(), self._advance, bool(period)),
+            guard=Guard(
+                self._traced.guard(),
+                self._advance,
+                bool(period),
+                partial(self._traced.reaction, period) if period else None,
+            ),
             unwired={name: zero(name) for name in unwired},
-            ports={"phase": (Signal("phase"),)},
+            ports={name: (Signal(name),) for name in ("phase", "ending")},
         )

@@ -24,6 +24,7 @@ from drake_dae.systems.control.references import traced_references
 from drake_dae.systems.task.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment, Phase
 from drake_dae.systems.task.phases.guards import eccentricity
+from drake_dae.systems.task.phases.phase import APPROACH, DONE, FAIL, HOLD, LEAVE, NEXT, STOP
 from drake_dae.systems.task.phases.tally import GuardMemory
 from drake_dae.systems.task.planner import CONTACT, FREE, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
@@ -39,9 +40,15 @@ NAMES = (
     "felt",
     "is_felt",
     "distance",
+    "approaches",
+    "ending",
 )
-"""The first numbers of a task in a context; the force filter, then base, rate and fade of its
-current segment follow."""
+"""The first numbers of a task in a context: the current segment, the number of times that it went
+back by "approach", and one of `ENDINGS`. The force filter, then base, rate and fade of the segment
+follow."""
+
+ENDINGS = {NEXT: 1.0, DONE: 1.0, STOP: 2.0, LEAVE: 2.0, HOLD: 3.0, FAIL: 4.0}
+"""Key word after which the robot rests -> the number of this ending; 0 while the task goes on."""
 
 EARLY = 1e-12
 """A margin below this has ended, so that margins with different round-off end together."""
@@ -81,12 +88,13 @@ class TracedTask:
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
         self.filter_size = 2 * contact.size + 1
         sizes = [len(NAMES), self.filter_size, count, count, rows * self._shape[1], plan.moved]
-        sizes.append(self.tally.size)
+        sizes += [len(self._phases), self.tally.size]
         ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
         self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
-        self._tallied = slice(ends[-2], ends[-1])
-        before, self._base, self._rate, fade, self._origin, self._counts = (
+        self._segment, self._entered_places = slice(ends[1], ends[5]), slice(ends[5], ends[6])
+        self._tallied = slice(ends[6], ends[7])
+        before, self._base, self._rate, fade, self._origin, self._entered, self._counts = (
             self._held[a:b] for a, b in pairwise(ends)
         )
         self._faded = ca.reshape(fade, *self._shape)
@@ -147,11 +155,15 @@ class TracedTask:
         segment = progress.segments[-1]
         change, touched = segment.change, self.touched(progress.segments)
         felt = progress.felt if np.isfinite(progress.felt) else change.time
+        chosen, places = zip(*((each.chosen, each.place) for each in progress.changes), strict=True)
+        ending = ENDINGS[change.chosen] if change.place == len(self._phases) else 0.0
         flags = [change.place, change.in_contact, change.time, segment.over, touched, felt]
+        flags += [progress.is_felt, change.distance, chosen.count(APPROACH), ending]
+        entered = [places.count(place) for place in range(len(self._phases))]
         faded = np.zeros(self._shape)
         faded[: segment.faded.shape[0], : segment.faded.shape[1]] = segment.faded
         sums = segment.base, segment.rate, faded.ravel(order="F"), segment.origin
-        return np.hstack([flags, progress.is_felt, change.distance, force, *sums, tally])
+        return np.hstack([flags, force, *sums, entered, tally])
 
     @staticmethod
     def touched(segments: Sequence[ReferenceSegment]) -> bool:
@@ -209,8 +221,9 @@ class TracedTask:
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
         is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
-        shown = ca.Function("shown", inputs, [desired, self._named["place"], contact])
-        outputs = ("desired_output", "phase", "in_contact")
+        values = [desired, self._named["place"], contact, self._named["ending"]]
+        shown = ca.Function("shown", inputs, values)
+        outputs = ("desired_output", "phase", "in_contact", "ending")
         computations.append(Computation(shown, (TIME, HELD), outputs))
         waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(contact > 0.5, hold)])
         computations.append(Computation(waits, (HELD, "hold"), ("free_hold",)))
@@ -252,9 +265,7 @@ class TracedTask:
         first, rates = motion[2 : 2 + moved], motion[2 + moved :]
         contact = self._contact
         distances = self._reference(FREE)[law.layout.lowest[list(contact.places)].tolist()]
-        force = self._reference(CONTACT)[
-            int(self._laws[CONTACT].layout.lowest[contact.main])
-        ]
+        force = self._reference(CONTACT)[int(self._laws[CONTACT].layout.lowest[contact.main])]
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
         if self._task.watches("control"):
@@ -281,6 +292,13 @@ class TracedTask:
         Raises:
             ModelError: The margin of a phase cannot be traced.
         """
+        margins, inputs, sources = self._margins()
+        none = ca.SX(0, 1)
+        function = ca.Function("guard", inputs, [ca.densify(margins - EARLY), none, none])
+        return Computation(function, sources, (MARGINS, GAPS, RATES))
+
+    def _margins(self) -> tuple[ca.SX, list[ca.SX], tuple[str, ...]]:
+        """The margins of `PhaseDecision`, and the symbols and sources of their inputs."""
         named, task = self._named, self._task
         moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
@@ -301,12 +319,9 @@ class TracedTask:
             trips = ca.mmin(ca.vertcat(1e9, *guards))
             return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)
 
-        all_margins = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
-        none = ca.SX(0, 1)
-        inputs = [*inputs, *signals.values()]
+        values = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
         sources = (*sources, *(SIGNAL + name for name in signals))
-        function = ca.Function("guard", inputs, [ca.densify(all_margins - EARLY), none, none])
-        return Computation(function, sources, (MARGINS, GAPS, RATES))
+        return values, [*inputs, *signals.values()], sources
 
     def _ends(self, phase: Phase, now: Moment) -> tuple[ca.SX, ca.SX]:
         """The margins of a phase until it succeeds and until it is late."""

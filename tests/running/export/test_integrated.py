@@ -73,6 +73,24 @@ def test_a_loop_does_what_it_does_in_drakes_simulator(name, settings, tmp_path):
         assert_same(np.array(rows)[:, places], record, key, slice(-1))
 
 
+@pytest.mark.slow
+def test_a_loop_with_a_task_has_its_phases(tmp_path):
+    """Drake's contact law with a sampled task, through its touch and the press after it."""
+    settings = ["task.signals={ready: !PointToPoint {start: [0], end: [1], end_time: 0.5}}"]
+    loop, context, record = in_drake("wall_guarded", *settings, duration=1.7)
+    part = loop_part(loop, context, ["desired_output"])
+    code = CIntegrated(write_integrated(part, "loop", context, "task", tmp_path, CONFIG))
+    rows = []
+    for time in record.time[:-1]:
+        assert code.advance(time) == 0
+        rows.append(np.array(code.own.row))
+    values = {key: np.array(rows)[:, places] for key, places in code.outputs.items()}
+    for key in ("state", "control", "constraint_force", "desired_output"):
+        assert_same(values[key], record, key, slice(-1))
+    np.testing.assert_array_equal(values["phase"][:, 0], record["phase"][:-1].argmax(axis=1))
+    assert {*values["phase"][:, 0]} == {0.0, 1.0, 2.0, 3.0}
+
+
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory):
     """A plant with its sensors, and Drake's record of the loop."""

@@ -39,6 +39,7 @@ from drake_dae import (
 )
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
+from drake_dae.systems.blocks.switch import LawSwitch
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.cascade.spring_view import SpringView
 from drake_dae.systems.cascade.torque_loop import TorqueLoop
@@ -47,7 +48,6 @@ from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
-from drake_dae.systems.task.switch import LawSwitch
 
 
 def measured_law(integral, gain=0.5):

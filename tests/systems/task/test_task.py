@@ -326,7 +326,7 @@ def test_law_may_have_another_wall(whole):
 def test_fade_begins_as_given_and_ends_at_rest():
     """Rows are derivatives of each other, by NumPy's polynomials; 0 and 1 to round-off."""
     offset, over = np.array([0.7, -2.0, 5.0, 3.0, 1.0, 2.0, 3.0, 4.0, 5.0]), 0.4
-    factors = fade(offset, [2, 0, 4], over)
+    factors = np.array(fade(offset, [2, 0, 4], over))
     assert_allclose(factors[:, 0], offset, rtol=1e-14)
     assert_allclose(factors.sum(axis=1), 0.0, atol=1e-8)
     for first, last in ((0, 2), (4, 8)):

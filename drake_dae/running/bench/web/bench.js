@@ -146,10 +146,10 @@ function draw() {
   const chosen = Number(element("signal").value);
   const desired = { value: ({ r }) => r[chosen], color: DESIRED, dashed: true };
   plots.signal.draw(bench.samples, [
-    { value: ({ z }) => z[chosen], color: COLORS[1] }, ...(data.compares ? [desired] : []),
-  ], data.compares ? [["actual", COLORS[1], false], ["desired", DESIRED, true]] : []);
+    { value: ({ z }) => z[chosen], color: COLORS[1] }, ...(data.desired ? [desired] : []),
+  ], data.desired ? [["actual", COLORS[1], false], ["desired", DESIRED, true]] : []);
   const errors = element("error").value.split(",").map(Number);
-  if (data.compares) draw_errors(errors);
+  if (data.desired) draw_errors(errors);
   else plots.error.draw(bench.samples, errors.map((i) => ({ value: ({ z }) => z[i], color: COLORS[0] })), []);
   const slow = bench.isRunning && bench.speed < 0.95 ? `, runs at ${bench.speed.toFixed(2)} of that` : "";
   const rate = RATES[bench.rate] === 1 ? "real time" : `${RATES[bench.rate]} x real time`;
@@ -245,18 +245,18 @@ element("lose").hidden = !data.opens;
 element("next").hidden = !data.phases.length;
 element("title").textContent = data.title;
 data.outputs.forEach(({ name, unit }, i) => element("signal").append(new Option(unit ? `${name} [${unit}]` : name, i)));
-const units = data.compares ? [...new Set(data.outputs.map(({ unit }) => unit))] : [];
+const units = data.desired ? [...new Set(data.outputs.map(({ unit }) => unit))] : [];
 for (const unit of units) {
   const own = data.outputs.flatMap((output, i) => (output.unit === unit ? [i] : []));
   element("error").append(new Option(`errors${unit ? ` [${unit}]` : " without unit"}`, own.join()));
 }
 data.outputs.forEach(({ name, unit }, i) => {
-  const text = data.compares ? `error of ${name}` : unit ? `${name} [${unit}]` : name;
+  const text = data.desired ? `error of ${name}` : unit ? `${name} [${unit}]` : name;
   element("error").append(new Option(text, i));
 });
 const force = data.outputs.findIndex(({ unit }) => unit === "N");
 element("signal").value = Math.max(force, 0);
-if (!data.compares) {
+if (!data.desired) {
   element("error").value = data.outputs.length > 1 ? (force === 1 ? 0 : 1) : 0;
   element("error").setAttribute("aria-label", "second output to plot");
 }

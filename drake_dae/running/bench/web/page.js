@@ -5,14 +5,16 @@ async function makeEngine() {
   let tick = 0, log = [];
 
   function sample() {
-    const { reference } = loop.outputs;
+    const desired = loop.outputs[data.desired], place = loop.outputs.phase?.[0];
     const shown = Array.from(loop.view("shown", 0, sizes.scene + sizes.coordinates));
     return {
       time: loop.time,
       z: data.plotted.flatMap((name) => Array.from(loop.outputs[name])),
-      r: data.outputs.map(({ lowest }) => (data.compares ? reference[lowest] : null)),
+      r: data.outputs.map((output) => (data.desired ? desired[output.desired] : null)),
       scene: shown.slice(0, sizes.scene),
       coordinates: shown.slice(sizes.scene),
+      place,
+      phase: data.phase_names[place] ?? "",
     };
   }
   return {

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import Context, Diagram, OutputPort
 
-from drake_dae.compiler.compile import compile_diagram, compile_part
+from drake_dae.compiler.compile import compile_part
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
@@ -128,12 +128,11 @@ def loop_part(
     Raises:
         ModelError: The loop has events, Drake's contact or noise.
     """
-    if further and not isinstance(loop, Diagram):
-        compiled = compile_diagram(loop.diagram, [*loop.signals, *further])
-        signals: Mapping[str, Sequence[Signal]] = loop.signals
-    else:
-        program = program_of(loop)
-        compiled, signals = program.compiled, program.signals
+    program = program_of(loop)
+    compiled, signals = program.compiled, program.signals
+    if not isinstance(loop, Diagram) and (further or compiled.watched):
+        ports = {name: loop.diagram.GetOutputPort(name) for name in (*loop.signals, *further)}
+        compiled = compile_part(loop.diagram, {}, ports)
     _check_time(compiled, "the loop")
     return _part(compiled, {name: tuple(each) for name, each in signals.items()})
 
@@ -220,7 +219,11 @@ def _check_steps(compiled: CompiledDiagram) -> None:
             "has a continuous state, as integrals of a law without samples: give the loop a "
             "sampling, in a scenario `sampling: {period: 0.001}`",
         ),
-        (phases, "leads through phases in Python, which no C has; a rollout does"),
+        (
+            phases,
+            "ends phases between samples, which no C does: give the loop a sampling, in a scenario "
+            "`sampling: {period: 0.001}`",
+        ),
         (
             compiled.noise,
             "draws random numbers, which are none of a controller's: leave it out, or put it "

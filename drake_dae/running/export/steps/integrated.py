@@ -1,5 +1,6 @@
 """Integration of a plant or of a whole loop with fixed steps, in C99."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,6 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import ExportedPart
 from drake_dae.running.export.steps.parts import PLANT, WrittenPart, defaults
@@ -27,6 +27,9 @@ from drake_dae.running.rollout.events import SAME
 from drake_dae.running.rollout.run import FIXED
 
 TEMPLATES = Path(__file__).parent / "c99"
+
+NOT_PROJECTED = "  (void)own, (void)time, (void)REACHED, (void)CLOSE;\n  return 1;\n"
+"""The body of the projection of a state without constraints."""
 
 SCHEME, LONGEST = "runge_kutta5", 1e-3
 """The method and its longest step in s for settings with error control, which no export has."""
@@ -58,9 +61,8 @@ def write_integrated(
     scheme, longest = fixed_steps(config)
     compiled, prefix, file = part.compiled, prefix_of(name), file_of(name)
     start, held = compiled.start(context)
-    functions = GeneratedFunctions.of(
-        compiled, ("given", "rate", "row", "newton"), held, f"{prefix}_traced_{kind}"
-    )
+    keys = ["given", "rate", "row", *(["newton"] if compiled.projects else [])]
+    functions = GeneratedFunctions.of(compiled, keys, held, f"{prefix}_traced_{kind}")
 
     def call(key: str, state: str, held: str, results: list[str]) -> str:
         arguments = ["&time", state, held, "own->parameters", "own->given"]
@@ -117,7 +119,7 @@ def write_integrated(
         "rate": call("rate", "x", "own->held", ["rate", "&valid"]),
         "row": call("row", "own->state", "own->held", ["own->row", "&valid"]),
         "begin": begin,
-        "project": _project(call("newton", "at", "own->held", ["found", "&left"]), compiled),
+        "project": _project(call) if compiled.projects else NOT_PROJECTED,
         **updates(
             compiled.rates,
             "Own *own",
@@ -147,15 +149,14 @@ def fixed_steps(config: SimulatorConfig | None) -> tuple[str, float]:
     return config.integration_scheme, config.max_step_size
 
 
-def _project(call: str, compiled: CompiledDiagram) -> str:
-    if not compiled.projects:
-        return "  (void)own, (void)time, (void)REACHED, (void)CLOSE;\n  return 1;\n"
+def _project(call: Callable[[str, str, str, list[str]], str]) -> str:
+    newton = call("newton", "at", "own->held", ["found", "&left"])
     return f"""  double at[SIZE + 1], found[SIZE + 1], left = 0.0;
   int attempt;
   set_time(own, time);
   memcpy(at, own->state, sizeof(double) * SIZE);
   for (attempt = 0; attempt < 8; attempt++) {{
-{call}    if (left <= REACHED) {{
+{newton}    if (left <= REACHED) {{
       memcpy(own->state, found, sizeof(double) * SIZE);
       return 1;
     }}

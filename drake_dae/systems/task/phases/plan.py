@@ -87,6 +87,7 @@ class PhasePlan:
         phases: The same, followed by the Release for "leave" if it may be needed.
         contacts: Whether each phase begins in contact; last whether the last one ends in contact.
         last: The number of phases that were given.
+        retries: The argument.
 
     Raises:
         ModelError: A successor is not a phase; a phase begins in contact although the robot is
@@ -96,7 +97,7 @@ class PhasePlan:
 
     def __init__(self, phases: Sequence[Phase], retries: int) -> None:
         self._names = [phase.name for phase in phases]
-        self._retries, self.last = retries, len(phases)
+        self.retries, self.last = retries, len(phases)
         self.phases: tuple[Phase, ...] = tuple(phases)
         self.contacts = contacts_of(phases)
         if self._leaves():
@@ -136,7 +137,7 @@ class PhasePlan:
         if outcome == "success":
             ends_free = not self.ends_in_contact(place)
         for _ in range(self.last + 1):
-            to = self._place(place, word)
+            to = self.place_of(place, word)
             if to is None and word == LEAVE:
                 to = None if ends_free else self.last
             if to is None or to >= self.last:
@@ -144,7 +145,7 @@ class PhasePlan:
             phase, most = self.phases[to], self.phases[to].retries
             count = counts[to]
             if most is None and word == APPROACH:
-                count, most = 1 + sum(key == APPROACH for key in chosen), self._retries
+                count, most = 1 + sum(key == APPROACH for key in chosen), self.retries
             if most is None or count <= most:
                 if count and most is not None:
                     remarks.append(f"retry {count} of {most}")
@@ -169,7 +170,7 @@ class PhasePlan:
                 return True
         return any(self.contacts) and any(phase.if_spent == LEAVE for phase in self.phases)
 
-    def _place(self, place: int, word: str) -> int | None:
+    def place_of(self, place: int, word: str) -> int | None:
         """The index of the phase that a key word of a phase leads to; None for none."""
         if word == NEXT:
             return place + 1 if place + 1 < self.last else len(self.phases)
@@ -192,7 +193,7 @@ class PhasePlan:
         for outcome in outcomes:
             at, key, word, tried = place, phase.key_of(outcome), phase.chosen(outcome), set[int]()
             self._check_word(place, key, word)
-            while (to := self._place(at, word)) is not None and to < self.last:
+            while (to := self.place_of(at, word)) is not None and to < self.last:
                 self._check_contact(place, key, outcome, to)
                 edges.append((word, to))
                 if to in tried or self.phases[to].retries is None:
@@ -258,7 +259,7 @@ class PhasePlan:
         }
         for place, phase in enumerate(self.phases[: self.last]):
             if phase.retries is not None:
-                word, spent = phase.if_spent, self._place(place, phase.if_spent)
+                word, spent = phase.if_spent, self.place_of(place, phase.if_spent)
                 ways[place] = [] if spent is None or counts(word, spent) else [spent]
         done = set[int]()
 

@@ -1,0 +1,236 @@
+"""The changes of phases as traced functions of a sampled task, for exports without Python."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.systems.blocks.traced import HELD, Computation, Reaction, Update
+from drake_dae.systems.task.fade import fade
+from drake_dae.systems.task.phases import Outcome
+from drake_dae.systems.task.phases.phase import APPROACH, FAIL, LEAVE
+from drake_dae.systems.task.planner import CONTACT, FREE
+from drake_dae.systems.task.traced import EARLY, ENDINGS, NAMES, TracedTask
+
+_OUTCOMES: tuple[Outcome, ...] = ("guard", "success", "lost", "late")
+"""How a phase ends, in the order of the margins of `PhaseDecision`, the first of which decides."""
+
+_Change = tuple[ca.SX, ca.SX, ca.SX]
+"""The index of the next phase, 1 after a return by "approach", and one of `ENDINGS`."""
+
+
+class SampledTask(TracedTask):
+    """A task whose phases change within the update of its numbers, as `TaskPlanner` has it.
+
+    A task that ends by "fail" rests as one that ends by "hold"; its number of ENDINGS differs.
+    """
+
+    def reaction(self, period: float) -> Reaction:
+        """The begin of the task and its update.
+
+        Args:
+            period: The sample period, in s.
+        """
+        return Reaction(self._begun(), Update(self._advanced(), period, 0.0, True))
+
+    def _begun(self) -> Computation:
+        """The numbers at the start of a run, as `TaskPlanner.first`."""
+        law, contact = self._laws[FREE], int(self._task.contacts[0])
+        x, parameters = law.system.state, law.system.parameter_symbol
+        force = self._task.contact_force if contact else 0.0
+        measured = ca.SX.zeros(law.system.num_outputs)
+        measured[self._contact.main] = force
+        motion = self._plan.motion_function.function.call([x, parameters])[0]
+        present = [self._met(which, measured) for which in (FREE, CONTACT)]
+        held = ca.SX.zeros(self.size)
+        self._begin_phase(held, ca.SX(0), ca.SX(contact), present, motion)
+        held[NAMES.index("felt")] = self._time
+        held[self._entered_places.start] = 1
+        sources = ("$time", "estimated_state", "$parameters")
+        return Computation(
+            ca.Function("begun", [self._time, x, parameters], [held]), sources, (HELD,)
+        )
+
+    def _advanced(self) -> Computation:
+        """The numbers after a sample, as `TaskSupervisor` has them."""
+        named, end = self._named, len(self._phases)
+        margins, inputs, sources = self._margins()
+        unchanged = self.unchanged()
+        known = dict(zip(sources, inputs, strict=True))
+        law = self._laws[FREE]
+        x, parameters = law.system.state, law.system.parameter_symbol
+        same = unchanged.function.call([known[source] for source in unchanged.sources])[0]
+
+        ended = [margins[i] <= 2.0 * EARLY for i in range(len(_OUTCOMES))]
+        ends = ended[0]
+        for each in ended[1:]:
+            ends = ca.logic_or(ends, each)
+        to, approaches, ending = self._successors(ended)
+
+        was = named["contact"]
+        measured = self._plan.forces_function.function.call([x, self._forces, parameters])[0]
+        before = [self._reference(which) for which in (FREE, CONTACT)]
+        present = []
+        for which in (FREE, CONTACT):
+            met = self._met(which, measured)
+            for i, first in enumerate(self._laws[which].layout.lowest.tolist()):
+                if i not in self._contact.places:
+                    size = self._laws[which].degrees[i] + 1
+                    start = int(self._laws[1 - which].layout.lowest[i])
+                    met[first : first + size] = before[1 - which][start : start + size]
+            stays = was > 0.5 if which else was < 0.5
+            present.append(ca.if_else(stays, before[which], met))
+        motion = self._plan.motion_function.function.call([x, parameters])[0]
+        changed = ca.SX(same)
+        self._begin_phase(changed, to, self._contact_after(to, ended), present, motion)
+        values = {
+            "touched": ca.logic_not(was > 0.5),
+            "approaches": named["approaches"] + approaches,
+            "ending": ca.if_else(named["place"] > end - 0.5, named["ending"], ending),
+        }
+        for name, value in values.items():
+            changed[NAMES.index(name)] = value
+        changed[self._entered_places] = self._entered + _at(to, end + 1)[:end]
+        changed[self._tallied] = 0
+
+        after = ca.if_else(ends, changed, same)
+        is_felt = named["is_felt"] > 0.5
+        turns = margins[len(_OUTCOMES)] <= 2.0 * EARLY
+        after[NAMES.index("felt")] = ca.if_else(is_felt, self._time, named["felt"])
+        after[NAMES.index("is_felt")] = ca.if_else(turns, ca.logic_not(is_felt), is_felt)
+        return Computation(ca.Function("advanced", inputs, [after]), sources, (HELD,))
+
+    def _begin_phase(
+        self, held: ca.SX, place: ca.SX, contact: ca.SX, present: list[ca.SX], motion: ca.SX
+    ) -> None:
+        """Writes the segment of a phase that begins now, as `ReferenceSegment.begin`.
+
+        Args:
+            held: The numbers of the task; changed in place.
+            place: The index of the phase.
+            contact: Whether the law in contact becomes active.
+            present: R of both laws at the end of the phase before.
+            motion: The values of `TaskPlanner.motion_function`.
+        """
+        phases, plan, moved = self._phases, self._plan, self._plan.moved
+        chosen, count = _at(place, len(phases) + 1), len(self._laws[FREE].degrees)
+        overs = [phase.over for phase in phases]
+        over = ca.mtimes(ca.DM([[*overs, overs[-1]]]), chosen)
+        rates = np.column_stack([*plan.rates, np.zeros(count)])
+        named = np.zeros((count, len(phases) + 1))
+        for index, each in enumerate(plan.goals):
+            named[list(each.named), index] = 1.0
+        goes, free = ca.mtimes(ca.DM(rates), chosen), 1 - ca.mtimes(ca.DM(named), chosen)
+        sums = []
+        for which, law in enumerate(self._laws):
+            size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
+            first_goals = np.zeros((size, len(phases) + 1))
+            for index, each in enumerate(plan.goals):
+                if int(self._task.contacts[index]) == which:
+                    first_goals[:, index] = each.function(0.0)
+            goal = ca.mtimes(ca.DM(first_goals), chosen)
+            base, rate = ca.SX.zeros(count), ca.SX(goes * free)
+            for i, (first, degree) in enumerate(zip(lowest, law.degrees, strict=True)):
+                moving = present[which][first + 1] if degree else 0
+                base[i] = free[i] * (present[which][first] + (moving - goes[i]) * over / 2)
+                goal[first] += base[i]
+                if degree:
+                    goal[first + 1] += rate[i]
+            rows = fade(present[which] - goal, law.degrees, over)
+            faded = ca.SX.zeros(*self._shape)
+            for row, factors in enumerate(rows):
+                faded[row, : len(factors)] = ca.horzcat(*factors)
+            sums.append(ca.vertcat(base, rate, ca.vec(faded)))
+        held[self._segment] = ca.vertcat(
+            ca.if_else(contact > 0.5, sums[CONTACT], sums[FREE]), motion[2 : 2 + moved]
+        )
+        values = [place, contact, self._time, over, motion[0]]
+        for name, value in zip(
+            ("place", "contact", "start", "over", "distance"), values, strict=True
+        ):
+            held[NAMES.index(name)] = value
+
+    def _met(self, which: int, measured: ca.SX) -> ca.SX:
+        """R of a law from the current outputs, as `TaskPlanner`.
+
+        Args:
+            which: The law.
+            measured: The outputs of the system in contact by the measured forces.
+        """
+        law, free = self._laws[which], self._laws[FREE].system
+        chains = [
+            chain[:degree]
+            for chain, degree in zip(law.structure.output_chains, law.degrees, strict=True)
+        ]
+        own = law.system.state, law.system.parameter_symbol
+        rows = ca.vertcat(ca.SX(0, 1), *(row for chain in chains for row in chain))
+        function = ca.Function("outputs", own, [rows])
+        reference = ca.SX.zeros(law.layout.reference_size)
+        reference[law.layout.chained.tolist()] = function(free.state, free.parameter_symbol)
+        for place in self._contact.places if which == CONTACT else ():
+            if law.degrees[place] == 0:
+                reference[int(law.layout.lowest[place])] = measured[place]
+        return reference
+
+    def _contact_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:
+        """Whether the law in contact is active in the next phase, or while the robot rests."""
+        end, plan = len(self._phases), self._task.plan
+        closed = ca.mtimes(ca.DM([[*map(float, self._task.contacts[:end]), 0.0]]), _at(to, end + 1))
+        succeeds = ca.logic_and(ca.logic_not(ended[0]), ended[1])
+        was = self._named["contact"] > 0.5
+        last = self._in_phase(
+            lambda place: ca.if_else(succeeds, float(plan.ends_in_contact(place)), was), was
+        )
+        rests = ca.logic_and(last, self._force >= self._task.contact_force)
+        return ca.if_else(to > end - 0.5, rests, closed)
+
+    def _successors(self, ended: list[ca.SX]) -> _Change:
+        """The change after the current phase, by how it has ended."""
+        end = len(self._phases)
+
+        def after(place: int, number: int) -> ca.SX:
+            if number == len(_OUTCOMES) - 1:
+                return ca.vertcat(*self._successor(place, _OUTCOMES[number]))
+            change = ca.vertcat(*self._successor(place, _OUTCOMES[number]))
+            return ca.if_else(ended[number], change, after(place, number + 1))
+
+        to, approaches, ending = ca.vertsplit(
+            self._in_phase(lambda place: after(place, 0), ca.vertcat(end, 0, 0))
+        )
+        return to, approaches, ending
+
+    def _successor(self, place: int, outcome: Outcome) -> _Change:
+        """The change after a phase with its outcome, as `PhasePlan.successor`."""
+        plan, end = self._task.plan, len(self._phases)
+        ends_free = not (
+            plan.ends_in_contact(place) if outcome == "success" else plan.contacts[place]
+        )
+
+        def following(at: int, word: str, left: int) -> _Change:
+            to = plan.place_of(at, word) if left else None
+            if to is None and word == LEAVE and not ends_free:
+                to = plan.last
+            if to is None or to == end:
+                return ca.SX(end), ca.SX(0), ca.SX(ENDINGS[word if left else FAIL])
+            if to >= plan.last:
+                return ca.SX(to), ca.SX(0), ca.SX(0)
+            phase, is_return = self._phases[to], word == APPROACH
+            there = ca.SX(to), ca.SX(is_return), ca.SX(0)
+            count, most = self._entered[to], phase.retries
+            if most is None and is_return:
+                count, most = 1 + self._named["approaches"], plan.retries
+            if most is None:
+                return there
+            word = FAIL if is_return and phase.retries is None else phase.if_spent
+            otherwise = following(to, word, left - 1)
+            allowed = count <= most
+            return (
+                ca.if_else(allowed, there[0], otherwise[0]),
+                ca.if_else(allowed, there[1], otherwise[1]),
+                ca.if_else(allowed, there[2], otherwise[2]),
+            )
+
+        return following(place, self._phases[place].chosen(outcome), plan.last + 1)
+
+
+def _at(place: ca.SX, count: int) -> ca.SX:
+    """A column with 1 at an index and 0 elsewhere, shape (count, 1)."""
+    return ca.vertcat(*(ca.fabs(place - i) < 0.5 for i in range(count)))
