@@ -122,9 +122,9 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
         build_scenario(load_scenario(file, [change]))
 
 
-def test_what_knows_no_tasks_says_so(file, tmp_path, capsys):
+def test_an_export_of_a_task_needs_samples(file, tmp_path, capsys):
     assert main(["export", str(file), "--out", str(tmp_path / "code")]) == 1
-    assert "task: exports support only `references`" in capsys.readouterr().err
+    assert "'task' ends phases between samples" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -105,8 +105,8 @@ def page_text(
     """Returns the page of a loop or diagram as text; for arguments and errors see `write_page`."""
     diagram = loop if isinstance(loop, Diagram) else loop.diagram
     context = diagram.CreateDefaultContext() if context is None else context
+    context = with_input_values(diagram, context)
     if isinstance(loop, Diagram):
-        context = with_input_values(loop, context)
         ports = parts_of_diagram(loop, context).ports
         part = diagram_part(loop, context, ports)
     else:

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from browser import needs_chromium, opened, with_script
+from browser import in_page, needs_chromium, opened, with_script
 from runs import scenario
 from test_live import serving
+from test_page import needs_zig
 
-from drake_dae import Approach, Move, Wait, build_commanded
+from drake_dae import Approach, Move, Wait, build_commanded, write_page
 from drake_dae.running.bench.description import bench_of
 from drake_dae.running.bench.run import HandRun
 from drake_dae.systems.task.phases import Moment
@@ -96,10 +97,17 @@ BUTTONS = """
 
 @needs_chromium
 @pytest.mark.slow
-def test_buttons_end_phases_and_lose_the_contact(guarded, tmp_path):
-    with serving(guarded[0], "wall_guarded") as server:
-        server.page = with_script(server.page, BUTTONS)
-        found = opened(server.address, tmp_path / "profile")
+@pytest.mark.parametrize("is_live", [True, pytest.param(False, marks=needs_zig)])
+def test_buttons_end_phases_and_lose_the_contact(is_live, guarded, tmp_path):
+    """Of a live bench, and of a page, where the supervisor runs as WebAssembly."""
+    built = guarded[0]
+    if is_live:
+        with serving(built, "wall_guarded") as server:
+            server.page = with_script(server.page, BUTTONS)
+            found = opened(server.address, tmp_path / "profile")
+    else:
+        (file,) = write_page(built.loop, built.context, tmp_path / "page.html")
+        found = in_page(file.read_text(), BUTTONS, file)
     assert found["hidden"] is False
     assert found["said"] == "this phase makes or breaks the contact, and ends by itself"
     assert (found["waits"], found["slides"], found["lost"]) == (2, 3, 0)

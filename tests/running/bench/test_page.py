@@ -187,7 +187,7 @@ def test_pages_share_a_bundle(tmp_path):
     [
         ("wall_point_contact", "the plant has Drake's own contact, which cannot be exported"),
         ("wall_bounce", "as where a contact opens or a phase ends"),
-        ("wall_guarded", "as where a contact opens or a phase ends"),
+        ("wall_polish", "as where a contact opens or a phase ends"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(name, reason, tmp_path, capsys):

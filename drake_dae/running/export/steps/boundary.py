@@ -132,7 +132,7 @@ def loop_part(
     compiled, signals = program.compiled, program.signals
     if not isinstance(loop, Diagram) and (further or compiled.watched):
         ports = {name: loop.diagram.GetOutputPort(name) for name in (*loop.signals, *further)}
-        compiled = compile_part(loop.diagram, {}, ports)
+        compiled = compile_part(loop.diagram, {}, ports, context)
     _check_time(compiled, "the loop")
     return _part(compiled, {name: tuple(each) for name, each in signals.items()})
 
@@ -187,7 +187,8 @@ def check_events(compiled: CompiledDiagram, what: str) -> None:
     if changing := [*compiled.guards, *compiled.watched]:
         raise ModelError(
             f"{what} changes at moments that a run has to find, as where a contact opens or a "
-            f"phase ends ('{changing[0].system.get_name()}'): no export knows it; a rollout does"
+            f"phase ends between samples ('{changing[0].system.get_name()}'): no export knows it; a "
+            "rollout does"
         )
     if compiled.has_stepped:
         raise ModelError(
