@@ -187,8 +187,8 @@ def check_events(compiled: CompiledDiagram, what: str) -> None:
     if changing := [*compiled.guards, *compiled.watched]:
         raise ModelError(
             f"{what} changes at moments that a run has to find, as where a contact opens or a "
-            f"phase ends between samples ('{changing[0].system.get_name()}'): no export knows it; a "
-            "rollout does"
+            f"phase ends between samples ('{changing[0].system.get_name()}'): no export knows it, "
+            "and a rollout does"
         )
     if compiled.has_stepped:
         raise ModelError(
