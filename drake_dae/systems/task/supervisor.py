@@ -1,6 +1,5 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
-import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -147,12 +146,8 @@ class TaskSupervisor(LeafSystem):
         return self._witnesses
 
     def _now(self, context: Context) -> ModelMoment:
-        parameters, forces = context.get_numeric_parameter(0).CopyToVector(), np.zeros(0)
-        if self.progress(context).segments:
-            forces = self._force_port.Eval(context).copy()
-            forces[list(self._contact.forces)] = self._filtered(context)[: self._contact.size]
-        time, state = context.get_time(), self._state_port.Eval(context)
-        return ModelMoment(time, state, parameters, forces)
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        return ModelMoment(context.get_time(), self._state_port.Eval(context), parameters)
 
     def _segment(self, context: Context) -> ReferenceSegment:
         """The current references."""
@@ -167,9 +162,7 @@ class TaskSupervisor(LeafSystem):
         contact, lowest = self._contact, segment.layout.lowest
         wanted = [contact.main] if change.in_contact else list(contact.places)
         desired = np.mean(segment.reference(time)[lowest[wanted]])
-        forces, off_center = self._filtered(context)[: contact.size], 0.0
-        if self.task.watches("eccentricity"):
-            off_center = float(eccentricity(ca.DM(forces), self.task.contact_force))
+        forces = self._filtered(context)[: contact.size].tolist()
         port, signal = self._control_port, 0.0
         control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
@@ -187,7 +180,7 @@ class TaskSupervisor(LeafSystem):
             travel=float(np.linalg.norm(moved - segment.origin)),
             work=self._traced.work_of(context.get_discrete_state(self._held).value()),
             control=control,
-            eccentricity=off_center,
+            eccentricity=float(eccentricity(forces, self.task.contact_force)),
             signal=signal,
         )
 

@@ -271,7 +271,7 @@ class TracedTask:
             travel=ca.norm_2(first - self._origin),
             work=self.tally.work(self._counted()),
             control=control,
-            eccentricity=eccentricity(self._each, self._task.contact_force),
+            eccentricity=eccentricity(ca.vertsplit(self._each), self._task.contact_force),
         )
         return moment, inputs, tuple(sources)
 
