@@ -271,11 +271,11 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
     if not controller.HasInputPort("hold"):
         return []
     law = controller.law
-    inputs = law.measured_force.inputs if law.measured_force else {}
+    rows = law.measured_force.rows if law.measured_force else {}
     integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
     for row, output in enumerate(law.integral.outputs):
         for column, normal in enumerate(plant.normals):
-            integrates[row, column] = inputs.get(output) == normal
+            integrates[row, column] = output in rows and not rows[output][normal].is_zero()
     if not integrates.any():
         return []
     hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))

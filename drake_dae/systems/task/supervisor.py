@@ -48,8 +48,8 @@ class TaskSupervisor(LeafSystem):
             of k points. In contact the distances are zero, otherwise the forces.
         in_contact: 1 while the law in contact is active, shape (1,).
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
-            while the other law is active, while no force is measured, just after a touch, and while
-            `hold` is not 0.
+            while the other law is active, while no force is measured at one of the points, just
+            after a touch, and while `hold` is not 0.
         tared_force: The measured forces minus the bias of the sensor, shape (m,); only with a
             tare_time.
 
@@ -329,8 +329,9 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        force = float(np.sum(self._filtered(context)[: self._contact.size]))
-        is_open = not begin.in_contact or force < self.task.contact_force
+        size = self._contact.size
+        least = size * float(np.min(self._filtered(context)[:size]))
+        is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         settles = (
             self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over

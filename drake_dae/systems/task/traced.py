@@ -207,7 +207,8 @@ class TracedTask:
             desired += values
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
-        is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
+        least = size * ca.mmin(self._each)
+        is_open = ca.logic_or(contact < 0.5, least < self._task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
         shown = ca.Function("shown", inputs, [desired, self._named["place"], contact])
         outputs = ("desired_output", "phase", "in_contact")
