@@ -278,6 +278,8 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
             integrates[row, column] = output in rows and not rows[output][normal].is_zero()
     if not integrates.any():
         return []
+    if controller.GetInputPort("hold").size() == 1:  # As of a task, for all integrals.
+        integrates = integrates.max(axis=0, keepdims=True)
     hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
