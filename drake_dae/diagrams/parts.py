@@ -271,13 +271,15 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
     if not controller.HasInputPort("hold"):
         return []
     law = controller.law
-    inputs = law.measured_force.inputs if law.measured_force else {}
+    rows = law.measured_force.rows if law.measured_force else {}
     integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
     for row, output in enumerate(law.integral.outputs):
         for column, normal in enumerate(plant.normals):
-            integrates[row, column] = inputs.get(output) == normal
+            integrates[row, column] = output in rows and not rows[output][normal].is_zero()
     if not integrates.any():
         return []
+    if controller.GetInputPort("hold").size() == 1:  # As of a task, for all integrals.
+        integrates = integrates.max(axis=0, keepdims=True)
     hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())

@@ -20,7 +20,7 @@ class IntegralAction:
         e_i^(mu_i) = -K_i0 sigma_i - K_i1 e_i - ... - K_i mu_i e_i^(mu_i - 1),
 
     so that an output has mu_i + 1 poles in place of mu_i. If mu_i = 0 it is the integral of a
-    measured force: ubar_i = r_i - K_i0 int (v_j - r_i) dt. With a constant model error, e_i tends
+    measured force: ubar_i = r_i - K_i0 int (z_i - r_i) dt. With a constant model error, e_i tends
     to zero.
 
     Attributes:
@@ -57,11 +57,11 @@ class IntegralAction:
             i = names_of_outputs.index(name)
             if i in integrated:
                 raise GainError(f"integral: '{name}' occurs twice")
-            if degrees[i] == 0 and (measured is None or i not in measured.inputs):
+            if degrees[i] == 0 and (measured is None or i not in measured.rows):
                 raise GainError(
                     f"integral: by the model the law attains '{name}' without delay, so there is "
                     "no error to integrate; make the law with measured_force=True, and integrate "
-                    "a constraint input"
+                    "a constraint input or a combination of some"
                 )
             integrated.append(i)
         chosen = tuple(sorted(integrated))
@@ -106,5 +106,5 @@ class IntegralAction:
             if self.degrees[i]:
                 rows.append(chain[starts[i]] - values[i])
             elif measured is not None:
-                rows.append(measured.symbol[measured.inputs[i]] - values[i])
+                rows.append(measured.value(i) - values[i])
         return ca.vertcat(*rows)

@@ -20,14 +20,19 @@ class ForceMeasurement:
             force error of a wrong model shrinks to 1 / (1 + Gbar).
         mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
 
+    Outputs that are combinations of constraint inputs, z_i = m_i(x) v, take m_i v in place of v_j;
+    then Gbar is a multiple of the identity.
+
     Attributes:
         layout: The layout of reference vectors and chains.
-        inputs: Output index i -> constraint input index j.
+        rows: Output index i -> m_i, shape (1, m), for the measured outputs.
+        inputs: Output index i -> constraint input index j, for those that are a single one.
         gain: Gbar, shape (m, m), positive semidefinite.
         symbol: The symbols v of the measurement, shape (m, 1).
     """
 
     layout: DerivativeLayout
+    rows: dict[int, ca.SX]
     inputs: dict[int, int]
     gain: FloatArray
     symbol: ca.SX
@@ -43,7 +48,7 @@ class ForceMeasurement:
 
         Raises:
             GainError: The gain is not positive semidefinite, or is for an output with mu_i >= 1.
-            ModelError: No output is a constraint input, or constraints share their forces.
+            ModelError: No output consists of constraint inputs, or constraints share their forces.
         """
         if system.sharing is not None:
             raise ModelError(
@@ -51,16 +56,36 @@ class ForceMeasurement:
                 "share their forces; leave them out with `drop_constraints`, or use the law's "
                 "own force"
             )
-        inputs = _force_outputs(system)
+        rows = _force_outputs(system)
+        inputs = {i: j for i, row in rows.items() if (j := _single(row)) is not None}
         matrix = force_gain(gain, system.num_constraints)
-        for i, j in inputs.items():
-            if layout.degrees[i] and matrix[j].any():
+        for i in rows:
+            name = system.output_signals[i].name
+            if i not in inputs and np.any(matrix != matrix[0, 0] * np.eye(len(matrix))):
                 raise GainError(
-                    f"force_gain is for outputs of degree 0; '{system.output_signals[i].name}' "
-                    f"has degree {layout.degrees[i]} and takes the measured force itself. Leave "
-                    "it 0"
+                    f"force_gain must be one number, since '{name}' is a combination of forces"
                 )
-        return cls(layout, inputs, matrix, ca.SX.sym("v", system.num_constraints))
+            if layout.degrees[i] and matrix[inputs.get(i, 0)].any():
+                raise GainError(
+                    f"force_gain is for outputs of degree 0; '{name}' has degree "
+                    f"{layout.degrees[i]} and takes the measured force itself. Leave it 0"
+                )
+        return cls(layout, rows, inputs, matrix, ca.SX.sym("v", system.num_constraints))
+
+    def value(self, output: int) -> ca.SX:
+        """Returns the measured value of an output, m_i v."""
+        return ca.mtimes(self.rows[output], self.symbol)
+
+    def inputs_for(self, values: ca.SX) -> ca.SX:
+        """Returns the least v for which the measured outputs have given values.
+
+        Args:
+            values: z, shape (p, 1); of the measured outputs.
+        """
+        rows, wanted = ca.vertcat(*self.rows.values()), values[list(self.rows), :]
+        if len(self.inputs) == len(self.rows):
+            return ca.mtimes(rows.T, wanted)
+        return ca.mtimes(rows.T, ca.solve(ca.densify(ca.mtimes(rows, rows.T)), wanted))
 
     def chain(self, chain: ca.SX) -> ca.SX:
         """Returns the output chains with the measurement in place of the model's l*_i.
@@ -70,8 +95,8 @@ class ForceMeasurement:
         """
         result = ca.SX(chain)
         for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
-            if output in self.inputs:
-                result[int(head)] = self.symbol[self.inputs[int(output)]]  # (71), (81)
+            if output in self.rows:
+                result[int(head)] = self.value(int(output))  # (71), (81)
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
@@ -88,6 +113,8 @@ class ForceMeasurement:
         for i in map(int, self.layout.direct):
             if i in self.inputs:
                 result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)  # (59)
+            elif i in self.rows:
+                result[i] -= self.gain[0, 0] * (self.value(i) - values[i])
         return result
 
 
@@ -115,17 +142,23 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
     return gain
 
 
-def _force_outputs(system: DaeSystem) -> dict[int, int]:
-    """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
-    forces = {}
-    for i in range(system.num_outputs):
-        row = ca.sparsify(system.m[i, :])
-        if row.nnz() == 1 and system.l[i].is_zero():
-            j = row.sparsity().get_triplet()[1][0]
-            if row[j].is_one():
-                forces[i] = j
-    if not forces:
+def _force_outputs(system: DaeSystem) -> dict[int, ca.SX]:
+    """The outputs that consist of constraint inputs, z_i = m_i v, as output index i -> m_i."""
+    rows = {
+        i: system.m[i, :]
+        for i in range(system.num_outputs)
+        if system.l[i].is_zero() and not system.m[i, :].is_zero()
+    }
+    if not rows:
         raise ModelError(
-            f"{system.name}: measured_force needs an output that is a constraint input, z_i = v_j"
+            f"{system.name}: measured_force needs an output that is a constraint input or a "
+            "combination of some"
         )
-    return forces
+    return rows
+
+
+def _single(row: ca.SX) -> int | None:
+    """The index j of a row whose only entry is a one; None for another row."""
+    row = ca.sparsify(row)
+    j: int = row.sparsity().get_triplet()[1][0]
+    return j if row.nnz() == 1 and row[j].is_one() else None

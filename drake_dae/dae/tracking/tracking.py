@@ -157,10 +157,8 @@ class TrackingLaw:
         """
         values = {"reference": ca.densify(reference)}
         if self.measured_force is not None:
-            force = ca.SX.zeros(self._inputs["measured_force"].numel())
-            for output, i in self.measured_force.inputs.items():
-                force[i] = reference[int(self.layout.lowest[output])]
-            values["measured_force"] = force
+            wanted = values["reference"][self.layout.lowest.tolist(), :]
+            values["measured_force"] = self.measured_force.inputs_for(wanted)
         if self.integral.outputs:
             values["integral"] = ca.SX.zeros(len(self.integral.outputs))
         symbols = ca.vertcat(*[self._inputs[name] for name in values])

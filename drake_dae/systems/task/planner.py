@@ -44,13 +44,11 @@ class ModelMoment:
         time: The time, in s.
         state: x, shape (n,).
         parameters: All parameters of the laws' system.
-        forces: The constraint forces, those of the contact after the force filter, shape (m,).
     """
 
     time: float
     state: FloatArray
     parameters: FloatArray
-    forces: FloatArray
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,6 @@ class TaskPlanner:
             outputs in m including the distance, then their derivatives. Of several distances it has
             the mean.
         moved: The number of these outputs.
-        forces_function: (x, v, parameters) -> all outputs of the system in contact.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -103,11 +100,7 @@ class TaskPlanner:
         self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
         self.rates = [_rates(task, index, laws[closed], contact, closed) for index, closed in pairs]
         self._nothing = [_no_goals(law) for law in laws]
-        free, closed = laws[FREE], laws[CONTACT].system
-        force = ca.SX.sym("force", closed.num_constraints)
-        self.forces_function = closed.trace(
-            "forces", {"value": closed.outputs(force)}, {"force": force}, often=False
-        )
+        free = laws[FREE]
         chains = free.structure.output_chains
         distance = [
             ca.sum1(ca.vertcat(*(chains[place][order] for place in contact.places))) / contact.size
@@ -133,9 +126,7 @@ class TaskPlanner:
         contact = self._task.contacts[0]
         force = self._task.contact_force if contact else 0.0
         moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
-        begun = np.zeros(self._laws[CONTACT].system.num_outputs)
-        begun[self._contact.main] = force
-        present = self._met(now, contact, begun)
+        present = self._met(now, contact, moment)
         return self._started(now, 0, self._name(0), contact, BEGIN, moment, present)
 
     def following(
@@ -165,8 +156,7 @@ class TaskPlanner:
         else:
             contact = self._task.contacts[place]
         if contact != was:
-            (measured,) = self.forces_function.evaluate(now.state, now.forces, now.parameters)
-            old, present = present, self._met(now, contact, measured)
+            old, present = present, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):
                 if i not in self._contact.places:
                     size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
@@ -204,18 +194,18 @@ class TaskPlanner:
             change, law.layout, goals.function, goals.named, rate, present, over, origin
         )
 
-    def _met(self, now: ModelMoment, contact: bool, measured: FloatArray) -> FloatArray:
+    def _met(self, now: ModelMoment, contact: bool, moment: Moment) -> FloatArray:
         """R of a law from the current outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        Forces of degree 0 are the measured ones.
+        A force of degree 0 is the measured one, and moments of degree 0 are zero: from an even
+        pressure on, all points of a face are pressed to the surface.
         """
         law = self._laws[contact]
         reference = np.zeros(law.layout.reference_size)
         coordinates = law.error_coordinates(now.state, reference, now.parameters)
         reference[law.layout.chained] = np.delete(coordinates, _integral_places(law))
-        for place in self._contact.places if contact else ():
-            if law.degrees[place] == 0:
-                reference[law.layout.lowest[place]] = measured[place]
+        if contact and law.degrees[self._contact.main] == 0:
+            reference[law.layout.lowest[self._contact.main]] = moment.force
         return reference
 
     def _name(self, place: int) -> str:

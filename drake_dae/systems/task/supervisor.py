@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -54,8 +53,8 @@ class TaskSupervisor(LeafSystem):
         ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
             rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
-            while the other law is active, while no force is measured, just after a touch, and while
-            `hold` is not 0.
+            while the other law is active, while no force is measured at one of the points, just
+            after a touch, and while `hold` is not 0.
         tared_force: The measured forces minus the bias of the sensor, shape (m,); only with a
             tare_time.
 
@@ -152,12 +151,8 @@ class TaskSupervisor(LeafSystem):
         return self._witnesses
 
     def _now(self, context: Context) -> ModelMoment:
-        parameters, forces = context.get_numeric_parameter(0).CopyToVector(), np.zeros(0)
-        if self.progress(context).segments:
-            forces = self._force_port.Eval(context).copy()
-            forces[list(self._contact.forces)] = self._filtered(context)[: self._contact.size]
-        time, state = context.get_time(), self._state_port.Eval(context)
-        return ModelMoment(time, state, parameters, forces)
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        return ModelMoment(context.get_time(), self._state_port.Eval(context), parameters)
 
     def _segment(self, context: Context) -> ReferenceSegment:
         """The current references."""
@@ -172,9 +167,7 @@ class TaskSupervisor(LeafSystem):
         contact, lowest = self._contact, segment.layout.lowest
         wanted = [contact.main] if change.in_contact else list(contact.places)
         desired = np.mean(segment.reference(time)[lowest[wanted]])
-        forces, off_center = self._filtered(context)[: contact.size], 0.0
-        if self.task.watches("eccentricity"):
-            off_center = float(eccentricity(ca.DM(forces), self.task.contact_force))
+        forces = self._filtered(context)[: contact.size].tolist()
         port, signal = self._control_port, 0.0
         control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
@@ -192,7 +185,7 @@ class TaskSupervisor(LeafSystem):
             travel=float(np.linalg.norm(moved - segment.origin)),
             work=self._traced.work_of(context.get_discrete_state(self._held).value()),
             control=control,
-            eccentricity=off_center,
+            eccentricity=float(eccentricity(forces, self.task.contact_force)),
             signal=signal,
         )
 
@@ -348,8 +341,9 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        force = float(np.sum(self._filtered(context)[: self._contact.size]))
-        is_open = not begin.in_contact or force < self.task.contact_force
+        size = self._contact.size
+        least = size * float(np.min(self._filtered(context)[:size]))
+        is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         settles = (
             self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over

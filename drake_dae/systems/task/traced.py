@@ -219,7 +219,8 @@ class TracedTask:
             desired += values
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
-        is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
+        least = size * ca.mmin(self._each)
+        is_open = ca.logic_or(contact < 0.5, least < self._task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
         values = [desired, self._named["place"], contact, self._named["ending"]]
         shown = ca.Function("shown", inputs, values)
@@ -282,7 +283,7 @@ class TracedTask:
             travel=ca.norm_2(first - self._origin),
             work=self.tally.work(self._counted()),
             control=control,
-            eccentricity=eccentricity(self._each, self._task.contact_force),
+            eccentricity=eccentricity(ca.vertsplit(self._each), self._task.contact_force),
         )
         return moment, inputs, tuple(sources)
 

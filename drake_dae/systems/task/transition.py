@@ -36,10 +36,8 @@ class SampledTask(TracedTask):
         law, contact = self._laws[FREE], int(self._task.contacts[0])
         x, parameters = law.system.state, law.system.parameter_symbol
         force = self._task.contact_force if contact else 0.0
-        measured = ca.SX.zeros(law.system.num_outputs)
-        measured[self._contact.main] = force
         motion = self._plan.motion_function.function.call([x, parameters])[0]
-        present = [self._met(which, measured) for which in (FREE, CONTACT)]
+        present = [self._met(which, ca.SX(force)) for which in (FREE, CONTACT)]
         held = ca.SX.zeros(self.size)
         self._begin_phase(held, ca.SX(0), ca.SX(contact), present, motion)
         held[NAMES.index("felt")] = self._time
@@ -66,11 +64,10 @@ class SampledTask(TracedTask):
         to, approaches, ending = self._successors(ended)
 
         was = named["contact"]
-        measured = self._plan.forces_function.function.call([x, self._forces, parameters])[0]
         before = [self._reference(which) for which in (FREE, CONTACT)]
         present = []
         for which in (FREE, CONTACT):
-            met = self._met(which, measured)
+            met = self._met(which, self._force)
             for i, first in enumerate(self._laws[which].layout.lowest.tolist()):
                 if i not in self._contact.places:
                     size = self._laws[which].degrees[i] + 1
@@ -148,13 +145,8 @@ class SampledTask(TracedTask):
         ):
             held[NAMES.index(name)] = value
 
-    def _met(self, which: int, measured: ca.SX) -> ca.SX:
-        """R of a law from the current outputs, as `TaskPlanner`.
-
-        Args:
-            which: The law.
-            measured: The outputs of the system in contact by the measured forces.
-        """
+    def _met(self, which: int, force: ca.SX) -> ca.SX:
+        """R of a law from the current outputs and the measured force, as `TaskPlanner`."""
         law, free = self._laws[which], self._laws[FREE].system
         chains = [
             chain[:degree]
@@ -165,9 +157,8 @@ class SampledTask(TracedTask):
         function = ca.Function("outputs", own, [rows])
         reference = ca.SX.zeros(law.layout.reference_size)
         reference[law.layout.chained.tolist()] = function(free.state, free.parameter_symbol)
-        for place in self._contact.places if which == CONTACT else ():
-            if law.degrees[place] == 0:
-                reference[int(law.layout.lowest[place])] = measured[place]
+        if which == CONTACT and law.degrees[self._contact.main] == 0:
+            reference[int(law.layout.lowest[self._contact.main])] = force
         return reference
 
     def _contact_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:

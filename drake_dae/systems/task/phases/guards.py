@@ -1,6 +1,8 @@
 """Guards: limits at which a phase fails."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Literal
 
 import casadi as ca
@@ -64,18 +66,23 @@ class PhaseGuard:
         """The reason of a failure in words."""
         unit = f" {UNITS[self.of]}".rstrip()
         over = f", in {self.samples} samples" if self.samples > 1 else ""
-        return f"a {self.of} of {value:.4g}{unit}, where its guard has {self.most:g}{unit}{over}"
+        article = "an" if self.of == "eccentricity" else "a"
+        return f"{article} {self.of} of {value:.4g}{unit}, where its guard has {self.most:g}{unit}{over}"
 
 
-def eccentricity(forces: ca.SX, contact_force: float) -> ca.SX:
-    """The distance of the center of pressure from the center of the points of a face.
+def eccentricity(forces: Sequence[float], contact_force: float) -> float:
+    """The distance of the center of pressure from the center of a face of k points.
 
-    1 where it is on an edge of the triangle of three points, and one of them has no force:
-    1 - k min_i lambda_i / sum_i lambda_i. It is 0 where the force is below contact_force.
+    1 - k min lambda_i / sum lambda_i is 1 where it is on an edge of the triangle of three points,
+    and one of them has no force. It is 0 where the sum is below contact_force.
 
     Args:
-        forces: lambda, in N, shape (k, 1).
+        forces: lambda, in N, as numbers or expressions.
         contact_force: As of a `Task`.
     """
-    count, total = forces.numel(), ca.sum1(forces)
-    return ca.if_else(total < contact_force, 0, 1 - count * ca.mmin(forces) / total)
+    if len(forces) == 1:
+        return 0.0
+    total = sum(forces)
+    off: float = 1.0 - len(forces) * reduce(ca.fmin, forces) / ca.fmax(total, contact_force)
+    eccentric: float = ca.if_else(total < contact_force, 0.0, off)
+    return eccentric

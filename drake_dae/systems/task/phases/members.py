@@ -76,11 +76,12 @@ class Approach(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Press(Phase):
-    """The force goes smoothly to a goal.
+    """The force goes smoothly to a goal, and the moments of a face to zero.
 
     Attributes:
         force: The goal, in N: a positive number, or a reference, whose time starts with the phase.
         tolerance: The largest error of the force at which the phase ends, in N.
+        eccentricity: The largest eccentricity of a face at which it ends, 0 to 1; see `PhaseGuard`.
         over: The duration of the transition from the previous references, in s.
         within: The largest duration of the phase, in s.
         if_late: The successor if it lasts longer; on_failure if left out.
@@ -89,6 +90,7 @@ class Press(Phase):
 
     force: float | Reference
     tolerance: float = 1.0
+    eccentricity: float = 0.5
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     if_lost: str | None = field(default=None, kw_only=True)
@@ -97,7 +99,8 @@ class Press(Phase):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive("Press: tolerance", self.tolerance)
+        for name in ("tolerance", "eccentricity"):
+            positive(f"Press: {name}", getattr(self, name))
         if not isinstance(self.force, Reference):
             positive("Press: force", self.force)
 
@@ -111,8 +114,17 @@ class Press(Phase):
 
     def margin(self, now: Moment, contact_force: float) -> float:
         off = abs(now.force - now.wanted)
-        margin: float = ca.fmax(self.over - now.time, off - self.tolerance)
+        tipped = now.eccentricity - self.eccentricity
+        margin: float = ca.fmax(ca.fmax(self.over - now.time, off - self.tolerance), tipped)
         return margin
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        if now.eccentricity <= self.eccentricity:
+            return super().lateness(now, contact_force)
+        return (
+            f"{self.name} has waited {self.within:g} s for all points of its face, and has an "
+            f"eccentricity of {now.eccentricity:.3g}, more than {self.eccentricity:g}"
+        )
 
     def awaited(self, contact_force: float) -> str:
         return f"a force within {self.tolerance:g} N of its reference"
