@@ -44,7 +44,7 @@ def links_in_the_way(
     if (model := loop.plant.model) is None:
         return ()
     shapes, states = LinkShapes(model, loop.scene_graph), record["state"]
-    parameters = _parameters(loop, record, context)
+    parameters = loop.plant_parameters(record, context)
     behind = links_behind(model, record.time, states, parameters, shapes)
     return *behind, *collisions(shapes, record.time, states)
 
@@ -60,18 +60,9 @@ def nearness(loop: ClosedLoop, record: Record, context: Context) -> Nearness:
     if (model := loop.plant.model) is None:
         return Nearness()
     shapes = LinkShapes(model, loop.scene_graph)
-    moved = model, record.time, record["state"], _parameters(loop, record, context)
+    moved = model, record.time, record["state"], loop.plant_parameters(record, context)
     links = nearest_links(shapes, record.time, record["state"])
     return Nearness(
         (*surface_distances(*moved, shapes), *([] if links is None else [links])),
         contact_speeds(*moved),
     )
-
-
-def _parameters(loop: ClosedLoop, record: Record, context: Context) -> FloatArray:
-    """The parameters of the plant at the times of a record, one row each."""
-    plant = loop.plant
-    values = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
-    if "exogenous" in record:
-        values[:, plant.exogenous_places] = record["exogenous"]
-    return values

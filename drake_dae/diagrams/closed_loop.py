@@ -159,11 +159,24 @@ class ClosedLoop:
         values = {name: recorded.values for name, recorded in record.signals.items()}
         if context is not None:
             at_controller = controller.GetMyContextFromRoot(context)
-            along = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+            along = self.plant_parameters(record, context)
             values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
         derived = controller.derived(at_controller, record.time, values)
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return Record(record.time, {**record.signals, **added})
+
+    def plant_parameters(self, record: Record, context: Context) -> FloatArray:
+        """The parameters of the plant at the times of a record, one row each.
+
+        Args:
+            record: The record.
+            context: The diagram's context after the run.
+        """
+        plant = self.plant
+        values = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+        if "exogenous" in record:
+            values[:, plant.exogenous_places] = record["exogenous"]
+        return values
 
     def predicted_error(self, record: Record) -> FloatArray:
         """The predicted error (30), (31) of a record, one column for each output."""

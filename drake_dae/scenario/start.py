@@ -84,7 +84,13 @@ def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> No
         of_law = structure.system.parameters_of(plant.dae, parameters)
         q = structure.manifold.settle(near, of_law)[: guess.size]
         _check_limits(model, q, "Give")
-        plant.set_state(at_plant, model.rest_state(q, forces, parameters))
+        at_rest = model.rest_state(q, forces, parameters)
+        if scenario.exogenous and not structure.manifold.is_consistent(at_rest, of_law):
+            raise ModelError(
+                "a task begins at rest, and its first phase in contact with a surface that moves "
+                "then; begin with a phase without contact, such as Approach"
+            )
+        plant.set_state(at_plant, at_rest)
     _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
 
 

@@ -61,6 +61,17 @@ class Exogenous:
                 degrees.append(max(orders, default=0))
         return tuple(degrees)
 
+    def rates(self) -> dict[str, slice]:
+        """Name of an exogenous parameter -> the place of its derivatives in the parameter vector.
+
+        The entries of the first derivative come first, then those of the second one.
+        """
+        first, rates = sum(p.value.size for p in self.parameters), dict[str, slice]()
+        for p in self.moving:
+            rates[p.name] = slice(first, first + p.value.size * len(p.derivatives))
+            first = rates[p.name].stop
+        return rates
+
     def places(self, degrees: Sequence[int]) -> list[int]:
         """Returns the indices of W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) in the parameter vector.
 

@@ -399,7 +399,8 @@ class DaeSystem:
     def parameters_of(self, other: "DaeSystem", values: ArrayLike) -> FloatArray:
         """Returns the parameter vector of this system with the values that another system has.
 
-        Those are taken that have the same name and size in both.
+        Those are taken that have the same name and size in both, with their derivatives if they are
+        exogenous.
 
         Args:
             other: A system of the same robot, as that of a plant with a payload.
@@ -421,6 +422,12 @@ class DaeSystem:
             if sizes.get(p.name) == p.value.size:
                 place = self.parameter_slice(p.name)
                 parameters[..., place] = values[..., other.parameter_slice(p.name)]
+        own, rates = {p.name: p.value.size for p in self.parameters}, other.exogenous.rates()
+        for name, to in self.exogenous.rates().items():
+            if name in rates and sizes[name] == own[name]:
+                count = min(to.stop - to.start, rates[name].stop - rates[name].start)
+                first = rates[name].start
+                parameters[..., to.start : to.start + count] = values[..., first : first + count]
         return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:

@@ -31,7 +31,6 @@ from drake_dae.systems.task.task import Task, check_sampled
 from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {
-    "exogenous": "nothing may move in a task; leave it out",
     "tolerances": "the phases of a task have their own, and times to end within; leave it out",
 }
 """The settings of a loop that a task does not support, each with the reason."""
@@ -68,8 +67,8 @@ class TaskController(Diagram, Controller):
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,). The control does not depend on it in the
             same instant, unless a law takes a measured force.
-        exogenous: The disturbance and the coefficients of friction from an observer, if the laws
-            have them.
+        exogenous: The exogenous signals of the laws with their derivatives, as of a surface that
+            moves, or an observer's estimates; see `ParameterizedSystem`.
         hold: While it is not 0, no integral is updated, shape (1,); 0 without a wire.
         signal_<name>: A signal that phases wait for, shape (1,); it is present above 1/2. 0 without
             a wire.
@@ -154,6 +153,8 @@ class TaskController(Diagram, Controller):
                 port = controller.GetInputPort("exogenous")
                 if which == FREE:
                     builder.ExportInput(port, "exogenous")
+                    if self.supervisor.HasInputPort("exogenous"):
+                        builder.ConnectInput("exogenous", self.supervisor.GetInputPort("exogenous"))
                 else:
                     builder.ConnectInput("exogenous", port)
             if count := len(its_law.integral.outputs):
@@ -168,6 +169,8 @@ class TaskController(Diagram, Controller):
             builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(name))
             controllers.append(controller)
         self.free_controller, self.controller = controllers
+        self.exogenous_layout = self.controller.exogenous_layout
+        self.exogenous_places = self.controller.exogenous_places
         control = switch.GetOutputPort("control")
         builder.ExportOutput(control, "control")
         if task.watches("control"):

@@ -7,7 +7,6 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed, unknown_name
-from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.structure.redundancy import with_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -144,17 +143,11 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
                 f"the free law must have the output '{distance}' where the law has "
                 f"'{closed.output_signals[place].name}'; make its system by open_contact"
             )
-    moving = [p.name for p in closed.exogenous.moving]
-    if moving and DISTURBANCE not in moving:
-        raise ModelError(
-            f"{closed.name}: the laws of a task take only the exogenous signals of an observer; "
-            f"'{moving[0]}' may not move"
-        )
     if law.exogenous_degrees != free_law.exogenous_degrees:
         raise ModelError(
-            f"{closed.name}: the law in contact needs {law.exogenous_degrees} derivatives of an "
-            f"observer's estimates, the free law {free_law.exogenous_degrees}; leave the observer "
-            "out"
+            f"{closed.name}: the law in contact needs {law.exogenous_degrees} derivatives of its "
+            f"exogenous signals, as of an observer's estimates, the free law "
+            f"{free_law.exogenous_degrees}; leave them, or the observer, out"
         )
     for i in range(closed.num_outputs):
         if i not in contact.places and law.degrees[i] != free_law.degrees[i]:

@@ -30,8 +30,8 @@ def predicted_errors(
         contact: The contact that opens and closes.
         segments: The references of the run.
         times: The times of the run, in s, shape (k,).
-        values: "state", "outputs", those of the law in contact, and "integral" and "free_integral"
-            if the laws have any, one row for each time.
+        values: "state", "outputs", those of the law in contact, "parameters" of the laws' system,
+            and "integral" and "free_integral" if the laws have any, one row for each time.
     """
     places, own = places_at(segments, times), list(contact.places)
     predicted = np.zeros((times.size, len(laws[CONTACT].degrees) + contact.size))
@@ -47,6 +47,7 @@ def predicted_errors(
             times[rows] - times[start],
             values["state"][start],
             segment.reference(max(segment.change.time, times[start])),
+            values["parameters"][start] if "parameters" in values else None,
             integral=values[name][start] if law.integral.outputs else None,
         )
         columns = np.arange(errors.shape[1])

@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
@@ -42,6 +43,8 @@ class TaskSupervisor(LeafSystem):
         measured_force: All constraint forces, shape (m,).
         hold: While it is not 0, the law's integrals are not updated, shape (1,); 0 without a wire.
         control: u, shape (p,); only if a guard watches it.
+        exogenous: As of the laws; only if they have exogenous signals besides an observer's. Without
+            a wire these keep the values of the parameters.
         signal_<name>: The signals that phases wait for, shape (1,); 0 without a wire.
 
     Output ports:
@@ -92,6 +95,11 @@ class TaskSupervisor(LeafSystem):
         declared, self._control_port = self.DeclareVectorInputPort, None
         if task.watches("control"):
             self._control_port = declared("control", system.num_controls)
+        self._moving: list[int] = []
+        moving = [parameter.name for parameter in system.exogenous.moving]
+        if moving and DISTURBANCE not in moving:
+            self._moving = system.exogenous.places(laws[FREE].exogenous_degrees)
+            declared("exogenous", len(self._moving))
         self.signal_ports = {name: declared(SIGNAL + name, 1) for name in task.signals}
         self.DeclareNumericParameter(BasicVector(system.parameter_values))
         self._index = self.DeclareAbstractState(AbstractValue.Make(TaskProgress()))
@@ -119,6 +127,8 @@ class TaskSupervisor(LeafSystem):
             self.input_port_ticket(self._state_port.get_index()),
             self.all_parameters_ticket(),
         }
+        if self._moving:
+            by_state.add(self.input_port_ticket(self.GetInputPort("exogenous").get_index()))
         by_time = by_state | {self.time_ticket()}
         filtered = {
             self.input_port_ticket(self._force_port.get_index()),
@@ -152,6 +162,8 @@ class TaskSupervisor(LeafSystem):
 
     def _now(self, context: Context) -> ModelMoment:
         parameters = context.get_numeric_parameter(0).CopyToVector()
+        if self._moving and self.GetInputPort("exogenous").HasValue(context):
+            parameters[self._moving] = self.GetInputPort("exogenous").Eval(context)
         return ModelMoment(context.get_time(), self._state_port.Eval(context), parameters)
 
     def _segment(self, context: Context) -> ReferenceSegment:
@@ -365,5 +377,6 @@ class TaskSupervisor(LeafSystem):
                 partial(self._traced.reaction, period) if period else None,
             ),
             unwired={name: zero(name) for name in unwired},
+            moving=tuple(self._moving),
             ports={name: (Signal(name),) for name in ("phase", "ending")},
         )
