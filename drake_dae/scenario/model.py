@@ -27,6 +27,7 @@ from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
+from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.parts.written import WrittenForm, make
 from drake_dae.scenario.robot_file.links import robot_links
@@ -151,7 +152,8 @@ def _read(
     _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
 
     # The completion.
-    completed = complete(scenario, links, constraints, plant_constraints(links), guess)
+    completing = complete if scenario.task is None else complete_task
+    completed = completing(scenario, links, constraints, plant_constraints(links), guess)
     return _BuiltRobot(name, links, constraints, stages, known_forces, completed)
 
 

@@ -113,7 +113,6 @@ def test_analysis_of_a_task_is_that_of_its_contact(file):
         ("task.gains={all: [5]}", r"task\.gains: the error dynamics \(30\) are not Hurwitz"),
         ("references={tool.z: 0.3}", "references: a task has the references of its phases"),
         ("start.errors={tool.z: 0.1}", r"start\.errors: a task begins at start\.positions"),
-        ("start={}", r"start\.positions: needed"),
         ("integral=[wall.force]", "integral: .*wall.force"),
     ],
 )

@@ -1,6 +1,6 @@
 """Completion of a scenario: missing outputs, and the start."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,16 +9,14 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.force_outputs import force_outputs, force_rows
 from drake_dae.robots.links.links import Links
-from drake_dae.scenario.completion.candidates import Candidates, merged
+from drake_dae.scenario.completion.candidates import merged
 from drake_dae.scenario.completion.choice import best_joints, first_independent
 from drake_dae.scenario.completion.postures import Posture, Postures
-from drake_dae.scenario.completion.referred import ReferredRows, value_at
+from drake_dae.scenario.completion.referred import ReferredRows
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.scenario.completion.setting import Setting
 from drake_dae.scenario.completion.shortage import check_independent, why_none
-from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.written import make
 from drake_dae.scenario.scenario import Scenario
 
 REGULAR = 1e-3
@@ -67,21 +65,13 @@ def complete(
     Raises:
         ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
-    bound = ConstraintSet([*constraints, *of_plant])
-    outputs = [make(form, constraints) for form in scenario.outputs]
-    _check_coordinates(
-        scenario, bound, [s.name for output in outputs for s in output.signals(links)]
-    )
-    size = sum(len(output.signals(links)) for output in outputs)
-    steered = force_outputs(scenario.forces, bound)
-    names = [signal.name for output in steered for signal in output.signals(bound)]
-    S = force_rows(steered, bound, links)
-    actuators = len(links.actuator_signals) + len(bound.motors)
-    missing = actuators - size - S.shape[0]
+    setting = Setting.of(scenario, links, constraints, of_plant)
+    bound, size, missing = setting.bound, len(setting.names), setting.missing
+    _check_coordinates(scenario, bound, setting.names)
     is_placed = len(scenario.start.positions) == len(links.position_signals)
     if (
-        not (size or S.shape[0] or scenario.references)  # A robot that is only simulated.
-        or scenario.task is not None
+        # A robot that is only simulated.
+        not (size or setting.S.shape[0] or scenario.references)
         or scenario.control_weights
         or scenario.compliances is not None
         # The model refuses such actuators.
@@ -90,11 +80,8 @@ def complete(
         or (missing == 0 and is_placed)
     ):
         return Completed(scenario)
-    candidates = Candidates(scenario, links, outputs, bound)
-    with at("plant_parameters or exogenous"):
-        postures = Postures(
-            links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
-        )
+    candidates, names = setting.candidates(scenario, links), setting.forces
+    postures = setting.postures(scenario, links, candidates)
     # Rows named by references are known before the posture, from the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
     if near is not None:
@@ -184,7 +171,7 @@ def _with_outputs(
         raise ScenarioError(("outputs", text))
     resting = [*along, *directions, *joints]
     chosen = [*named[referred.given :], *resting]
-    values = _rounded(posture.rows)
+    values = rounded(posture.rows)
     if is_normal:
         values[candidates.tilts] = 0.0
     constants = {candidates.signals[row].name: float(values[row]) for row in resting}
@@ -280,24 +267,19 @@ def _started(scenario: Scenario, referred: ReferredRows, posture: Posture) -> Sc
 def _named(referred: ReferredRows, posture: Posture) -> dict[str, float]:
     """The positions of a posture by their names, rounded."""
     names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
-    return dict(zip(names, _rounded(posture.q).tolist(), strict=True))
+    return dict(zip(names, rounded(posture.q).tolist(), strict=True))
 
 
-def _rounded(values: FloatArray) -> FloatArray:
+def rounded(values: FloatArray) -> FloatArray:
     """Values as they are written, without -0."""
     return np.round(values, _DIGITS) + 0.0
 
 
 def _start_note(referred: ReferredRows, posture: Posture) -> str:
-    positions = (f"{name}: {value:.4g}" for name, value in _named(referred, posture).items())
-    return f"start found: {{{', '.join(positions)}}}"
+    return start_note(_named(referred, posture))
 
 
-def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
-    """Parameter name -> value at the start, for the parameters that differ from their defaults."""
-    begin = scenario.integrator.start_time
-    values = {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
-    for name, references in scenario.exogenous.items():
-        entries = [value_at(r, getattr(r, "size", 1), begin) for r in references]
-        values[name] = np.concatenate([np.zeros(0), *entries])
-    return values
+def start_note(positions: Mapping[str, float]) -> str:
+    """The note on a start: the positions of all joints."""
+    texts = (f"{name}: {value:.4g}" for name, value in positions.items())
+    return f"start found: {{{', '.join(texts)}}}"

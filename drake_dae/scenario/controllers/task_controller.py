@@ -26,8 +26,6 @@ def check_task(scenario: Scenario) -> None:
         problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
-    if not scenario.start.positions:
-        problems.append(("start.positions", "needed: where the task begins, joint by joint"))
     if problems:
         raise ScenarioError(*problems)
 

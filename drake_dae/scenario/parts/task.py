@@ -18,8 +18,10 @@ class ScenarioTask:
     """A sequence of phases, in place of `references`.
 
     It starts at rest at start.positions, or in contact near them if the first phase requires
-    contact. While the contact is open, its distance, such as "wall.distance", is an output in place
-    of its force, and each distance of a face. With ideal constraints in `plant` the contact opens and closes without bouncing.
+    contact. Without start.positions it starts 20 mm before the surface, with the first reference of
+    each output. While the contact is open, its distance, such as "wall.distance", is an output in
+    place of its force, and each distance of a face. With ideal constraints in `plant` the contact
+    opens and closes without bouncing.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.
