@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.robots.geometry.clearances import LinkBehind, links_behind, surface_distances
 from drake_dae.robots.geometry.shapes import (

@@ -43,7 +43,7 @@ class TaskSupervisor(LeafSystem):
         measured_force: All constraint forces, shape (m,).
         hold: While it is not 0, the law's integrals are not updated, shape (1,); 0 without a wire.
         control: u, shape (p,); only if a guard watches it.
-        exogenous: As of the laws; only if they have exogenous signals besides an observer's. Without
+        exogenous: As of the laws; only for exogenous signals that are not an observer's. Without
             a wire these keep the values of the parameters.
         signal_<name>: The signals that phases wait for, shape (1,); 0 without a wire.
 

@@ -1,6 +1,5 @@
 """Outputs and starts of scenarios with a task that gives neither."""
 
-import numpy as np
 import pytest
 from arms import parse
 from numpy.testing import assert_allclose
