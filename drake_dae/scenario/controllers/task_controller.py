@@ -64,7 +64,9 @@ def task_controller(
         free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
     with at("task"):
         # The noise of the sum over the points.
-        return TaskController(task.make(noise * len(points) ** 0.5), law, free_law, sample_period=period)
+        return TaskController(
+            task.make(noise * len(points) ** 0.5), law, free_law, sample_period=period
+        )
 
 
 def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:

@@ -19,7 +19,8 @@ class ScenarioTask:
 
     It starts at rest at start.positions, or in contact near them if the first phase requires
     contact. While the contact is open, its distance, such as "wall.distance", is an output in place
-    of its force, and each distance of a face. With ideal constraints in `plant` the contact opens and closes without bouncing.
+    of its force, and each distance of a face. With ideal constraints in `plant` the contact opens
+    and closes without bouncing.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.

@@ -94,9 +94,7 @@ def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
     outputs = listed(signal.name for signal in system.output_signals)
     others = [i for i in range(len(names)) if i not in forces]
     depending = [
-        j
-        for j in range(system.num_outputs)
-        if any(not system.m[j, i].is_zero() for i in forces)
+        j for j in range(system.num_outputs) if any(not system.m[j, i].is_zero() for i in forces)
     ]
     fitting = [
         j

@@ -253,9 +253,7 @@ class TracedTask:
         first, rates = motion[2 : 2 + moved], motion[2 + moved :]
         contact = self._contact
         distances = self._reference(FREE)[law.layout.lowest[list(contact.places)].tolist()]
-        force = self._reference(CONTACT)[
-            int(self._laws[CONTACT].layout.lowest[contact.main])
-        ]
+        force = self._reference(CONTACT)[int(self._laws[CONTACT].layout.lowest[contact.main])]
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
         if self._task.watches("control"):
