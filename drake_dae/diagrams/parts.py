@@ -266,9 +266,10 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
         controller: The controller of the integrals.
 
     Returns:
-        Its output port, for the controller's `hold`; empty if there is no such integral.
+        Its output port, for the controller's `hold`; empty if there is no such integral, or the
+        controller opens contacts and does so itself.
     """
-    if not controller.HasInputPort("hold"):
+    if controller.takes_over or not controller.HasInputPort("hold"):
         return []
     law = controller.law
     rows = law.measured_force.rows if law.measured_force else {}
@@ -278,8 +279,6 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
             integrates[row, column] = output in rows and not rows[output][normal].is_zero()
     if not integrates.any():
         return []
-    if controller.GetInputPort("hold").size() == 1:  # As of a task, for all integrals.
-        integrates = integrates.max(axis=0, keepdims=True)
     hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())

@@ -50,6 +50,16 @@ DEAR = (
 """Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
 
 
+def has_task(name: str) -> bool:
+    """Whether a shipped scenario is a task, with two laws."""
+    return "\ntask:" in shipped_scenarios()[name].read_text("utf-8")
+
+
+def is_apart(name: str) -> bool:
+    """Whether a shipped scenario has a task, or a plant whose contact gives way or opens."""
+    return has_task(name) or "\nplant:" in shipped_scenarios()[name].read_text("utf-8")
+
+
 def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
     """The shipped scenarios except for some: all slow but the first one, the dear ones thorough."""
     marks = {

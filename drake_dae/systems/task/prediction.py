@@ -33,7 +33,7 @@ def predicted_errors(
         values: "state", "outputs", those of the law in contact, "parameters" of the laws' system,
             and "integral" and "free_integral" if the laws have any, one row for each time.
     """
-    places, own = places_at(segments, times), list(contact.places)
+    places, own = places_at(segments, times), np.array(contact.places)
     predicted = np.zeros((times.size, len(laws[CONTACT].degrees) + contact.size))
     for which, segment in enumerate(segments):
         rows = np.flatnonzero(places == which)

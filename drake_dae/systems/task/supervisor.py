@@ -176,10 +176,9 @@ class TaskSupervisor(LeafSystem):
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
         time, change = context.get_time(), segment.change
         distance, rate, moved, rates = self._plan.motion(self._now(context))
-        contact, lowest = self._contact, segment.layout.lowest
+        contact, forces = self._contact, self._traced.forces(self._filtered(context))
         wanted = [contact.main] if change.in_contact else list(contact.places)
-        desired = np.mean(segment.reference(time)[lowest[wanted]])
-        forces = self._filtered(context)[: contact.size].tolist()
+        desired = np.mean(segment.reference(time)[segment.layout.lowest[wanted]])
         port, signal = self._control_port, 0.0
         control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
@@ -188,7 +187,7 @@ class TaskSupervisor(LeafSystem):
                 signal = float(self.signal_ports[name].Eval(context)[0])
         return Moment(
             time=time - change.time,
-            force=float(np.sum(forces)),
+            force=sum(forces),
             distance=distance,
             rate=rate,
             wanted=float(desired),
@@ -353,8 +352,7 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        size = self._contact.size
-        least = size * float(np.min(self._filtered(context)[:size]))
+        least = self._contact.size * min(self._traced.forces(self._filtered(context)))
         is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         settles = (

@@ -129,6 +129,11 @@ class TracedTask:
         """
         return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
 
+    def forces(self, filtered: FloatArray) -> list[float]:
+        """The forces of the contact after the filter, in N, one for each of its points."""
+        forces: list[float] = filtered[: self._contact.size].tolist()
+        return forces
+
     def bias(self, filtered: FloatArray) -> FloatArray:
         """The bias of the forces of the contact, in N, from the state of the force filter."""
         return filtered[self._contact.size : -1]

@@ -32,6 +32,11 @@ MEMBERS = {
         Moment(0.4, 20.0, 0.0, 0.0, 20.0),
         Moment(0.5, 20.0, 0.0, 0.0, 20.0),
     ),
+    "Press flat": (
+        Press(20.0, eccentricity=0.3),
+        Moment(0.6, 20.0, 0.0, 0.0, 20.0, eccentricity=0.4),
+        Moment(0.6, 20.0, 0.0, 0.0, 20.0, eccentricity=0.2),
+    ),
     "Move": (Move({}, 2.0), Moment(1.9, 20.0, 0.0, 0.0, 20.0), Moment(2.0, 20.0, 0.0, 0.0, 20.0)),
     "Dwell": (Dwell(2.0), Moment(1.9, 0.0, 0.1, 0.0, 0.1), Moment(2.1, 0.0, 0.1, 0.0, 0.1)),
     "Wait": (
@@ -98,6 +103,16 @@ def test_a_release_that_has_left_does_not_wait_for_the_force():
     assert "gone 0.021 m away, and a force of 1 N" in Release().lateness(far, CONTACT_FORCE)
     late = replace(far, time=61.0)
     assert Release().lateness(late, CONTACT_FORCE).startswith("Release has waited 60 s")
+
+
+def test_a_press_on_an_edge_says_what_it_waits_for():
+    on_edge = Moment(60.0, 20.0, 0.0, 0.0, 20.0, eccentricity=1.0)
+    assert Press(20.0).lateness(on_edge, CONTACT_FORCE) == (
+        "Press has waited 60 s for all points of its face, and has an eccentricity of 1, more than "
+        "0.5"
+    )
+    flat = replace(on_edge, force=10.0, eccentricity=0.0)
+    assert "for a force within 1 N" in Press(20.0).lateness(flat, CONTACT_FORCE)
 
 
 @pytest.mark.parametrize("name", MEMBERS)

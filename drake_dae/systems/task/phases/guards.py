@@ -66,8 +66,8 @@ class PhaseGuard:
         """The reason of a failure in words."""
         unit = f" {UNITS[self.of]}".rstrip()
         over = f", in {self.samples} samples" if self.samples > 1 else ""
-        article = "an" if self.of == "eccentricity" else "a"
-        return f"{article} {self.of} of {value:.4g}{unit}, where its guard has {self.most:g}{unit}{over}"
+        which = "an eccentricity" if self.of == "eccentricity" else f"a {self.of}"
+        return f"{which} of {value:.4g}{unit}, where its guard has {self.most:g}{unit}{over}"
 
 
 def eccentricity(forces: Sequence[float], contact_force: float) -> float:
