@@ -98,11 +98,8 @@ class CompiledDiagram:
     @property
     def watched_rates(self) -> int:
         """A bit mask of the `rates` at whose samples the guards of `watched` are checked."""
-        mask = 0
-        for system, _ in self.watched:
-            for update in self.blocks[system].updates:
-                mask |= 1 << self.rate_index(update)
-        return mask
+        updates = [update for system, _ in self.watched for update in self.blocks[system].updates]
+        return sum({1 << self.rate_index(update) for update in updates})
 
     def rate_index(self, update: Update) -> int:
         """The index in `rates` of the function that computes an update."""
@@ -142,19 +139,15 @@ class CompiledDiagram:
         return scales
 
     def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
-        """The continuous and the discrete state in a context of the diagram, shapes (n,), (k,).
-
-        The discrete state of a block with `Block.begins` is NaN.
-        """
+        """The continuous and the discrete state in a context; NaN where `Block.begins` is True."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
             local = system.GetMyContextFromRoot(context)
             state[part] = local.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
-            local, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
-            held[part] = stepped.held(local) if stepped else np.concatenate(discrete_states(local))
-            if self.blocks[system].begins:
-                held[part] = np.nan
+            local, block = system.GetMyContextFromRoot(context), self.blocks[system]
+            groups = [block.stepped.held(local)] if block.stepped else discrete_states(local)
+            held[part] = np.nan if block.begins else np.concatenate(groups)
         return state, held
 
     def set_context(

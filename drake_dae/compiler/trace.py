@@ -1,7 +1,7 @@
 """The CasADi expressions of a diagram: the functions of its blocks, with connected arguments."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 from pydrake.systems.framework import Context, PortDataType, System
@@ -113,13 +113,7 @@ class Expressions:
         """The block of a system: its computations and updates."""
         if system not in self.used:
             block = system.traced() if isinstance(system, Traced) else primitive(system)
-            if self._reacts and block.guard is not None and block.guard.reaction is not None:
-                reaction = block.guard.reaction()
-                updates = (reaction.update,)
-                block = replace(
-                    block, updates=updates, initial=reaction.begin, begins=True, guard=None
-                )
-            self.used[system] = block
+            self.used[system] = block.with_reaction() if self._reacts else block
         return self.used[system]
 
     def port(self, port: Port) -> ca.SX:

@@ -1,7 +1,7 @@
 """The computations of a block as traced functions: the interface between diagram and compiler."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
@@ -206,6 +206,14 @@ class Block:
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
     failure: Callable[[float, Sequence[FloatArray]], SimulationError] | None = None
+
+    def with_reaction(self) -> "Block":
+        """The same block, whose updates make the changes of its guard if it has a `Reaction`."""
+        if self.guard is None or self.guard.reaction is None:
+            return self
+        reaction = self.guard.reaction()
+        begin, update = reaction.begin, reaction.update
+        return replace(self, updates=(update,), initial=begin, begins=True, guard=None)
 
 
 def not_traced(what: str) -> ModelError:

@@ -30,10 +30,7 @@ from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task, check_sampled
 from drake_dae.trace.functions import TracedFunction
 
-_REFUSED = {
-    "tolerances": "the phases of a task have their own, and times to end within; leave it out",
-}
-"""The settings of a loop that a task does not support, each with the reason."""
+_REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
 
 
 @checked(ModelError)
@@ -91,8 +88,7 @@ class TaskController(Diagram, Controller):
             contact may be a face of several points, whose force and moments are outputs; see
             `FaceForces`.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
-        sample_period: The period at which guards are evaluated and errors are integrated, in s; 0
-            for continuously.
+        sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
@@ -246,8 +242,8 @@ class TaskController(Diagram, Controller):
     @property
     def phase_signals(self) -> tuple[Signal, ...]:
         """The names of the phases in a record: "1 Approach", "2 Press", ..., "end"."""
-        names = [phase.name for phase in self.task.plan.phases]
-        return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal("end"))
+        *names, end = self.phase_names
+        return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal(end))
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:

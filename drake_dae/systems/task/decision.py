@@ -1,13 +1,15 @@
 """The decision whether a phase goes on, and how it has ended."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.errors import SimulationError
 from drake_dae.systems.task.phases import Moment, Outcome, Phase
-from drake_dae.systems.task.traced import EARLY
+from drake_dae.systems.task.progress import TaskProgress
+from drake_dae.systems.task.traced import EARLY, TracedTask
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +26,40 @@ class PhaseDecision:
     moment: Moment
     guards: FloatArray
     margins: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        traced: TracedTask,
+        progress: TaskProgress,
+        moment: Moment,
+        time: float,
+        held: FloatArray,
+    ) -> Self:
+        """The decision at one moment of a run.
+
+        Args:
+            traced: The functions of the task.
+            progress: Its progress.
+            moment: The measurements.
+            time: The time, in s.
+            held: The numbers of the task before the sample.
+        """
+        task, change, guards = traced.task, progress.segments[-1].change, np.zeros(0)
+        excess, lost, end, late = moment.force - task.contact_force, np.inf, np.inf, np.inf
+        phases, holds = task.plan.phases, True
+        if change.place < len(phases):
+            phase = phases[change.place]
+            late, holds = float(phase.remaining(moment)), phase.holds_contact
+            if not traced.tares(held):
+                end = float(phase.margin(moment, task.contact_force))
+            margins = traced.tally.margins(phase, traced.tally_of(held), moment)
+            guards = np.array([float(margin) for margin in margins])
+        if holds and change.in_contact and not progress.is_felt:
+            lost = task.patience - (time - progress.felt)
+        felt = excess if progress.is_felt else -excess
+        nearest = np.min(guards, initial=np.inf)
+        return cls(moment, guards, np.array([nearest, end, lost, late, felt]))
 
     @property
     def ends(self) -> bool:

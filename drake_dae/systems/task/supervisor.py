@@ -31,7 +31,7 @@ from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import CONTACT, FREE, ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, ENDINGS
+from drake_dae.systems.task.traced import EARLY, NAMES
 from drake_dae.systems.task.transition import SampledTask
 
 
@@ -39,27 +39,20 @@ class TaskSupervisor(LeafSystem):
     """Runs the phases of a task one after the other; see `TaskController`.
 
     Input ports:
-        estimated_state: x, shape (n,).
-        measured_force: All constraint forces, shape (m,).
-        hold: While it is not 0, the law's integrals are not updated, shape (1,); 0 without a wire.
+        estimated_state, measured_force, hold, signal_<name>: As of `TaskController`.
         control: u, shape (p,); only if a guard watches it.
         exogenous: As of the laws; only for exogenous signals that are not an observer's. Without
             a wire these keep the values of the parameters.
-        signal_<name>: The signals that phases wait for, shape (1,); 0 without a wire.
 
     Output ports:
+        phase, desired_output, tared_force: As of `TaskController`.
         contact_reference, free_reference: R of the active law; zero for the other one.
-        phase: The index of the phase, shape (1,); the number of phases when the task is over.
-        desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces.
         in_contact: 1 while the law in contact is active, shape (1,).
         ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
             rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
             while the other law is active, while no force is measured at one of the points, just
             after a touch, and while `hold` is not 0.
-        tared_force: The measured forces minus the bias of the sensor, shape (m,); only with a
-            tare_time.
 
     Args:
         task: The phases.
@@ -139,9 +132,9 @@ class TaskSupervisor(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
         size = self._laws[FREE].system.num_outputs + self._contact.size
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
-        progress = {self.abstract_state_ticket(self._index)}
-        for name in ("phase", "in_contact", "ending"):
-            self.DeclareVectorOutputPort(name, 1, weakly(self._calc_change, name), progress)
+        progress = {self.abstract_state_ticket(self._index), self.discrete_state_ticket(self._held)}
+        for name, number in (("phase", "place"), ("in_contact", "contact"), ("ending", "ending")):
+            self.DeclareVectorOutputPort(name, 1, weakly(self._calc_number, number), progress)
         hold = self.input_port_ticket(self._hold_port.get_index())
         for name, calc, tickets in (
             ("free_hold", weakly(self._calc_free_hold), by_state),
@@ -207,23 +200,9 @@ class TaskSupervisor(LeafSystem):
         return self._traced.filtered(held, measured)
 
     def _decision(self, context: Context, progress: TaskProgress) -> PhaseDecision:
-        task, segment = self.task, progress.segments[-1]
-        moment, guards = self._moment(context, segment), np.zeros(0)
-        excess, lost, end, late = moment.force - task.contact_force, np.inf, np.inf, np.inf
-        phase = None if self._is_over(segment) else self._phases[segment.change.place]
-        if phase is not None:
-            late = float(phase.remaining(moment))
-            held = context.get_discrete_state(self._held).value()
-            if not self._traced.tares(held):
-                end = float(phase.margin(moment, task.contact_force))
-            margins = self._traced.tally.margins(phase, self._traced.tally_of(held), moment)
-            guards = np.array([float(margin) for margin in margins])
-        holds = phase is None or phase.holds_contact
-        if holds and segment.change.in_contact and not progress.is_felt:
-            lost = task.patience - (context.get_time() - progress.felt)
-        felt = excess if progress.is_felt else -excess
-        nearest = np.min(guards, initial=np.inf)
-        return PhaseDecision(moment, guards, np.array([nearest, end, lost, late, felt]))
+        moment = self._moment(context, progress.segments[-1])
+        held = context.get_discrete_state(self._held).value()
+        return PhaseDecision.of(self._traced, progress, moment, context.get_time(), held)
 
     def _guard(self, context: Context) -> float:
         """A number that is positive until the phase ends: Drake locates its zero."""
@@ -325,15 +304,11 @@ class TaskSupervisor(LeafSystem):
         segment = self._segment(context)
         output.SetFromVector(segment.desired(self._contact, context.get_time()))
 
-    def _calc_change(self, name: str, context: Context, output: BasicVector) -> None:
-        segments = self.progress(context).segments
-        place, contact, chosen = 0, self.task.contacts[0], ""
-        if segments:
-            change = segments[-1].change
-            place, contact, chosen = change.place, change.in_contact, change.chosen
-        ending = ENDINGS[chosen] if place == len(self._phases) else 0.0
-        values = {"phase": place, "in_contact": contact, "ending": ending}
-        output.SetFromVector([float(values[name])])
+    def _calc_number(self, name: str, context: Context, output: BasicVector) -> None:
+        value = context.get_discrete_state(self._held).value()[NAMES.index(name)]
+        if not self.progress(context).segments:
+            value = float(name == "contact" and self.task.contacts[0])
+        output.SetFromVector([value])
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
@@ -355,25 +330,20 @@ class TaskSupervisor(LeafSystem):
         least = self._contact.size * min(self._traced.forces(self._filtered(context)))
         is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
-        settles = (
-            self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over
-        )
+        end = begin.time + segments[-1].over
+        settles = self._traced.touched(segments) and context.get_time() < end
         output.SetFromVector([float(is_open or settles or self._holds(context))])
 
     def traced(self) -> Block:
-        period = self._sample_period
-        updates = (Update(self._traced.unchanged(), period, 0.0, True),) if period else ()
+        period, traced = self._sample_period, self._traced
+        updates = (Update(traced.unchanged(), period, 0.0, True),) if period else ()
+        reaction = partial(traced.reaction, period) if period else None
         unwired = ["hold", *(port.get_name() for port in self.signal_ports.values())]
         return Block(
             self,
-            self._traced.computations(),
+            traced.computations(),
             updates,
-            guard=Guard(
-                self._traced.guard(),
-                self._advance,
-                bool(period),
-                partial(self._traced.reaction, period) if period else None,
-            ),
+            guard=Guard(traced.guard(), self._advance, bool(period), reaction),
             unwired={name: zero(name) for name in unwired},
             moving=tuple(self._moving),
             ports={name: (Signal(name),) for name in ("phase", "ending")},

@@ -64,6 +64,7 @@ class TracedTask:
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
 
     Attributes:
+        task: The argument.
         size: The number of these numbers.
         filter_size: The number of those of the force filter: for each point of the contact the
             force after the low-pass, then the mean of the samples before the first touch; then the
@@ -80,7 +81,7 @@ class TracedTask:
         num_forces: int,
         sample_period: float,
     ) -> None:
-        self._task, self._laws, self._contact, self._plan = task, laws, contact, plan
+        self.task, self._laws, self._contact, self._plan = task, laws, contact, plan
         self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
         self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
@@ -118,7 +119,7 @@ class TracedTask:
             unbiased = ca.if_else(waits, ca.SX.zeros(size), measured - bias)
         else:
             unbiased = measured
-        return ca.vertcat(force + self._task.force_gain * (unbiased - force), bias, count)
+        return ca.vertcat(force + self.task.force_gain * (unbiased - force), bias, count)
 
     def filtered(self, held: FloatArray, measured: FloatArray) -> FloatArray:
         """The state of the force filter after a sample, shape (filter_size,).
@@ -190,7 +191,7 @@ class TracedTask:
 
         def goals(index: int) -> ca.SX:
             references = self._plan.goals[index].references
-            if self._task.contacts[index] != bool(which):
+            if self.task.contacts[index] != bool(which):
                 return ca.SX.zeros(size)
             time = ca.SX.sym("time")
             rows = traced_references(references, law.degrees, time)
@@ -225,7 +226,7 @@ class TracedTask:
         contact = self._named["contact"]
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
         least = size * ca.mmin(self._each)
-        is_open = ca.logic_or(contact < 0.5, least < self._task.contact_force)
+        is_open = ca.logic_or(contact < 0.5, least < self.task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
         values = [desired, self._named["place"], contact, self._named["ending"]]
         shown = ca.Function("shown", inputs, values)
@@ -274,7 +275,7 @@ class TracedTask:
         force = self._reference(CONTACT)[int(self._laws[CONTACT].layout.lowest[contact.main])]
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
-        if self._task.watches("control"):
+        if self.task.watches("control"):
             u = ca.SX.sym("control", law.system.num_controls)
             inputs, sources, control = [*inputs, u], [*sources, "control"], ca.norm_inf(u)
         moment = Moment(
@@ -288,7 +289,7 @@ class TracedTask:
             travel=ca.norm_2(first - self._origin),
             work=self.tally.work(self._counted()),
             control=control,
-            eccentricity=eccentricity(ca.vertsplit(self._each), self._task.contact_force),
+            eccentricity=eccentricity(ca.vertsplit(self._each), self.task.contact_force),
         )
         return moment, inputs, tuple(sources)
 
@@ -305,7 +306,7 @@ class TracedTask:
 
     def _margins(self) -> tuple[ca.SX, list[ca.SX], tuple[str, ...]]:
         """The margins of `PhaseDecision`, and the symbols and sources of their inputs."""
-        named, task = self._named, self._task
+        named, task = self._named, self.task
         moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
         counts, tares = self._counted(), self._count < self._tares - 0.5
@@ -332,7 +333,7 @@ class TracedTask:
     def _ends(self, phase: Phase, now: Moment) -> tuple[ca.SX, ca.SX]:
         """The margins of a phase until it succeeds and until it is late."""
         try:
-            end = ca.SX(phase.margin(now, self._task.contact_force))
+            end = ca.SX(phase.margin(now, self.task.contact_force))
             return end, ca.fmin(ca.SX(phase.remaining(now)), 1e9)
         except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
             raise ModelError(

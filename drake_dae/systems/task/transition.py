@@ -33,9 +33,9 @@ class SampledTask(TracedTask):
 
     def _begun(self) -> Computation:
         """The numbers at the start of a run, as `TaskPlanner.first`."""
-        law, contact = self._laws[FREE], int(self._task.contacts[0])
+        law, contact = self._laws[FREE], int(self.task.contacts[0])
         x, parameters = law.system.state, law.system.parameter_symbol
-        force = self._task.contact_force if contact else 0.0
+        force = self.task.contact_force if contact else 0.0
         motion = self._plan.motion_function.function.call([x, parameters])[0]
         present = [self._met(which, ca.SX(force)) for which in (FREE, CONTACT)]
         held = ca.SX.zeros(self.size)
@@ -121,7 +121,7 @@ class SampledTask(TracedTask):
             size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
             first_goals = np.zeros((size, len(phases) + 1))
             for index, each in enumerate(plan.goals):
-                if int(self._task.contacts[index]) == which:
+                if int(self.task.contacts[index]) == which:
                     first_goals[:, index] = each.function(0.0)
             goal = ca.mtimes(ca.DM(first_goals), chosen)
             base, rate = ca.SX.zeros(count), ca.SX(goes * free)
@@ -163,14 +163,14 @@ class SampledTask(TracedTask):
 
     def _contact_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:
         """Whether the law in contact is active in the next phase, or while the robot rests."""
-        end, plan = len(self._phases), self._task.plan
-        closed = ca.mtimes(ca.DM([[*map(float, self._task.contacts[:end]), 0.0]]), _at(to, end + 1))
+        end, plan = len(self._phases), self.task.plan
+        closed = ca.mtimes(ca.DM([[*map(float, self.task.contacts[:end]), 0.0]]), _at(to, end + 1))
         succeeds = ca.logic_and(ca.logic_not(ended[0]), ended[1])
         was = self._named["contact"] > 0.5
         last = self._in_phase(
             lambda place: ca.if_else(succeeds, float(plan.ends_in_contact(place)), was), was
         )
-        rests = ca.logic_and(last, self._force >= self._task.contact_force)
+        rests = ca.logic_and(last, self._force >= self.task.contact_force)
         return ca.if_else(to > end - 0.5, rests, closed)
 
     def _successors(self, ended: list[ca.SX]) -> _Change:
@@ -190,7 +190,7 @@ class SampledTask(TracedTask):
 
     def _successor(self, place: int, outcome: Outcome) -> _Change:
         """The change after a phase with its outcome, as `PhasePlan.successor`."""
-        plan, end = self._task.plan, len(self._phases)
+        plan, end = self.task.plan, len(self._phases)
         ends_free = not (
             plan.ends_in_contact(place) if outcome == "success" else plan.contacts[place]
         )
