@@ -98,6 +98,10 @@ def test_points_carry_what_force_and_moment_imply_and_leave_together(file):
     assert_allclose(cop, wanted[:, 1] / wanted[:, 0], atol=1e-9)
     names = [signal.name for signal in record.signals["desired_output"].signals]
     assert names == ["face.force", "face.my", "upper.distance", "lower.distance"]
+    # Force and moment of a Release go to zero together: the center of pressure does not move.
+    release = record["controlled_output"][in_phase(record, 2)[1:]]
+    assert release[-1, 0] < 1.0
+    assert_allclose(release[:, 1] / release[:, 0], 0.2 / 24.0, atol=1e-3)
     assert_allclose(record["distance"][-1], [0.01, 0.01, 0.0, 0.0], atol=1e-9)
     # Where it is open the forces are zero, and so is their desired value.
     assert not record["tracking_error"][-1, :2].any()
