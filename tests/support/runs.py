@@ -50,14 +50,17 @@ DEAR = (
 """Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
 
 
-def has_task(name: str) -> bool:
-    """Whether a shipped scenario is a task, with two laws."""
-    return "\ntask:" in shipped_scenarios()[name].read_text("utf-8")
+def _with_keys(*keys: str) -> tuple[str, ...]:
+    """The shipped scenarios that have one of these keys."""
+    texts = {name: path.read_text("utf-8") for name, path in shipped_scenarios().items()}
+    return tuple(n for n, text in texts.items() if any(f"\n{key}:" in text for key in keys))
 
 
-def is_apart(name: str) -> bool:
-    """Whether a shipped scenario has a task, or a plant whose contact gives way or opens."""
-    return has_task(name) or "\nplant:" in shipped_scenarios()[name].read_text("utf-8")
+IN_CONTACT = _with_keys("plant", "task")
+"""The scenarios with compliant contacts, or contacts that open."""
+
+TASKS = _with_keys("task")
+"""The scenarios with a task, which has two laws."""
 
 
 def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:

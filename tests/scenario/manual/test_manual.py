@@ -32,6 +32,7 @@ PURE = {
     ("!HeightMap", "normal"),
     ("!MeshSurface", "normal"),
     ("!PointOnSurface", "friction"),
+    ("!Press", "eccentricity"),
     ("!JointCoupler", "ratio"),
     ("!AxisNormalToSurface", "axis"),
     ("!Blade", "axis"),

@@ -81,7 +81,8 @@ class Press(Phase):
     Attributes:
         force: The goal, in N: a positive number, or a reference, whose time starts with the phase.
         tolerance: The largest error of the force at which the phase ends, in N.
-        eccentricity: The largest eccentricity of a face at which it ends, 0 to 1; see `PhaseGuard`.
+        eccentricity: The largest eccentricity of a face at which it ends, a pure number from 0 to
+            1; see `PhaseGuard`.
         over: The duration of the transition from the previous references, in s.
         within: The largest duration of the phase, in s.
         if_late: The successor if it lasts longer; on_failure if left out.
