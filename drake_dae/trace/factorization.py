@@ -112,15 +112,18 @@ class PositiveDefiniteFactorization:
     Attributes:
         pivot: A holds the products of some vectors; the smallest squared sine of the angle between
             one of them and the span of those before it: 0 exactly where A is singular.
+        lengths: The length of each of these vectors orthogonal to those before it.
     """
 
     def __init__(self, matrix: ca.SX) -> None:
         self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
         self.pivot = ca.SX(1)
+        self.lengths = [ca.SX(1)] * matrix.shape[0]
         if self._identity:
             return
         self._diagonal, upper, _ = ca.ldl(matrix, False)
         self._lower = upper.T + ca.SX.eye(matrix.shape[0])
+        self.lengths = [ca.sqrt(square) for square in ca.vertsplit(ca.SX(self._diagonal))]
         for i in range(matrix.shape[0]):
             square = self._diagonal[i] / matrix[i, i]
             self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))

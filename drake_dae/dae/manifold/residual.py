@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import norm
 from drake_dae.trace.round_off import positive
@@ -88,10 +89,12 @@ def shortest_step(
 ) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
     """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
 
-    From (C S)' = Q R it is -Q R^-T residual; the diagonal of R comes with it.
+    It is -(C S)' N^-1 residual with N = C S (C S)'. An error of N^-1 grows with the square of the
+    condition of C, and only makes Newton's method slower. The lengths of the parts of the gradients
+    that are orthogonal to those before are returned as well.
     """
     if not gradient.shape[0]:
         return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
-    q, r = ca.qr(ca.mtimes(gradient, ca.diag(scale)).T)
-    pivots = [r[i, i] for i in range(r.shape[0])]
-    return (lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))), pivots
+    scaled = ca.mtimes(gradient, ca.diag(scale))
+    normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
+    return (lambda residual: -ca.mtimes(scaled.T, normal.solve(residual))), normal.lengths
