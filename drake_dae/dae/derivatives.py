@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
@@ -74,7 +75,7 @@ class Derivatives:
         balance, self._constraint_rate = self._first_order(constraint)
         self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)  # (1)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
-        if _agree(system, gradient, g_rows):
+        if agree(system, gradient, g_rows):
             gradient = g_rows
         self._matrix = ca.blockcat(
             mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
@@ -263,7 +264,7 @@ class Derivatives:
         if system.exogenous:  # `implicit` has the part of the state alone.
             shorter = ca.vertcat(shorter[: system.num_states], constraint_rate)
         longer = ca.vertcat(balance, constraint_rate)
-        if shorter.shape != longer.shape or not _agree(
+        if shorter.shape != longer.shape or not agree(
             system, shorter, longer, self._symbols[1], self.control
         ):
             raise ModelError(
@@ -306,28 +307,3 @@ class Derivatives:
             return expression
         symbols = ca.vertcat(*self._symbols[1 : orders + 1])
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
-
-
-def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-    """Returns whether two expressions agree at random states around the nominal state.
-
-    The parameters are varied as well: expressions that agree at their defaults alone are different.
-    """
-    symbols = [system.state, *unknowns, system.parameter_symbol]
-    function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
-    random, p = np.random.default_rng(0), system.parameter_values
-    deviation = system.nominal_spread
-    finite = 0
-    for spread in (0.0, 0.1, 0.1):
-        x = system.nominal_state + deviation * random.standard_normal(system.num_states)
-        numbers = [random.standard_normal(u.numel()) for u in unknowns]
-        changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
-        a, b = (v.full() for v in function(x, *numbers, changed))
-        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-            continue  # Out of the domain of one of the functions.
-        finite += 1
-        # By columns: constraints may have very different units.
-        size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
-        if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
-            return False
-    return finite > 0

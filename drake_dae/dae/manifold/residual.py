@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -62,13 +63,37 @@ class Residual:
         return values.reshape(-1, self.system.num_states)
 
     @cached_property
+    def short_gradient(self) -> ca.SX:
+        """`gradient`, in fewer operations where constraint forces are along the gradients.
+
+        Where q' = v, the forces g' are dk/dq, and the gradient of k' = (dk/dq) v is the derivative
+        of dk/dq along v beside dk/dq.
+        """
+        system = self.system
+        if set(self.layout.degrees) != {2}:
+            return self.gradient
+        slope, rate = ca.SX(system.num_constraints, system.num_states), 0 * system.state
+        forces = system.frictional_contacts.without_friction(system.g)
+        index = {entry.name(): i for i, entry in enumerate(ca.vertsplit(system.state))}
+        moved = ca.SX(*slope.shape)
+        for i, entry in enumerate(ca.vertsplit(system.f)):
+            if entry.is_symbolic() and (j := index.get(entry.name())) is not None:
+                rate[i], slope[:, i], moved[:, j] = entry, forces[j, :].T, forces[j, :].T
+        further = ca.jtimes(ca.vec(ca.densify(slope)), system.state, rate)
+        moved += ca.reshape(further, slope.shape)
+        rows = zip(ca.vertsplit(slope), ca.vertsplit(moved), strict=True)
+        short = ca.sparsify(ca.vertcat(*[row for pair in rows for row in pair]))
+        is_shorter = _num_operations(short) < _num_operations(self.gradient)
+        return short if is_shorter and agree(system, short, self.gradient) else self.gradient
+
+    @cached_property
     def newton_step(self) -> TracedFunction:
         """The Newton step of least norm from a state, divided by the scale of the states.
 
         A function of the state, a second state at which the gradients are taken, and parameters.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
-        gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
+        gradient = ca.substitute(self.short_gradient, state, other)
         scale = ca.SX(self.scale)
         step = shortest_step(gradient, scale)[0](self.residual_expression)
         inputs = {"other": other}
@@ -82,6 +107,12 @@ class Residual:
             return 0.0
         length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
         return norm(residual / positive(length))
+
+
+def _num_operations(expression: ca.SX) -> int:
+    """The number of operations of an expression, without its common subexpressions."""
+    symbols = ca.vertcat(ca.SX(0, 1), *ca.symvar(expression))
+    return int(ca.Function("f", [symbols], [ca.cse(expression)]).n_instructions())
 
 
 def shortest_step(
