@@ -23,7 +23,13 @@ from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
-from drake_dae.trace.factorization import Factorization, nonzeros
+from drake_dae.trace.factorization import (
+    Factorization,
+    Factors,
+    PositiveDefiniteFactorization,
+    nonzeros,
+)
+from drake_dae.trace.functions import count_operations
 
 
 class Derivatives:
@@ -81,7 +87,7 @@ class Derivatives:
             mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
         )
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
-            mass[self._rows, self._rows], g_rows, gradient
+            _factors_of(system, self._rows), g_rows, gradient
         )
         if system.frictional_contacts:
             self.pivot = ca.fmin(
@@ -307,3 +313,22 @@ class Derivatives:
             return expression
         symbols = ca.vertcat(*self._symbols[1 : orders + 1])
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
+
+
+def _factors_of(system: DaeSystem, rows: Sequence[int]) -> Factors:
+    """Returns factors of some rows and columns of E, by `DaeSystem.factorize` if they are shorter.
+
+    Args:
+        system: The system (1)-(3).
+        rows: The indices of the rows and columns.
+    """
+    mass = system.mass_matrix[rows, rows]
+    triangle = PositiveDefiniteFactorization(mass)
+    other = None if system.factorize is None else system.factorize(rows)
+    if other is None:
+        return triangle
+    right = ca.SX.sym("right", len(rows))
+    solutions = other.solve(right), triangle.solve(right)
+    counts = [count_operations(solution) for solution in solutions]
+    is_chosen = counts[0] < counts[1] and agree(system, *solutions, right)
+    return other if is_chosen else triangle

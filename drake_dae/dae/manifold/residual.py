@@ -12,7 +12,7 @@ from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.newton import norm
 from drake_dae.trace.round_off import positive
 
@@ -83,7 +83,7 @@ class Residual:
         moved += ca.reshape(further, slope.shape)
         rows = zip(ca.vertsplit(slope), ca.vertsplit(moved), strict=True)
         short = ca.sparsify(ca.vertcat(*[row for pair in rows for row in pair]))
-        is_shorter = _num_operations(short) < _num_operations(self.gradient)
+        is_shorter = count_operations(short) < count_operations(self.gradient)
         return short if is_shorter and agree(system, short, self.gradient) else self.gradient
 
     @cached_property
@@ -107,12 +107,6 @@ class Residual:
             return 0.0
         length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
         return norm(residual / positive(length))
-
-
-def _num_operations(expression: ca.SX) -> int:
-    """The number of operations of an expression, without its common subexpressions."""
-    symbols = ca.vertcat(ca.SX(0, 1), *ca.symvar(expression))
-    return int(ca.Function("f", [symbols], [ca.cse(expression)]).n_instructions())
 
 
 def shortest_step(
