@@ -19,10 +19,17 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
-from drake_dae.trace.factorization import Factorization, nonzeros
+from drake_dae.trace.factorization import (
+    Factorization,
+    Factors,
+    PositiveDefiniteFactorization,
+    nonzeros,
+)
+from drake_dae.trace.functions import count_operations
 
 
 class Derivatives:
@@ -74,13 +81,13 @@ class Derivatives:
         balance, self._constraint_rate = self._first_order(constraint)
         self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)  # (1)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
-        if _agree(system, gradient, g_rows):
+        if agree(system, gradient, g_rows):
             gradient = g_rows
         self._matrix = ca.blockcat(
             mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
         )
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
-            mass[self._rows, self._rows], g_rows, gradient
+            _factors_of(system, self._rows), g_rows, gradient
         )
         if system.frictional_contacts:
             self.pivot = ca.fmin(
@@ -263,7 +270,7 @@ class Derivatives:
         if system.exogenous:  # `implicit` has the part of the state alone.
             shorter = ca.vertcat(shorter[: system.num_states], constraint_rate)
         longer = ca.vertcat(balance, constraint_rate)
-        if shorter.shape != longer.shape or not _agree(
+        if shorter.shape != longer.shape or not agree(
             system, shorter, longer, self._symbols[1], self.control
         ):
             raise ModelError(
@@ -308,26 +315,20 @@ class Derivatives:
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
 
 
-def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-    """Returns whether two expressions agree at random states around the nominal state.
+def _factors_of(system: DaeSystem, rows: Sequence[int]) -> Factors:
+    """Returns factors of some rows and columns of E, by `DaeSystem.factorize` if they are shorter.
 
-    The parameters are varied as well: expressions that agree at their defaults alone are different.
+    Args:
+        system: The system (1)-(3).
+        rows: The indices of the rows and columns.
     """
-    symbols = [system.state, *unknowns, system.parameter_symbol]
-    function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
-    random, p = np.random.default_rng(0), system.parameter_values
-    deviation = system.nominal_spread
-    finite = 0
-    for spread in (0.0, 0.1, 0.1):
-        x = system.nominal_state + deviation * random.standard_normal(system.num_states)
-        numbers = [random.standard_normal(u.numel()) for u in unknowns]
-        changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
-        a, b = (v.full() for v in function(x, *numbers, changed))
-        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-            continue  # Out of the domain of one of the functions.
-        finite += 1
-        # By columns: constraints may have very different units.
-        size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
-        if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
-            return False
-    return finite > 0
+    mass = system.mass_matrix[rows, rows]
+    triangle = PositiveDefiniteFactorization(mass)
+    other = None if system.factorize is None else system.factorize(rows)
+    if other is None:
+        return triangle
+    right = ca.SX.sym("right", len(rows))
+    solutions = other.solve(right), triangle.solve(right)
+    counts = [count_operations(solution) for solution in solutions]
+    is_chosen = counts[0] < counts[1] and agree(system, *solutions, right)
+    return other if is_chosen else triangle

@@ -14,6 +14,7 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loop_state import LoopState
+from drake_dae.trace.factorization import BlockFactors, Factors, PositiveDefiniteFactorization
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,17 @@ def robot_equations(
         stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
         return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
+    def factorize(rows: Sequence[int]) -> Factors | None:
+        first = rows[0] if rows else 0
+        if first > nq or list(rows) != list(range(first, nq + nv + k)):
+            return None
+        bodies = links.articulated_bodies(_rotors_in_links(links, driven))
+        if bodies is None:
+            return None
+        others = (ca.SX.eye(nq - first), driven.mass)
+        before, after = ((PositiveDefiniteFactorization(e), e.shape[0]) for e in others)
+        return BlockFactors([before, (bodies, nv), after])
+
     return DaeSystem(
         state=ca.vertcat(links.q, links.v, driven.state),
         mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
@@ -104,6 +116,7 @@ def robot_equations(
         state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
         implicit=implicit,
+        factorize=factorize,
         control_metric=ca.diag(choice[0].symbol) if choice else None,
         free_control=choice[1].symbol if choice else None,
         contacts=bound.contacts,
@@ -120,7 +133,16 @@ def _known_force(links: Links, known_forces: Sequence[KnownForce]) -> ca.SX:
 
 def _moved_rotors(links: Links, driven: ActuationChain) -> ca.SX:
     """The part of M that moves with a stage instead of the links, shape (nv, nv)."""
+    return ca.SX(ca.sparsify(ca.DM(_rotors(links) * driven.carries_rotors)))
+
+
+def _rotors_in_links(links: Links, driven: ActuationChain) -> FloatArray:
+    """The diagonal of the part of M from rotors that move with the links, shape (nv,)."""
+    return np.diag(_rotors(links)) * (not driven.carries_rotors)
+
+
+def _rotors(links: Links) -> FloatArray:
+    """The part of M from rotors, shape (nv, nv)."""
     B = links.actuation_matrix
-    if not driven.carries_rotors:
-        return ca.SX(B.shape[0], B.shape[0])
-    return ca.SX(ca.sparsify(ca.DM(B * links.reflected_inertia @ B.T)))
+    rotors: FloatArray = B * links.reflected_inertia @ B.T
+    return rotors

@@ -34,8 +34,6 @@ PERIOD = 0.02
 STARTING = 300.0
 """The longest time that a process may need to start, in s."""
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
 _ENDED = {128 + signal.SIGINT, *(-number for number in ENDING_SIGNALS)}
 """Exit codes of a process that was ended by a signal to the study."""
 
@@ -130,7 +128,7 @@ class _Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env={**dict.fromkeys(_THREADS, "1"), **os.environ},
+            env={"OMP_NUM_THREADS": "1", **os.environ},  # OpenBLAS and MKL read it, too.
             start_new_session=True,  # Ctrl-C reaches only the study, which ends its processes.
         )
         self.output: IO[bytes] = self._process.stdout  # type: ignore[assignment]

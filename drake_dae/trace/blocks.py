@@ -5,7 +5,12 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization, nonzeros
+from drake_dae.trace.factorization import (
+    Factorization,
+    Factors,
+    PositiveDefiniteFactorization,
+    nonzeros,
+)
 
 
 def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
@@ -29,14 +34,13 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
 
 
 def saddle_point_solver(
-    mass: ca.SX, g: ca.SX, gradient: ca.SX
+    inertia: Factors, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
-    """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), from E, g and c^T.
+    """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), from factors of E, g, c^T.
 
     Returns:
         The solver, A = c E^-1 g, and a scalar that is 0 exactly where A is singular.
     """
-    inertia = PositiveDefiniteFactorization(mass)
     half = inertia.forward(g)
     coupling: Factorization | PositiveDefiniteFactorization
     if gradient is g:  # A = g^T E^-1 g, as J M^-1 J^T

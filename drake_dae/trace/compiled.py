@@ -176,11 +176,31 @@ def without_branches(source: str) -> str:
 
 
 def generate(*functions: ca.Function) -> str:
-    """Generates the C source of functions, each under its own name."""
+    """Generates the C source of functions, each under its own name.
+
+    A caller in C passes pointers to arguments and results, and no memory.
+    """
     generator = ca.CodeGenerator("code")
     for function in functions:
         generator.add(function)
-    return str(generator.dump())
+    source = str(generator.dump())
+    for function in functions:
+        source = _with_memory(source, function) if function.sz_w() or function.sz_iw() else source
+    return source
+
+
+def _with_memory(source: str, function: ca.Function) -> str:
+    """Adds the memory of a function that calls others, as lookups in tables, to its C source."""
+    begin = source.index(f"int {function.name()}(const casadi_real** arg")
+    body = source.index("{", begin) + 1
+    own = f"""
+  const casadi_real *arguments[{function.sz_arg()}];
+  casadi_real *results[{function.sz_res()}], reals[{function.sz_w() + 1}];
+  casadi_int i, integers[{function.sz_iw() + 1}];
+  for (i = 0; i < {function.n_in()}; i++) arguments[i] = arg[i];
+  for (i = 0; i < {function.n_out()}; i++) results[i] = res[i];
+  arg = arguments, res = results, iw = integers, w = reals;"""
+    return f"{source[:body]}{own}{source[body:]}"
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:

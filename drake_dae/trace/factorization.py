@@ -1,6 +1,7 @@
 """Matrices of expressions, factored once for many right sides."""
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -112,15 +113,18 @@ class PositiveDefiniteFactorization:
     Attributes:
         pivot: A holds the products of some vectors; the smallest squared sine of the angle between
             one of them and the span of those before it: 0 exactly where A is singular.
+        lengths: The length of each of these vectors orthogonal to those before it.
     """
 
     def __init__(self, matrix: ca.SX) -> None:
         self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
         self.pivot = ca.SX(1)
+        self.lengths = [ca.SX(1)] * matrix.shape[0]
         if self._identity:
             return
         self._diagonal, upper, _ = ca.ldl(matrix, False)
         self._lower = upper.T + ca.SX.eye(matrix.shape[0])
+        self.lengths = [ca.sqrt(square) for square in ca.vertsplit(ca.SX(self._diagonal))]
         for i in range(matrix.shape[0]):
             square = self._diagonal[i] / matrix[i, i]
             self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
@@ -140,6 +144,56 @@ class PositiveDefiniteFactorization:
     def scaled(self, half: ca.SX) -> ca.SX:
         """Returns D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
         return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
+
+
+class Factors(Protocol):
+    """A factorization A = L D L^T, as `PositiveDefiniteFactorization`."""
+
+    def solve(self, right: ca.SX) -> ca.SX:
+        """Returns X of A X = B."""
+
+    def forward(self, right: ca.SX) -> ca.SX:
+        """Returns Y = L^-1 B."""
+
+    def backward(self, half: ca.SX) -> ca.SX:
+        """Returns X = L^-T D^-1 Y."""
+
+    def scaled(self, half: ca.SX) -> ca.SX:
+        """Returns D^-1 Y."""
+
+
+class BlockFactors:
+    """The factors of a block-diagonal matrix, from those of its blocks.
+
+    Args:
+        blocks: The factors of each block, with its size.
+    """
+
+    def __init__(self, blocks: Sequence[tuple[Factors, int]]) -> None:
+        self._factors = [factors for factors, _ in blocks]
+        self._stops = np.cumsum([0, *[size for _, size in blocks]]).tolist()
+
+    def solve(self, right: ca.SX) -> ca.SX:
+        """Returns X of A X = B."""
+        return self.backward(self.forward(right))
+
+    def forward(self, right: ca.SX) -> ca.SX:
+        """Returns Y = L^-1 B."""
+        return self._each("forward", right)
+
+    def backward(self, half: ca.SX) -> ca.SX:
+        """Returns X = L^-T D^-1 Y."""
+        return self._each("backward", half)
+
+    def scaled(self, half: ca.SX) -> ca.SX:
+        """Returns D^-1 Y."""
+        return self._each("scaled", half)
+
+    def _each(self, name: str, matrix: ca.SX) -> ca.SX:
+        parts = ca.vertsplit(matrix, self._stops)
+        return ca.vertcat(
+            *[getattr(f, name)(part) for f, part in zip(self._factors, parts, strict=True)]
+        )
 
 
 def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:

@@ -52,6 +52,12 @@ class Failure:
     singular: str = ""
 
 
+def count_operations(expression: ca.SX) -> int:
+    """The number of operations of an expression, without its common subexpressions."""
+    symbols = ca.vertcat(ca.SX(0, 1), *ca.symvar(expression))
+    return int(ca.Function("f", [symbols], [ca.cse(expression)]).n_instructions())
+
+
 class TracedFunction:
     """A compiled or interpreted function of CasADi expressions on preallocated NumPy arrays.
 

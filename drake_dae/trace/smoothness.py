@@ -105,7 +105,7 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFla
             moves = any(moving[i] for i in inputs)
             if moves and operation in _KINKS:
                 return SmoothnessFlaw(_KINKS[operation])
-        moving[function.instruction_output(i)[0]] = moves
+        moving.update(dict.fromkeys(function.instruction_output(i), moves))
     return None
 
 

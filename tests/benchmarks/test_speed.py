@@ -6,6 +6,7 @@ record is what is computed of each step afterwards. Traced is parsed, traced and
 an accuracy of 1e-6. The command that lists scenarios has NumPy alone beside it.
 """
 
+import resource
 import subprocess
 import sys
 import time
@@ -148,6 +149,25 @@ def test_starting(report):
     pairs = [(seconds("-m", "drake_dae", "list"), seconds("-c", "import numpy")) for _ in range(5)]
     ours, numpy = map(min, zip(*pairs, strict=True))
     report("drake-dae list", {"[s]": f"{ours:.2f} (<0.3)", "to NumPy alone": f"{ours / numpy:.1f}"})
+
+
+def test_a_short_run(tmp_path, report):
+    """CPU time of the command with all pictures, and of what it stands on, in alternation."""
+
+    def seconds(*words):
+        began = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+
+    run = ("-m", "drake_dae", "simulate", "two_link_wall", "--set=duration=0.5")
+    packages = "import pydantic, scipy.linalg, matplotlib.figure, pydrake.multibody.plant"
+    pairs = [
+        (seconds(*run, f"--out={tmp_path / str(i)}"), seconds("-c", packages)) for i in range(5)
+    ]
+    ours, theirs = map(min, zip(*pairs, strict=True))
+    figures = {"CPU [s]": f"{ours:.2f} (<1.6)", "to its packages alone": f"{ours / theirs:.1f}"}
+    report("drake-dae simulate", figures)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

@@ -1,6 +1,7 @@
 """What commands tell programs, JSON and exit codes, and what of earlier runs they keep."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.scenario import read_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.scenario.start import start_scenario
+from drake_dae.studies.processes import cores
 
 BARE = ("--set=write.plots=false", "--set=write.animation=false")
 QUICK = ("--set=duration=0.2", *BARE)
@@ -197,6 +199,27 @@ def test_a_film_that_is_ended_leaves_nothing_behind(sent, tmp_path):
     assert process.returncode == 128 + sent
     assert said.splitlines()[-1] == "interrupted"
     assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="lists threads as Linux does")
+@pytest.mark.parametrize(("chosen", "threads"), [({}, 1), ({"OMP_NUM_THREADS": "2"}, 2)])
+def test_the_command_starts_no_threads_of_linear_algebra(chosen, threads):
+    """They wait in a loop: a fifth of the CPU time of a short run. A user's choice is kept."""
+    code = (
+        "import os, sys, drake_dae.__main__, numpy.linalg\n"
+        "print(len(os.listdir('/proc/self/task')), 'drake_dae.cli' in sys.modules)"
+    )
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    surroundings = {name: text for name, text in os.environ.items() if name not in names}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**surroundings, **chosen},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.split() == [str(min(threads, cores())), "True"]
 
 
 # Where it starts.

@@ -27,6 +27,12 @@ mostly_compiled = pytest.mark.parametrize(
 )
 """As machine code; interpreted where all is tested, since other tests compare both."""
 
+MANY_PIECES = (
+    "references={tool: !Polyline {points: [[0.3], [0.5], [0.2]], corner: 0.0005, "
+    "limits: {speed: 0.5, acceleration: 5, jerk: 100}}, wall.force: 20}"
+)
+"""A setting of the two links on a wall: a path of 1,000 polynomials, which are in a table."""
+
 DEAR = (
     "three_fingers",
     "seven_joint_flexible_motors",

@@ -241,6 +241,7 @@ def test_the_pivot_of_a_positive_definite_matrix_is_an_angle(size):
         {"a": ca.vec(matrix), "b": b},
         {
             "pivot": factors.pivot,
+            "lengths": ca.vertcat(*factors.lengths),
             "square": ca.dot(factors.forward(b), factors.scaled(factors.forward(b))),
         },
     )
@@ -248,7 +249,8 @@ def test_the_pivot_of_a_positive_definite_matrix_is_an_angle(size):
     columns, right = random.normal(size=(size + 2, size)), random.normal(size=size)
     triangle = np.linalg.qr(columns)[1]
     sines = np.abs(np.diag(triangle)) / np.linalg.norm(columns, axis=0)
-    pivot, square = function((columns.T @ columns).ravel(), right)
+    pivot, lengths, square = function((columns.T @ columns).ravel(), right)
+    np.testing.assert_allclose(lengths, np.abs(np.diag(triangle)), rtol=1e-9)
     assert pivot[0] == pytest.approx(sines.min() ** 2, rel=1e-9)
     wanted = right @ np.linalg.solve(columns.T @ columns, right)
     assert square[0] == pytest.approx(wanted, rel=1e-9)

@@ -169,6 +169,7 @@ def integrated(
             else np.concatenate([system.state_scale, positive(np.abs(nominal))])
         ),
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
+        factorize=None,
         implicit=None,  # The derivatives of the constraints may differ.
     )
 

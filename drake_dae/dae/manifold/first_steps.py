@@ -33,7 +33,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     usual = positive(residual.lengths)
     state, p, scale = system.state, system.parameter_symbol, ca.SX(residual.scale)
     # The steps hold them often: common subexpressions are removed once here, not from the whole.
-    expression, gradient = ca.cse([residual.residual_expression, residual.gradient])
+    expression, gradient = ca.cse([residual.residual_expression, residual.short_gradient])
     function = ca.Function("residual", [state, p], [expression], {"cse": False})
     (step_for, pivots), steps = shortest_step(gradient, scale), []
     for _ in range(NEWTON_STEPS):

@@ -5,7 +5,6 @@ from bisect import bisect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -15,8 +14,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.reference import Reference, check_continuity
 from drake_dae.errors import ReferenceSignalError
 
-MOST_IN_EXPRESSION = 200
-"""The largest number of polynomials in the expression of most references."""
+UNROLLED = 200
+"""The largest number of polynomials that an expression contains one by one; more are looked up in
+a table, which runs side by side cannot do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,15 +56,55 @@ class PiecewisePolynomials:
     def expression(self, time: ca.SX) -> ca.SX:
         """Returns the values at a symbolic time, shape (rows, 1)."""
         count, rows, size = self.factors.shape
+        inside = ca.fmin(ca.fmax(time, self.breaks[0]), self.breaks[-1])
+        chosen = self._selected(time) if count <= UNROLLED else self._looked_up(inside)
+        begin, width, factors = chosen[0], chosen[1], ca.SX(rows * size, 1)
+        factors[self._places] = chosen[2:]
+        monomials = ca.vertcat(*[((inside - begin) / width) ** int(k) for k in self._powers])
+        return ca.mtimes(ca.reshape(factors, size, rows).T, monomials)
+
+    def _selected(self, time: ca.SX) -> ca.SX:
+        """Returns the row of `_table` at a symbolic time, as the sum of all rows times 0 or 1."""
         passed = [time >= moment for moment in self.breaks[1:-1]]
         chosen = ca.vertcat(1, *passed) - ca.vertcat(*passed, 0)
-        inside = ca.fmin(ca.fmax(time, self.breaks[0]), self.breaks[-1])
-        begin, width = (
-            ca.dot(ca.DM(values), chosen) for values in (self.breaks[:-1], np.diff(self.breaks))
+        return ca.mtimes(ca.DM(self._table.T), chosen)
+
+    def _looked_up(self, inside: ca.SX) -> ca.SX:
+        """Returns the row of `_table` at a symbolic time within the breaks."""
+        index, begin, row = self._lookups
+        found = ca.fmin(ca.floor(index(inside)), len(self._table) - 1)
+        # Where round-off has moved a time just before a break past it.
+        return row(found - (inside < begin(found)))
+
+    @cached_property
+    def _lookups(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """The piece at a time, with a fraction; the begin and the row of `_table` of a piece."""
+        count = len(self._table)
+        pieces = np.arange(count + 1.0)
+        inside = {"lookup_mode": ["binary"]}
+        return (
+            ca.interpolant("piece", "linear", [self.breaks], pieces, inside),
+            ca.interpolant("begin", "linear", [pieces], self.breaks, {"lookup_mode": ["exact"]}),
+            ca.interpolant(
+                "row", "linear", [pieces[:-1]], self._table.ravel(), {"lookup_mode": ["exact"]}
+            ),
         )
-        monomials = ca.vertcat(*[((inside - begin) / width) ** int(k) for k in self._powers])
-        table = ca.mtimes(ca.DM(self.factors.reshape(count, -1).T), chosen)
-        return ca.mtimes(ca.reshape(table, size, rows).T, monomials)
+
+    @cached_property
+    def _table(self) -> FloatArray:
+        """The begin of each piece, its width, and its factors that are not zero in all pieces."""
+        columns = self.breaks[:-1], np.diff(self.breaks), self._columns[:, self._places]
+        return np.column_stack(columns)
+
+    @property
+    def _columns(self) -> FloatArray:
+        return self.factors.reshape(len(self.factors), -1)
+
+    @cached_property
+    def _places(self) -> list[int]:
+        """The indices of the factors of a piece that are not zero in all pieces."""
+        places: list[int] = np.flatnonzero(self._columns.any(axis=0)).tolist()
+        return places
 
     @property
     def _powers(self) -> FloatArray:
@@ -73,15 +113,9 @@ class PiecewisePolynomials:
 
 @checked(ReferenceSignalError)
 class PiecewiseReference(Reference):
-    """A piecewise polynomial reference with `order` continuous derivatives.
-
-    One with many pieces is a table and not an expression.
-    """
+    """A piecewise polynomial reference with `order` continuous derivatives."""
 
     order: int
-
-    most_in_expression: ClassVar[int] = MOST_IN_EXPRESSION
-    """The largest number of polynomials in a symbolic expression; longer references are tables."""
 
     @abstractmethod
     def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
@@ -91,10 +125,9 @@ class PiecewiseReference(Reference):
         self._check(degrees)
         return self.pieces(degrees).at
 
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
         self._check(degrees)
-        pieces = self.pieces(degrees)
-        return pieces.expression(time) if len(pieces.factors) <= self.most_in_expression else None
+        return self.pieces(degrees).expression(time)
 
     def _check(self, degrees: Sequence[int]) -> None:
         check_continuity(self, self.order, degrees)

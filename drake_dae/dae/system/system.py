@@ -22,7 +22,7 @@ from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving, valued
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
-from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.factorization import Factors, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
@@ -77,6 +77,9 @@ class DaeSystem:
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
+        factorize: A function that returns factors of given rows and columns of E, for when they
+            take fewer operations than a triangular factor: for a robot with many links they are the
+            articulated-body algorithm. It returns None if it has none for these rows.
         sharing: The distribution of forces among redundant constraints; k contains the others. None
             without redundant constraints. Made by `share_forces`.
         control_metric: W, shape (p, p), symmetric positive definite, for more controls than
@@ -118,6 +121,7 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    factorize: Callable[[Sequence[int]], Factors | None] | None = None
     sharing: ForceSharing | None = None
     control_metric: ca.SX = None
     free_control: ca.SX = None
@@ -192,6 +196,7 @@ class DaeSystem:
             h=solved[:, 1 + m :],
             mass_matrix=None,
             implicit=None,
+            factorize=None,
             state_scale=self.scale,
         )
 

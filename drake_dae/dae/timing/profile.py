@@ -34,9 +34,6 @@ PASSES = 40
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
 
-MOST_POLYNOMIALS = 500
-"""The largest number of polynomials of an expression; longer references are tables."""
-
 LOWERINGS = 3
 """The largest number of times that limits are lowered where the motion exceeds them."""
 
@@ -207,7 +204,6 @@ class TimeOptimalReference(PiecewiseReference):
     """
 
     is_table = True
-    most_in_expression = MOST_POLYNOMIALS
 
     profile: TimeProfile
     order: int = field(default=2, init=False)

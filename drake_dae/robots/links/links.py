@@ -7,6 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.robots.links.articulated import ArticulatedBodies
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
@@ -26,7 +27,8 @@ class Links(Frames, Protocol):
     4. `kinematics(acceleration)` follows the rules of `Kinematics`, with the same frames.
     5. `generalized_force` of a reaction is tau with tau . v = its power.
     6. `inverse_dynamics` of a reaction is M v' + H - tau.
-    7. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
+    7. `articulated_bodies` are factors of M, if the links have them.
+    8. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
        and `velocity_signals` together.
     """
 
@@ -89,6 +91,13 @@ class Links(Frames, Protocol):
     @property
     def plant(self) -> MultibodyPlant | None:
         """Their MultibodyPlant, for Drake's visualization; None without one."""
+
+    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
+        """Factors of M by the articulated-body algorithm; None if they are not known.
+
+        Args:
+            rotors: The addition of the rotors to the diagonal of M, shape (nv,).
+        """
 
     def landmarks(self) -> ca.SX:
         """Points of the robot for views of it, in m, shape (3, k)."""

@@ -12,6 +12,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
 from drake_dae.robots.links.comparison import compare_with_plant
 from drake_dae.robots.links.force_elements import Springs, check_force_elements
 from drake_dae.robots.links.frames import PlantFrames, position_of, unique_names
@@ -125,6 +126,14 @@ class MultibodyExpressions:
             ModelError: No frame, or more than one, has that name; or the point is not finite.
         """
         return position_of(self._frames.pose(self._frames.find(frame)), point)
+
+    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
+        """Factors of M by the articulated-body algorithm; None if joints have several velocities.
+
+        Args:
+            rotors: The addition of the rotors to the diagonal of M, shape (nv,).
+        """
+        return ArticulatedBodies(self._links, rotors) if is_one_by_one(self._links) else None
 
     def landmarks(self) -> ca.SX:
         """The origins of all bodies, in m, shape (3, k)."""

@@ -144,6 +144,9 @@ class LinkExpressions:
             acceleration = ca.SX.sym("acceleration", self.v.numel())
         return TextbookKinematics(self, acceleration)
 
+    def articulated_bodies(self, rotors: FloatArray) -> None:
+        """None: these links are no tree."""
+
     def generalized_force(self, kinematics: "TextbookKinematics", reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction, shape (nv, k)."""
         return reaction.generalized

@@ -126,13 +126,17 @@ class TreeLink:
     def inertia_to_parent(self, inertia: Inertia) -> Inertia:
         """An inertia in L, transformed to P's origin and axes."""
         first = self.rotation @ inertia.first
-        fixed = ca.SX(self.fixed)
-        second = symmetric(fixed @ self._turn_second(inertia.second) @ fixed.T)
+        second = symmetric(self.to_parent_axes(inertia.second))
         half = first + inertia.mass / 2 * self.offset
         outer = self.offset @ half.T
         return Inertia(
             inertia.mass, first + inertia.mass * self.offset, second + symmetric(outer + outer.T)
         )
+
+    def to_parent_axes(self, matrix: ca.SX) -> ca.SX:
+        """A symmetric matrix in L, shape (3, 3), in the axes of P."""
+        fixed = ca.SX(self.fixed)
+        return fixed @ self._turn_second(matrix) @ fixed.T
 
     def _turn_second(self, second: ca.SX) -> ca.SX:
         """turn second turn^T with 16 operations instead of 75."""

@@ -12,7 +12,10 @@ _FUNCTION = re.compile(
     r"(?P<head>static int (?P<name>casadi_f\d+)\([^\n]*\{)\n(?P<body>(?:  [^\n]*\n)*)\}"
 )
 _DECLARATION = "  casadi_real a"
-_ARGUMENTS = "const casadi_real** arg, casadi_real** res, casadi_real* shared"
+_ARGUMENTS = (
+    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, "
+    "casadi_real* shared"
+)
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
@@ -52,9 +55,9 @@ def _split(function: re.Match[str], longest: int) -> str:
             for a in sorted(read | written)
         ]
         end = [f"  shared[{index[a]}] = {a};" for a in sorted(written & needed[k + 1])]
-        head = f"static void __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
-        text += "\n".join([head, *begin, *piece, *end, "}", "", ""])
-        calls += f"  {name}_{k}(arg, res, shared);\n"
+        head = f"static int __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
+        text += "\n".join([head, *begin, *piece, *end, "  return 0;", "}", "", ""])
+        calls += f"  if ({name}_{k}(arg, res, iw, w, shared)) return 1;\n"
     shared = f"  casadi_real shared[{len(index) + 1}];\n"
     return f"{text}{function['head']}\n{shared}{calls}  return 0;\n}}"
 

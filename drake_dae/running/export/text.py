@@ -1,6 +1,7 @@
 """C code from Python: vectors, functions, lists, strings, comments and files from templates."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,12 +62,16 @@ def generated(functions: Mapping[str, ca.Function]) -> str:
         is_helper = (
             line.startswith("CASADI_SYMBOL_EXPORT") and "(const casadi_real** arg" not in line
         )
-        if not (is_helper or is_left_out or line.startswith("static const casadi_int casadi_s")):
+        if not (is_helper or is_left_out):
             kept.append(line)
         # A helper ends on its first line, or at the next line that is "}".
         is_left_out = (is_helper and not line.endswith("}")) or (is_left_out and line != "}")
     text = "\n".join([*kept, ""]).replace("CASADI_SYMBOL_EXPORT int", "static int")
-    text = re.sub(r"^casadi_real casadi_", "static casadi_real casadi_", text, flags=re.MULTILINE)
+    text = re.sub(r"^(\w+ casadi_\w+\()", r"static \1", text, flags=re.MULTILINE)
+    # Integer arrays that only helpers read; one that is read occurs three times.
+    used = Counter(re.findall(r"\bcasadi_s\d+\b", text))
+    integers = re.compile(r"^static const casadi_int (casadi_s\d+)\[.*\n", re.MULTILINE)
+    text = integers.sub(lambda found: found[0] if used[found[1]] > 2 else "", text)
     return re.sub(r"\n{3,}", "\n\n", text)
 
 

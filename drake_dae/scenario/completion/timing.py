@@ -3,12 +3,10 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi as ca
-
 from drake_dae.dae.references import references_by_name
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.timing.motion_limits import MotionLimits
-from drake_dae.dae.timing.profile import MOST_POLYNOMIALS, PathTiming, TimeOptimalReference
+from drake_dae.dae.timing.profile import PathTiming, TimeOptimalReference
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.motion_limits import robot_motion_limits
@@ -81,7 +79,9 @@ def timed(
             points=settings.points,
         )
     reference = TimeOptimalReference(profile)
-    why_not = _why_not_governed(scenario, reference)
+    why_not = ""
+    if scenario.observer is not None:
+        why_not = "the law has an observer, whose estimates it does not know"
     if settings.governor and why_not:
         raise ScenarioError(("time_optimal.governor", why_not))
     is_governed = not why_not and settings.governor is not False
@@ -98,13 +98,3 @@ def timed(
         notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
     governed = robot_motion_limits(model, **contacts) if is_governed else None
     return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)
-
-
-def _why_not_governed(scenario: Scenario, reference: TimeOptimalReference) -> str:
-    """Why there can be no governor; empty if there can be one."""
-    if scenario.observer is not None:
-        return "the law has an observer, whose estimates it does not know"
-    if reference.expression(reference.profile.layout.degrees, ca.SX.sym("t")) is None:
-        count = len(reference.table.factors)
-        return f"the path needs {count} polynomials, and it takes at most {MOST_POLYNOMIALS}"
-    return ""

@@ -1,6 +1,7 @@
 """Reads dataclasses from plain data and writes them, with all problems at once."""
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -20,9 +21,16 @@ class Reader(Generic[T]):
     def __init__(self, form: type[T]) -> None:
         whole = Annotated[form, Form(is_part=False)]  # type: ignore[valid-type]
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(whole)
-        self.schema: dict[str, Any] = self._adapter.json_schema()
-        #: Dotted keys of the dictionaries with any names; "*" is any entry of a list.
-        self.free_names = set(_free_names(self.schema, ""))
+
+    @cached_property
+    def schema(self) -> dict[str, Any]:
+        """The JSON Schema of the plain data."""
+        return self._adapter.json_schema()
+
+    @cached_property
+    def free_names(self) -> set[str]:
+        """Dotted keys of the dictionaries with any names; "*" is any entry of a list."""
+        return set(_free_names(self.schema, ""))
 
     def read(self, data: Any, folder: Path | None = None, known: dict[Any, Any] | None = None) -> T:
         """Makes the dataclass of plain data.

@@ -36,7 +36,7 @@ class TimeOptimal:
         points: The number of intervals of the grid along the path.
         governor: Whether the motion is slowed down during the run if the robot, off its path, would
             exceed a limit. If left out, it is if possible: the law must have no observer and no
-            exogenous signals, and the path at most 500 polynomials.
+            exogenous signals.
     """
 
     efforts: float = 0.95

@@ -11,7 +11,6 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
 from drake_dae.dae.references import Reference, ReferenceRows, stack_references
-from drake_dae.dae.references.pieces import MOST_IN_EXPRESSION
 from drake_dae.dae.references.reference import not_finite, with_degrees
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
@@ -228,11 +227,9 @@ def traced_references(
         if row is None:
             whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ModelError(
-                f"a {type(whole).__name__} is no expression of time, or one of more than "
-                f"{MOST_IN_EXPRESSION} polynomials, and a rollout needs one: take an "
-                "ExpressionReference, PointToPointReference or SinusoidReference, fewer "
-                "polynomials (by a larger tolerance, corner or smoothing), or run the loop by "
-                "simulate"
+                f"a {type(whole).__name__} is no expression of time, and a rollout needs one: take "
+                "an ExpressionReference, PointToPointReference or SinusoidReference, or run the "
+                "loop by simulate"
             )
         rows.append(row)
     return ca.vertcat(*rows)

@@ -4,7 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import PROBLEMS, Problem, double_integrator, pendulum
+from runs import scenario
 
+from drake_dae import build_scenario
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
@@ -293,3 +295,24 @@ def test_settling_reaches_the_manifold(problem):
         found = structure.manifold.settle(start)
         assert structure.manifold.is_consistent(found)
         assert np.max(np.abs(found - start) / structure.scale, initial=0.0) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_arms", "four_bar"])
+def test_the_gradient_in_fewer_operations_is_the_gradient(name):
+    """Also off the manifold. Two arms have less than half of the operations."""
+    loop, _ = build_scenario(scenario(name))
+    manifold = loop.plant.structure.manifold
+    short, whole = manifold.short_gradient, manifold.gradient
+    assert short is not whole
+    state, system = manifold.system.state, manifold.system
+    inputs = [state, system.parameter_symbol]
+    functions = [ca.Function("C", inputs, [ca.cse(each)]) for each in (short, whole)]
+    counts = [each.n_instructions() for each in functions]
+    assert counts[0] < {"two_arms": 0.5, "four_bar": 1.0}[name] * counts[1]
+    random = np.random.default_rng(2)
+    for _ in range(5):
+        x = system.nominal_state + 0.3 * random.standard_normal(system.num_states)
+        found, wanted = (each(x, system.parameter_values).full() for each in functions)
+        # Sums of some ten products of order 1.
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-13)

@@ -3,11 +3,14 @@
 import casadi as ca
 import numpy as np
 import pytest
+from runs import both
 from scipy.interpolate import BSpline
 
 from drake_dae import PathLimits, PolylineReference
+from drake_dae.dae.references.pieces import UNROLLED, PiecewisePolynomials
 from drake_dae.dae.references.splines import TimeSpline, basis_pieces
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.trace.functions import TracedFunction
 
 LIMITS = PathLimits(0.2, 2.0, 40.0)
 POINTS = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.1], [0.05, 0.1], [0.15, 0.1]]  # It turns back at the end.
@@ -67,12 +70,26 @@ def test_a_smaller_corner_is_nearer_and_slower():
     assert near.spline.duration > 1.5 * PATH.spline.duration
 
 
-def test_long_ones_are_tables():
-    """And short ones are expressions: both have the same values, so says their contract."""
+@both
+def test_many_polynomials_are_looked_up(compiled):
+    """At breaks, beside them, between them and far away; beside a break it is the right piece.
+
+    The sums have another order: to round-off of the largest factors, which are below 5.
+    """
+    random = np.random.default_rng(0)
+    breaks = np.cumsum([1.0, *random.uniform(1e-3, 1.0, UNROLLED + 100)])
+    factors = random.normal(size=(breaks.size - 1, 4, 3))
+    factors[:, 1, 2] = 0.0
+    pieces = PiecewisePolynomials(breaks, factors)
     time = ca.SX.sym("t")
-    assert PATH.expression([2, 2], time) is not None
-    long = PolylineReference(POINTS, LIMITS, 0.002)
-    assert long.expression([2, 2], time) is None
+    expressions = {"r": pieces.expression(time)}
+    function = TracedFunction("pieces", {"time": time}, expressions, compiled=compiled)
+    beside = np.nextafter(breaks, -np.inf), breaks, np.nextafter(breaks, np.inf)
+    for moment in np.concatenate([*beside, random.uniform(1.0, breaks[-1], 300), [-1e6, 1e6]]):
+        (found,) = function.evaluate(np.array([moment]))
+        np.testing.assert_allclose(found, pieces.at(moment), rtol=0.0, atol=1e-14)
+    assert function.is_machine_code == compiled
+    assert function.num_operations < 100
 
 
 @pytest.mark.parametrize(

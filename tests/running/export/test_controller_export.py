@@ -12,7 +12,7 @@ from c_controller import CController, compile_c
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from runs import scenario
+from runs import MANY_PIECES, scenario
 
 from drake_dae import LcmArm, build_scenario, export_controller, make_closed_loop
 from drake_dae.errors import ModelError
@@ -58,6 +58,7 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
     ("name", "settings"),
     [
         ("two_link_wall", (SAMPLED,)),
+        pytest.param("two_link_wall", (SAMPLED, MANY_PIECES), marks=pytest.mark.slow),
         pytest.param("two_link_wall", EVERYTHING, marks=pytest.mark.slow),
         pytest.param("seven_joint_moving_plate", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),

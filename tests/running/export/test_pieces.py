@@ -11,8 +11,11 @@ from drake_dae.trace.compiled import generate, without_branches
 from drake_dae.trace.compiler import find_compiler
 
 
-def long_function(name):
-    """A recursion whose values are read many assignments after they are written."""
+def long_function(name, looks_up=False):
+    """A recursion whose values are read many assignments after they are written.
+
+    One that looks values up calls another function, which needs memory.
+    """
     x, y = ca.SX.sym("x", 6), ca.SX.sym("y", 3)
     column = [x[i] for i in range(6)]
     for k in range(120):
@@ -20,6 +23,9 @@ def long_function(name):
         chosen = ca.if_else(one > y[k % 3], other, far)
         column.append(ca.sin(one + 0.1 * far) + ca.fmin(other, 0.3) * chosen)
     first = ca.vertcat(*column[20:30])
+    if looks_up:
+        table = ca.interpolant("table", "linear", [[0.0, 0.2, 1.0]], [1.0, 2.0, 0.5])
+        first = first + sum(table(each) for each in column[30:40])
     return ca.Function(name, [x, y], [ca.cse(ca.vertcat(*column[-10:])), first])
 
 
@@ -30,9 +36,10 @@ def library(source, folder):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("looks_up", [False, True])
 @pytest.mark.parametrize("longest", [7, 100])
-def test_pieces_compute_what_the_whole_does(tmp_path, longest):
-    whole = long_function("long_one")
+def test_pieces_compute_what_the_whole_does(tmp_path, longest, looks_up):
+    whole = long_function("long_one", looks_up)
     source = generate(whole)
     pieces = in_pieces(without_branches(source), longest)
     assert pieces.count("noinline") > 120 // longest

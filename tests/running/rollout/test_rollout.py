@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.trajectories import PiecewisePolynomial
-from runs import IN_CONTACT, both, each_scenario, mostly_compiled, run, scenario
+from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario
 
 from drake_dae import (
     ConstantReference,
@@ -23,6 +23,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
+from drake_dae.dae.references.pieces import UNROLLED
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import (
     InconsistentStateError,
@@ -102,6 +103,28 @@ def test_equal_fixed_steps_are_equal(name, scheme, compiled):
     assert found.failure is None
     assert found.steps == 200
     assert_equal_records(found.record, wanted, 1e-12)
+
+
+@both
+def test_a_reference_of_many_polynomials_is_the_same(compiled):
+    """To 1e-12 of the largest value, in steps that are powers of 2: Drake's times are exact."""
+    step, duration = 2.0**-10, 0.5
+    chosen = scenario("two_link_wall", MANY_PIECES, f"duration={duration}", *fixed(step=step))
+    loop, context = build_scenario(chosen)
+    assert loop.generator.references[0].spline.spans > UNROLLED
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, duration, chosen.integrator)
+    assert np.ptp(wanted["desired_output"][:, 0]) > 0.005
+    moments = grid(duration, step)
+    (found,) = rollout(
+        loop, start, parameters, moments, config=chosen.integrator, compiled=compiled
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+    # Several runs: they do not go side by side, and are the same.
+    many = rollout(
+        loop, [start] * 9, parameters, moments, config=chosen.integrator, compiled=compiled
+    )
+    np.testing.assert_array_equal(many[8].record["state"], found.record["state"])
 
 
 @mostly_compiled

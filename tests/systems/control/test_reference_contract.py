@@ -80,6 +80,7 @@ MEMBERS = {
     "turn": CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
     "spiral": SpiralReference([0.0, 1.0], 0.0, 0.3, 0.2, LIMITS),
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
+    "polyline of many pieces": PolylineReference(EDGES, LIMITS, 0.01),
     "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
     "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
     "file": CsvReference(
@@ -189,11 +190,17 @@ def test_rule_7_with_other_parameters_it_is_another_reference_of_the_same_form(r
 
 
 def test_rule_6_traced_together_the_values_are_the_same(reference):
-    """Beside another, all as one function or one after the other."""
+    """Beside another, all as one function or one after the other; and as an expression."""
     degrees = [2] * reference.size
+    time = ca.SX.sym("t")
+    rows = reference.expression(degrees, time)
+    traced = None if rows is None else ca.Function("rows", [time], [rows])
     generator = ReferenceGenerator([ConstantReference(7.0), reference], [1, *degrees])
-    for time in TIMES:
-        stacked = generator.reference(time)
+    for moment in TIMES:
+        stacked = generator.reference(moment)
         np.testing.assert_array_equal(stacked[:2], [7.0, 0.0])
-        own = reference.derivatives(degrees)(time)
+        own = reference.derivatives(degrees)(moment)
         np.testing.assert_allclose(stacked[2:], own, rtol=1e-14, atol=1e-14)
+        if traced is not None:
+            # Derivatives of a polynomial of a short piece are divided by its length.
+            np.testing.assert_allclose(traced(moment).full()[:, 0], own, rtol=1e-12, atol=1e-12)

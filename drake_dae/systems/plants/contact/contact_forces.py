@@ -67,16 +67,18 @@ class ContactForces(LeafSystem):
         self._output = dae.trace("controlled output", output, {"force": force})
         self._state = self.DeclareVectorInputPort("state", dae.num_states)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        # The part that other ports use is computed once.
-        self._contact = self.DeclareVectorOutputPort(
-            "contact_force", 3 * len(self._pairs), port_value(self._contact_force)
+        # Ports that others use are computed once; none depends on the time, which changes from a
+        # record to the next sample while the state does not.
+        sources = {self.all_input_ports_ticket()}
+        self._contact, self._constraint, *_ = (
+            self.DeclareVectorOutputPort(name, size, port_value(value), sources)
+            for name, size, value in (
+                ("contact_force", 3 * len(self._pairs), self._contact_force),
+                ("constraint_force", dae.num_constraints, self._force),
+                ("constraint_residual", len(structure.manifold.residual_signals), self._residual),
+                ("controlled_output", dae.num_outputs, self._outputs),
+            )
         )
-        for name, size, value in (
-            ("constraint_force", dae.num_constraints, self._force),
-            ("constraint_residual", len(structure.manifold.residual_signals), self._residual),
-            ("controlled_output", dae.num_outputs, self._outputs),
-        ):
-            self.DeclareVectorOutputPort(name, size, port_value(value))
 
     def _contact_force(self, context: Context) -> FloatArray:
         results: ContactResults = self._results.Eval(context)
@@ -104,15 +106,17 @@ class ContactForces(LeafSystem):
     def _force(self, context: Context) -> FloatArray:
         contact = self._contact.Eval(context).reshape(-1, 3)
         state = self._state.Eval(context)
-        normals = self._normals(state, self._parameters)[0].reshape(-1, 3)
-        return np.asarray(np.sum(normals * contact, axis=1))
+        normals = self._normals.evaluate(state, self._parameters)[0].reshape(-1, 3)
+        force: FloatArray = (normals * contact).sum(axis=1)
+        return force
 
     def _residual(self, context: Context) -> FloatArray:
-        return self._manifold.residual(self._state.Eval(context), self._parameters)
+        function = self._manifold.residual_function
+        return function.evaluate(self._state.Eval(context), self._parameters)[0]
 
     def _outputs(self, context: Context) -> FloatArray:
-        state, force = self._state.Eval(context), self._force(context)
-        return self._output(state, force, self._parameters)[0]
+        state, force = self._state.Eval(context), self._constraint.Eval(context)
+        return self._output.evaluate(state, force, self._parameters)[0]
 
 
 def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:
