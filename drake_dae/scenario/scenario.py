@@ -127,6 +127,9 @@ class Scenario:
             - 1 poles per constraint; none if left out while `gains` are given.
         observer: The observer of a disturbance and of coefficients of friction, for a sampled law
             with measured `force_feedback`; none if left out while `gains` are given.
+        identified: Names of parameters that the observer estimates while the robot moves, each with
+            a standard deviation, within `bounds`: masses and places of payloads, friction of
+            joints, "wall.rpy" of a surface.
         largest_roughness: The largest permitted rms change of the controls from sample to sample by
             the noise of `encoders`, over all joints, in N m, for computed gains; if left out 0.3 %
             of the largest effort limit, or 1 N m without limits.
@@ -175,6 +178,7 @@ class Scenario:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     observer: Observer | None = None
+    identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None
     plant: Plant = field(default_factory=plants.IdealConstraints)
     sampling: Sampling | None = None

@@ -22,7 +22,8 @@ def check_model(model: RobotModel) -> None:
     if model.dae.exogenous or model.known_forces:
         raise ModelError(
             "Drake's contact as the plant takes no exogenous signals and no known_forces; forces "
-            "that the law does not know are disturbance forces (plant_disturbances)"
+            "that the law does not know are disturbance forces (plant_disturbances). Use "
+            "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
@@ -50,6 +51,7 @@ def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -
     changeable += [
         *model.links.parameters,
         *(p for stage in model.stages for p in stage.parameters),
+        *(p for load in model.known_forces for p in load.parameters),
     ]
     known = {parameter.name: parameter for parameter in changeable}
     for name, value in parameters.items():

@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
@@ -258,17 +258,22 @@ class ContactPlant(Diagram, Plant):
             balls.append((GetScopedFrameByName(plant, name), center))
         return balls
 
-    def _other_masses(self) -> list[tuple[RigidBody, float]]:
-        """The bodies with another mass than in the model, each with its own."""
+    def _other_masses(self) -> list[tuple[RigidBody, float, FloatArray | None]]:
+        """The bodies with another mass or place than in the model, with their own."""
         drawn = self.model.links.plant
         assert drawn is not None  # check_model.
         bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
         changed = []
         with_mass = (body for body in bodies if body.default_mass() > 0.0)
-        for body, parameter in zip(with_mass, self.model.links.parameters, strict=True):
-            value = self._values[self.dae.parameter_slice(parameter.name)].item()
-            if value != body.default_mass():
-                changed.append((self.multibody.get_body(body.index()), value))
+        values = {
+            p.name: self._values[self.dae.parameter_slice(p.name)]
+            for p in self.model.links.parameters
+        }
+        masses = [name for name in values if name.endswith(".mass")]
+        for body, name in zip(with_mass, masses, strict=True):
+            mass, center = values[name].item(), values.get(f"{name.removesuffix('mass')}center")
+            if mass != body.default_mass() or (center is not None and center.any()):
+                changed.append((self.multibody.get_body(body.index()), mass, center))
         return changed
 
     def parameters(self, context: Context) -> FloatArray:
@@ -316,8 +321,14 @@ class ContactPlant(Diagram, Plant):
         """Sets (q, v) and changed masses in a context of the scene."""
         multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(multibody_context, links)
-        for body, mass in self._masses:
-            body.SetMass(multibody_context, mass)
+        for body, mass, center in self._masses:
+            if center is None:
+                body.SetMass(multibody_context, mass)
+            else:
+                squares = center @ center - center**2
+                unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
+                inertia = SpatialInertia(mass, center, unit)
+                body.SetSpatialInertiaInBodyFrame(multibody_context, inertia)
 
     def traced(self) -> Block:
         count = self.multibody.num_multibody_states()
