@@ -124,8 +124,8 @@ class Observation:
     identified: Identified
 
     @classmethod
-    def of(cls, structure: Structure) -> "Observation":
-        """Derives the functions from the structure of a system.
+    def of(cls, structure: Structure, layout: DerivativeLayout) -> "Observation":
+        """Derives the functions from the structure of a system, for references of a layout.
 
         Raises:
             ModelError: The system has no disturbance, or a mass matrix that depends on the states
@@ -183,7 +183,7 @@ class Observation:
         directions = system.trace(
             "directions of friction", directions_of_forces, pressed, often=False
         )
-        wanted, moving = _wanted(structure, rows)
+        wanted, moving = _wanted(structure, rows, layout)
         return cls(
             function, friction, directions, wanted, moving, tuple(rows), frictions, identified
         )
@@ -243,10 +243,10 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 
 
 def _wanted(
-    structure: Structure, rows: Sequence[int]
+    structure: Structure, rows: Sequence[int], layout: DerivativeLayout
 ) -> tuple[TracedFunction | None, TracedFunction]:
     """Returns `wanted` and `moving` of an `Observation`."""
-    system, layout = structure.system, DerivativeLayout(structure.output_degrees)
+    system = structure.system
     # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}

@@ -51,7 +51,7 @@ class ForceMeasurement:
                 "share their forces; leave them out with `drop_constraints`, or use the law's "
                 "own force"
             )
-        inputs = _force_outputs(system)
+        inputs = force_outputs_of(system)
         matrix = force_gain(gain, system.num_constraints)
         for i, j in inputs.items():
             if layout.degrees[i] and matrix[j].any():
@@ -115,7 +115,7 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
     return gain
 
 
-def _force_outputs(system: DaeSystem) -> dict[int, int]:
+def force_outputs_of(system: DaeSystem) -> dict[int, int]:
     """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
     forces = {}
     for i in range(system.num_outputs):

@@ -88,7 +88,7 @@ class Observed:
     """
 
     def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
-        self.observation = observation = Observation.of(law.structure)
+        self.observation = observation = Observation.of(law.structure, law.layout)
         self._system, self._observing, self._period = law.system, observing, period
         self._force = ca.SX.sym("constraint_input", law.system.num_constraints)
         entries = (law.system.parameter_slice(p.name) for p in observation.identified.parameters)

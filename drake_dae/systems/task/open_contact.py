@@ -97,6 +97,8 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
             f"{', '.join(others) or 'nothing'}"
         )
     place, force = output_of_force(closed, gone[0]), names.index(gone[0])
+    if law.deflection is not None:
+        raise ModelError(f"{closed.name}: a contact_stiffness is not for tasks; leave it out")
     distance = closed.constraint_output_signals[force].name
     if free.output_signals[place].name != distance:
         raise ModelError(

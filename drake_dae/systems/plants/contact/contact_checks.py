@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
@@ -87,3 +88,10 @@ def check_same(plant: MultibodyPlant, model: RobotModel) -> None:
             f"add_robot must add the robot of the model, with positions "
             f"{', '.join(model_names[0])}; it has {', '.join(names[0]) or 'none'}"
         )
+
+
+def point_mass(mass: float, center: FloatArray) -> SpatialInertia:
+    """The inertia of a point mass in kg at a place in m, shape (3,)."""
+    squares = center @ center - center**2
+    unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
+    return SpatialInertia(mass, center, unit)

@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import BodyIndex, Frame, RigidBody, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
@@ -37,6 +37,7 @@ from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
     check_same,
+    point_mass,
 )
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contact.contact_material import (
@@ -265,10 +266,8 @@ class ContactPlant(Diagram, Plant):
         bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
         changed = []
         with_mass = (body for body in bodies if body.default_mass() > 0.0)
-        values = {
-            p.name: self._values[self.dae.parameter_slice(p.name)]
-            for p in self.model.links.parameters
-        }
+        names = [parameter.name for parameter in self.model.links.parameters]
+        values = {name: self._values[self.dae.parameter_slice(name)] for name in names}
         masses = [name for name in values if name.endswith(".mass")]
         for body, name in zip(with_mass, masses, strict=True):
             mass, center = values[name].item(), values.get(f"{name.removesuffix('mass')}center")
@@ -325,10 +324,7 @@ class ContactPlant(Diagram, Plant):
             if center is None:
                 body.SetMass(multibody_context, mass)
             else:
-                squares = center @ center - center**2
-                unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
-                inertia = SpatialInertia(mass, center, unit)
-                body.SetSpatialInertiaInBodyFrame(multibody_context, inertia)
+                body.SetSpatialInertiaInBodyFrame(multibody_context, point_mass(mass, center))
 
     def traced(self) -> Block:
         count = self.multibody.num_multibody_states()
