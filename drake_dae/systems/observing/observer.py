@@ -148,7 +148,13 @@ class DisturbanceObserver(ObservingSystem):
 
     def _sample(self, context: Context, state: State) -> EventStatus:
         x, u, force = self._inputs(context, "estimated_state", "control", "measured_force")
-        inputs = context.get_discrete_state(self._held).value(), u, force, self._hold_input(context)
+        inputs = (
+            context.get_discrete_state(self._held).value(),
+            u,
+            force,
+            self._hold_input(context),
+            self._reference(context, x),
+        )
         after = self._checked(self._functions.sample, context, x, *inputs)[0]
         state.get_mutable_discrete_state().set_value(self._held, after)
         return EventStatus.Succeeded()
@@ -166,7 +172,7 @@ class DisturbanceObserver(ObservingSystem):
         functions, memory = self._functions, self._functions.memory
         read = ("estimated_state", HELD)
         needed = (*read, "measured_force", "reference", PARAMETERS)
-        sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
+        sampled = (*read, "control", "measured_force", "hold", "reference", PARAMETERS)
         parts = {"disturbance": memory.disturbance, "friction": memory.friction}
         parts |= self._estimates
         shown = ca.Function("shown", [memory.column], list(parts.values()))

@@ -6,7 +6,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.beyond.disturbance import beside
+from drake_dae.dae.beyond.disturbance import beside, shares
 from drake_dae.dae.beyond.lags import Lags
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
@@ -14,6 +14,18 @@ from drake_dae.systems.observing.observed import ContactTerms, Observed, disturb
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.parameter_filter import ParameterFilter, Sampled
 from drake_dae.trace.functions import TracedFunction
+
+BREAK_RATE = 12.0
+"""The rate in 1/s at which a coefficient of friction rises until its contact breaks away."""
+
+STICKS = 0.5
+"""A contact sticks below this share of the wanted speed."""
+
+LEAST_SHARE = 0.06
+"""The least wanted speed for which this is tested, relative to `Observing.least_speed`."""
+
+EARLY = 2.0
+"""The number of samples that the first value of a coefficient counts for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +39,7 @@ class ObserverMemory:
         lags: The inputs of the lags before r, shape (n k,).
         momentum, drift, control: p, its rate without inputs, and u of the sample before.
         has_sample: 0 before the first sample, then 1, shape (1,).
+        experience: The samples for which each contact slides, while they are few, shape (c,).
         filter: The state of the `ParameterFilter`.
         identified: The part of it that are parameters, but for coefficients of friction.
     """
@@ -39,6 +52,7 @@ class ObserverMemory:
     drift: ca.SX
     control: ca.SX
     has_sample: ca.SX
+    experience: ca.SX
     filter: ca.SX
     identified: ca.SX
 
@@ -48,7 +62,7 @@ class ObserverMemory:
     ) -> Self:
         """Symbols for given sizes of r, mu and u, and a given number of derivatives of r."""
         chain = degree * size
-        sizes = (size, frictions, chain, chain, size, size, controls, 1)
+        sizes = (size, frictions, chain, chain, size, size, controls, 1, frictions)
         symbols = [ca.SX.sym("held", count) for count in sizes]
         return cls(*[*symbols, filtered, filtered[:known]])
 
@@ -63,7 +77,7 @@ class ObserverFunctions(Observed):
 
     Attributes:
         memory: The symbols of the discrete state.
-        sample: (x, held, u, v, hold, parameters) -> the discrete state after a sample.
+        sample: (x, held, u, v, hold, R, parameters) -> the discrete state after a sample.
         exogenous: (x, held, v, R, parameters) -> the disturbance to compensate, mu, and their
             derivatives.
 
@@ -79,7 +93,7 @@ class ObserverFunctions(Observed):
         self, law: TrackingLaw, observing: Observing, period: float, lag: float, delay: float
     ) -> None:
         super().__init__(law, observing, period)
-        self._lag = lag
+        self._lag, self._delay, self._reference_size = lag, delay, law.layout.reference_size
         rates = observing.rate, observing.force_rate or observing.rate
         degree, size = disturbance_degree(law), len(self.observation.rows)
         self._lags = [Lags.of(rate, period, degree) for rate in rates]
@@ -119,6 +133,7 @@ class ObserverFunctions(Observed):
         acted = late * memory.control + (1.0 - late) * u
         momentum = observation.momentum.function(x, acted, v, parameters)
         contact = self.contact(x, parameters)
+        reference = ca.SX.sym("reference", self._reference_size)
         p, drift, inputs = momentum[:3]
         d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
         d -= ca.mtimes(contact.friction, mu)
@@ -145,17 +160,70 @@ class ObserverFunctions(Observed):
             filtered = ca.SX(0, 1)
             change = self.change(contact, mu, chain[:, -1], hold)
             chain -= ca.repmat(ca.mtimes(contact.friction, change), 1, chain.shape[1])
+        early, experience = self._early(contact, x, v, reference, parameters, d, hold)
+        change = ca.fmin(ca.fmax(mu + change + early, 0.0), self._observing.largest_friction) - mu
         moves = ca.mtimes(contact.free, chain)
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         lags = ca.vec(chain[:, :-1])
-        after = [chain[:, -1], mu + change, ca.vec(rates), lags, p, drift, u, 1.0, filtered]
+        after = [
+            chain[:, -1],
+            mu + change,
+            ca.vec(rates),
+            lags,
+            p,
+            drift,
+            u,
+            1.0,
+            experience,
+            filtered,
+        ]
         # A value that is not finite may be hidden by a limit.
         valid = momentum[-1] + contact.valid
         return self._system.trace(
             "sample of the observer",
             {"held": ca.vertcat(*after), "valid": valid},
-            {"held": memory.column, "control": u, "constraint_input": v, "hold": hold},
+            {
+                "held": memory.column,
+                "control": u,
+                "constraint_input": v,
+                "hold": hold,
+                "reference": reference,
+            },
         )
+
+    def _early(
+        self,
+        contact: ContactTerms,
+        x: ca.SX,
+        v: ca.SX,
+        reference: ca.SX,
+        parameters: ca.SX,
+        d: ca.SX,
+        hold: ca.SX,
+    ) -> tuple[ca.SX, ca.SX]:
+        """The change of friction at the first break-away, and the samples of sliding after it.
+
+        While a contact sticks where it should slide, its coefficient rises with `BREAK_RATE`, so
+        that it breaks away before the reference is far. Then samples of d are averaged, without a
+        low-pass, until `friction_rate` is faster.
+        """
+        memory, observation = self.memory, self.observation
+        if observation.wanted is None:
+            return 0.0 * memory.friction, memory.experience
+        goal = observation.wanted.function(x, reference, self._delay, parameters)[0]
+        wanted, actual = (
+            observation.friction.function(state, v, parameters)[1] for state in (goal, x)
+        )
+        least = LEAST_SHARE * self._observing.least_speed
+        follows = actual >= STICKS * wanted
+        weight = 1.0 / (memory.experience + EARLY)
+        is_early = weight > EARLY * self._observing.friction_rate * self._period
+        used = is_early * (wanted > least) * ca.logic_not(ca.logic_or(self._is_lost, hold))
+        slides = used * follows * (actual > least)
+        terms = contact.friction, contact.planes, contact.velocity, contact.metric
+        change = slides * weight * shares(*terms, d)
+        change += used * ca.logic_not(follows) * BREAK_RATE * self._period
+        return change, memory.experience + slides
 
     def _passed(self, contact: ContactTerms, chain: ca.SX, signal: ca.SX) -> ca.SX:
         """The lags of a signal after a sample; what a sticking contact may hide does not enter."""

@@ -1,4 +1,4 @@
-"""Forces that change within a period of a compliant contact, against the error that is predicted."""
+"""Forces that change within a period of a compliant contact: the error is the predicted one."""
 
 import numpy as np
 import pytest

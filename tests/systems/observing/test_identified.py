@@ -30,6 +30,7 @@ from drake_dae import (
 from drake_dae.cli import main
 from drake_dae.dae.beyond.disturbance import Observation
 from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.model import scenario_model
@@ -115,7 +116,9 @@ def observed_arm():
     names = ["payload.mass", "payload.center", "wall.rpy", *(f"{j}.coulomb" for j in JOINTS)]
     velocities = [signal.name for signal in model.links.velocity_signals]
     system = with_disturbance(model.dae, velocities, ["wall.friction", *names])
-    return system, Observation.of(find_structure(system)), names
+    structure = find_structure(system)
+    layout = DerivativeLayout(structure.output_degrees)
+    return system, Observation.of(structure, layout), names
 
 
 def test_slopes_are_those_of_momentum_and_distance():
@@ -278,3 +281,26 @@ def test_bounds_are_needed_in_python_too():
         with_disturbance(
             scenario_model(load_scenario("two_link_wall")).dae, ["joint1_w"], ["link2.mass"]
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("acceleration", [0.3, pytest.param(0.05, marks=pytest.mark.thorough)])
+def test_a_contact_breaks_away_for_the_first_time_without_a_swing(acceleration):
+    """At most 0.1 mm and 0.1 N at a friction of 0.45 that the law takes for 0; 2.6 mm without.
+
+    A rest of 1 s, then a line.
+    """
+    limits = f"{{speed: 0.05, acceleration: {acceleration}}}"
+    line = f"!Line {{start: [0.0], end: [0.05], limits: {limits}, start_time: 1.0}}"
+    settings = [
+        f"references.tool.y={line}",
+        "references.tool.z=0.7",
+        "references.wall.force=!PointToPoint {start: [1], end: [20], start_time: 0, end_time: 0.8}",
+        "plant.friction=0.45",
+    ]
+    _, _, record = rolled(2.0, *settings)
+    error = record["controlled_output"] - record["desired_output"]
+    late = record.time > 0.9
+    assert 1e3 * np.linalg.norm(error[late, :2], axis=1).max() < 0.1
+    assert np.abs(error[late, -1]).max() < 0.1
+    assert abs(record["friction"][-1, 0] - 0.45) < 0.005
