@@ -103,12 +103,13 @@ class Scenario:
         plant_payloads: Additional masses on the plant, unknown to the law's model.
         plant_disturbances: Disturbance forces on the plant, unknown to the law.
         known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
-            `plant_parameters`.
+            `plant_parameters`. And friction of joints.
         exogenous: Parameter name -> references of its entries, known to plant and law;
             "wall.position" for example.
         bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; a
             number, or one per entry. Relative degrees are checked for all values within bounds; if
-            both bounds are equal, the value is fixed. Bounds do not restrict a run.
+            both bounds are equal, the value is fixed. Bounds do not restrict a run, only values
+            that are `identified`.
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
