@@ -86,6 +86,7 @@ from .robots.force_outputs import ForceCombination as ForceCombination
 from .robots.force_outputs import ForceOutput as ForceOutput
 from .robots.force_outputs import NamedForce as NamedForce
 from .robots.force_outputs import Squeeze as Squeeze
+from .robots.joint_friction import JointFriction as JointFriction
 from .robots.known_forces import KnownForce as KnownForce
 from .robots.known_forces import KnownWrench as KnownWrench
 from .robots.link_side import link_side as link_side

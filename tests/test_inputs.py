@@ -150,7 +150,7 @@ ROBOTS = {
     ),
     "Coulomb friction": (
         {"dynamics": '<dynamics damping="0.1" friction="0.5"/>'},
-        "joint 'j': Coulomb friction of a joint is not supported",
+        "joint 'j': Coulomb friction of joints is not read from files",
     ),
     "no effort": ({"effort": "0"}, "joint 'j': .* zero effort limit"),
     "two actuators on a joint": ({"more": SECOND}, "m, m2 move the joints in only 1 indepen"),

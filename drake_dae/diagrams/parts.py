@@ -117,7 +117,9 @@ def check_parts(
     if controller.HasInputPort("reference") is not (reference is not None):
         needs = "plans its references itself: leave `reference` out"
         if reference is None:
-            needs = "needs a ReferenceGenerator(references, controller.law.degrees)"
+            needs = (
+                "needs a ReferenceGenerator(references, controller.law.layout.reference_degrees)"
+            )
         raise WiringError(f"{controller.get_name()} {needs}")
     needs = "it needs the references of a generator, and there is none"
     missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}

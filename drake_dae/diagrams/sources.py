@@ -28,11 +28,11 @@ def make_generator(
         ReferenceSignalError: The references do not fit the law.
     """
     if parts.commands is None:
-        return ReferenceGenerator(references, law.degrees)
+        return ReferenceGenerator(references, law.layout.reference_degrees)
     if parts.governed is not None:
         raise WiringError("references that are governed cannot be commanded: leave one out")
-    signals = law.system.output_signals
-    return CommandedReferences(references, law.degrees, signals, parts.commands, parts.start_time)
+    degrees, signals = law.layout.reference_degrees, law.system.output_signals
+    return CommandedReferences(references, degrees, signals, parts.commands, parts.start_time)
 
 
 def add_exogenous(

@@ -89,10 +89,10 @@ def make_closed_loop(
     settings = settings or LoopSettings()
     check_law(plant.dae, law)
     if isinstance(references, System):
-        references = [SystemReference(references, law.degrees)]
+        references = [SystemReference(references, law.layout.reference_degrees)]
     if isinstance(references, Mapping):
         names = [signal.name for signal in law.system.output_signals]
-        references = references_by_name(references, names, law.degrees)
+        references = references_by_name(references, names, law.layout.reference_degrees)
     period = settings.period(plant.time_step)
     reference = make_generator(references, law, settings)
     if settings.governed is not None:

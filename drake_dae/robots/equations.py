@@ -11,7 +11,7 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.trace.factorization import BlockFactors, Factors, PositiveDefiniteFactorization
@@ -38,7 +38,7 @@ def robot_equations(
     bound: ConstraintSet,
     driven: ActuationChain,
     loop_joints: LoopState,
-    known_forces: Sequence[KnownForce],
+    known_forces: Sequence[Load],
     outputs: Outputs,
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
@@ -120,10 +120,11 @@ def robot_equations(
         control_metric=ca.diag(choice[0].symbol) if choice else None,
         free_control=choice[1].symbol if choice else None,
         contacts=bound.contacts,
+        dry=tuple(name for load in known_forces for name in load.dry),
     )
 
 
-def _known_force(links: Links, known_forces: Sequence[KnownForce]) -> ca.SX:
+def _known_force(links: Links, known_forces: Sequence[Load]) -> ca.SX:
     """The generalized force of the known_forces, shape (nv, 1)."""
     total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
     for load in known_forces:

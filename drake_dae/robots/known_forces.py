@@ -1,5 +1,6 @@
 """Known applied forces on a robot.                                            (37)"""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -12,9 +13,34 @@ from drake_dae.robots.links.kinematics import Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import Vector
 
 
+class Load(ABC):
+    """Applied forces on a robot that its model contains.
+
+    1. `reaction` are the forces, as a function of positions, velocities and `parameters`.
+    2. `resistance` is D(q, v), positive semidefinite, if they are -D v; zero otherwise. A plant in
+       discrete steps uses D v of the velocities after the step, which is stable for any step.
+    3. `dry` are the names of the parameters that are coefficients of Coulomb friction.
+    """
+
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def dry(self) -> tuple[str, ...]:
+        """Names of the coefficients of Coulomb friction."""
+        return ()
+
+    @abstractmethod
+    def reaction(self, kinematics: Kinematics) -> Reaction:
+        """The reaction on the robot."""
+
+    def resistance(self, kinematics: Kinematics) -> ca.SX:
+        """D of the generalized force -D v, shape (nv, nv)."""
+        return ca.SX(kinematics.v.numel(), kinematics.v.numel())
+
+
 @checked(ModelError)
 @dataclass(frozen=True)
-class KnownForce:
+class KnownForce(Load):
     """A force F on a point of a frame, which adds J_p^T F to the right side of (37).
 
     The parameter "<name>.force" is F in N, in the world, zero by default. As an exogenous signal

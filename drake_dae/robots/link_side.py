@@ -48,6 +48,9 @@ def link_side(model: RobotModel) -> RobotModel:
         model.known_forces,
         compiled=model.dae.compiled,
     )
+    bounds = {p.name: p.bounds for p in model.dae.parameters if p.bounds is not None}
+    own = [p.name for p in robot.dae.parameters]
+    robot.dae = robot.dae.with_bounds({n: pair for n, pair in bounds.items() if n in own})
     robot.control_limits = np.array(model.links.effort_limits)
     return robot
 

@@ -23,7 +23,7 @@ from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.equations import Outputs, robot_equations
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loop_state import LoopState
@@ -67,7 +67,7 @@ class RobotModel:
             of forces, as a `Squeeze`; all constraint forces if None, none without actuators.
         exogenous: The names of parameters that are exogenous signals w with known derivatives,
             "wall.position" for example; see `DaeSystem`.
-        known_forces: Known forces on frames; zero by default.
+        known_forces: Known forces on frames, zero by default, and friction of joints.
         compliances: For a robot whose constraints are redundant: name of a constraint force -> its
             relative compliance, 1 if not named, {} for equal ones. The forces are then shared by
             least squares, see `share_forces`. An output that depends on the split is refused, since
@@ -103,7 +103,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        known_forces: Sequence[KnownForce] = (),
+        known_forces: Sequence[Load] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
@@ -181,7 +181,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        known_forces: Sequence[KnownForce] = (),
+        known_forces: Sequence[Load] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",

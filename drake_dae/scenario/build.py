@@ -36,7 +36,7 @@ from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
-from drake_dae.scenario.parts.parts import Adaptive
+from drake_dae.scenario.parts.parts import Adaptive, Tracking
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -242,6 +242,13 @@ def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
     force, damping = scenario.force_feedback, scenario.constraint_damping
     keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
+    stiffness = scenario.law.contact_stiffness if isinstance(scenario.law, Tracking) else None
+    if stiffness is not None:
+        keys = ["law", *keys]
+        if scenario.task is not None or scenario.time_optimal is not None:
+            key = "task" if scenario.task is not None else "time_optimal"
+            text = f"is not for scenarios with `{key}`; leave it out"
+            raise ScenarioError(("law.contact_stiffness", text))
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.
         return TrackingLaw(
@@ -252,6 +259,7 @@ def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
             force_gain=force.gain,
             constraint_damping=None if damping is None else damping.design(),
             integral=scenario.integral or (),
+            contact_stiffness=stiffness,
         )
 
 
@@ -284,7 +292,8 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
     smooth = []
     for name, reference in references.items():
         with at(f"references.{name}"):
-            smooth.append(assigned(name, reference, outputs, law.degrees))
+            degrees = law.layout.reference_degrees
+            smooth.append(assigned(name, reference, outputs, degrees))
     with at("references"):
         return in_order(smooth, outputs)
 

@@ -21,7 +21,7 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.model import RobotModel
@@ -116,7 +116,7 @@ class _BuiltRobot:
     links: MultibodyExpressions
     constraints: Sequence[Constraint]
     stages: Sequence[Stage]
-    known_forces: Sequence[KnownForce]
+    known_forces: Sequence[Load]
     completed: Completed
 
 
@@ -260,7 +260,7 @@ def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
 def _check_exogenous(
     names: Iterable[str],
     links: Links,
-    members: Sequence[Constraint | KnownForce],
+    members: Sequence[Constraint | Load],
     stages: Sequence[Stage],
     choice: Sequence[Parameter],
 ) -> None:

@@ -2,7 +2,7 @@
 
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
@@ -53,6 +53,9 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
     """
     observer = scenario.observer
     if observer is None:
+        if scenario.identified:
+            text = "needs an observer; give `observer`, or leave `gains` out with Drake's contact"
+            raise ScenarioError(("identified", text))
         return structure
     with at("observer"):
         if scenario.exogenous:
@@ -69,4 +72,6 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
                 )
         velocities = [signal.name for signal in model.links.velocity_signals]
         frictions = [frictional[name] for name in observer.identify_friction]
-        return find_structure(with_disturbance(model.dae, velocities, frictions))
+        with at("identified"):
+            observed = with_disturbance(model.dae, velocities, [*frictions, *scenario.identified])
+        return find_structure(observed)

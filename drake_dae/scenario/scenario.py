@@ -103,12 +103,13 @@ class Scenario:
         plant_payloads: Additional masses on the plant, unknown to the law's model.
         plant_disturbances: Disturbance forces on the plant, unknown to the law.
         known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
-            `plant_parameters`.
+            `plant_parameters`. And friction of joints.
         exogenous: Parameter name -> references of its entries, known to plant and law;
             "wall.position" for example.
         bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; a
             number, or one per entry. Relative degrees are checked for all values within bounds; if
-            both bounds are equal, the value is fixed. Bounds do not restrict a run.
+            both bounds are equal, the value is fixed. Bounds do not restrict a run, only values
+            that are `identified`.
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
@@ -127,6 +128,9 @@ class Scenario:
             - 1 poles per constraint; none if left out while `gains` are given.
         observer: The observer of a disturbance and of coefficients of friction, for a sampled law
             with measured `force_feedback`; none if left out while `gains` are given.
+        identified: Names of parameters that the observer estimates while the robot moves, each with
+            a standard deviation, within `bounds`: masses and places of payloads, friction of
+            joints, "wall.rpy" of a surface.
         largest_roughness: The largest permitted rms change of the controls from sample to sample by
             the noise of `encoders`, over all joints, in N m, for computed gains; if left out 0.3 %
             of the largest effort limit, or 1 N m without limits.
@@ -175,6 +179,7 @@ class Scenario:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     observer: Observer | None = None
+    identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None
     plant: Plant = field(default_factory=plants.IdealConstraints)
     sampling: Sampling | None = None

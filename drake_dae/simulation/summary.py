@@ -211,14 +211,39 @@ def _controls(record: Record, limits: Limits) -> list[str]:
     return Table(["control", "unit", "least", "largest", "limit", ""], rows, left=2).lines()
 
 
+UNEXCITED = 0.5
+"""A parameter is not excited if its deviation stays above this share of that of its bounds."""
+
+
 def _identified(record: Record) -> list[str]:
-    """The friction identified by an observer at the end."""
+    """The friction, or all parameters, identified by an observer at the end."""
+    if "identified" in record.signals:
+        return _estimated(record)
     if "friction" not in record.signals:
         return []
     friction = record.signals["friction"]
     pairs = zip(friction.signals, friction.values[-1], strict=True)
     text = ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
     return [f"identified           {text} at the end"]
+
+
+def _estimated(record: Record) -> list[str]:
+    """Estimated parameters with their standard deviations, and those that remain unknown."""
+    recorded, deviations = record.signals["identified"], record["identified_deviation"]
+    found, unknown = list[str](), list[str]()
+    # The first row has the deviations of values that are equally likely within their bounds.
+    for signal, value, own, prior in zip(
+        recorded.signals, recorded.values[-1], deviations[-1], deviations[0], strict=True
+    ):
+        text = f"{signal.name} = {value:.3g} +- {own:.1g} {signal.unit}".rstrip()
+        if own < UNEXCITED * prior:
+            found.append(f"identified           {text}")
+        else:
+            unknown.append(signal.name)
+    if unknown:
+        names = ", ".join(unknown)
+        found.append(f"not identified       {names}: this motion does not excite them")
+    return found
 
 
 def _number(value: float, size: float, digits: int) -> str:

@@ -8,7 +8,7 @@ from runs import scenario
 
 from drake_dae import grid_variations, listed_variations, random_variations
 from drake_dae.errors import ScenarioError
-from drake_dae.studies.variations import parse_variations
+from drake_dae.studies.variations import parse_variations, setting
 
 
 def test_a_grid_has_every_combination_the_last_key_first():
@@ -36,6 +36,14 @@ def test_a_seed_determines_random_values():
     assert random_variations(ranges, 80, seed=3)[:50] == first
     alone = random_variations({"b": range(5)}, 50, seed=3)
     assert [changes["b"] for changes in alone] == [changes["b"] for changes in first]
+
+
+def test_numbers_within_a_value_are_plain_and_written_as_a_setting():
+    """NumPy's scalars have no YAML: a study with a place that varies could not be finished."""
+    (changes,) = random_variations({"a": [[{"b": "-1..2"}, 3]]}, 1)
+    number = changes["a"][0]["b"]
+    assert type(number) is float
+    assert setting("a", changes["a"]) == f"a=[{{b: {number!r}}}, 3]"
 
 
 def test_random_values_are_even():

@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
+from drake_dae.dae.beyond.identified import Identified, check_bounded
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
@@ -42,12 +43,12 @@ def with_disturbance(
     Args:
         system: The system, as a robot's `RobotModel.dae`.
         states: The names of the states whose rates contain d, for a robot those of v.
-        frictions: The names of parameters that are observed as well, such as "wall.friction". They
-            become exogenous signals.
+        frictions: The names of parameters that are observed as well: coefficients of friction, such
+            as "wall.friction", and others that have bounds. They become exogenous signals.
 
     Raises:
         ModelError: A name is not that of a state or parameter, or occurs twice; or the system
-            already has a parameter "disturbance".
+            already has a parameter "disturbance"; or a parameter has no bounds.
     """
     names = [signal.name for signal in system.state_signals]
     for name in states:
@@ -61,6 +62,9 @@ def with_disturbance(
         )
     if DISTURBANCE in [p.name for p in system.parameters]:
         raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
+    frictional = [contact.friction for contact in system.contacts]
+    estimated = set(frictions).difference(frictional)
+    check_bounded(system, [p for p in system.parameters if p.name in estimated])
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
@@ -107,6 +111,7 @@ class Observation:
         moving: (x, parameters) -> R with the present rates r' of the outputs, and zeros otherwise.
         rows: The states whose rates contain d.
         frictions: The names of the coefficients of friction, and the constraint input of each.
+        identified: The other parameters that are estimated.
     """
 
     momentum: TracedFunction
@@ -116,10 +121,11 @@ class Observation:
     moving: TracedFunction
     rows: tuple[int, ...]
     frictions: dict[str, int]
+    identified: Identified
 
     @classmethod
-    def of(cls, structure: Structure) -> "Observation":
-        """Derives the functions from the structure of a system.
+    def of(cls, structure: Structure, layout: DerivativeLayout) -> "Observation":
+        """Derives the functions from the structure of a system, for references of a layout.
 
         Raises:
             ModelError: The system has no disturbance, or a mass matrix that depends on the states
@@ -136,6 +142,7 @@ class Observation:
         entry = ca.DM(ca.jacobian(system.f, d).sparsity()).full()
         rows = [int(np.flatnonzero(column)[0]) for column in entry.T]
         frictions = _frictions(system, tuple(named))
+        others = tuple(p for p in named.values() if p.name not in (*frictions, DISTURBANCE))
         x, v = system.state, ca.SX.sym("v", system.num_constraints)
         u = ca.SX.sym("u", system.num_controls)
         mass, action = system.mass_matrix[rows, :], ca.mtimes(system.g, v)
@@ -147,6 +154,7 @@ class Observation:
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
         signals = {"control": u, "constraint_input": v}
         function = system.trace("momentum", outputs, signals, often=False)
+        identified = Identified.of(system, others, outputs, signals)
 
         # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
@@ -175,8 +183,10 @@ class Observation:
         directions = system.trace(
             "directions of friction", directions_of_forces, pressed, often=False
         )
-        wanted, moving = _wanted(structure, rows)
-        return cls(function, friction, directions, wanted, moving, tuple(rows), frictions)
+        wanted, moving = _wanted(structure, rows, layout)
+        return cls(
+            function, friction, directions, wanted, moving, tuple(rows), frictions, identified
+        )
 
 
 def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
@@ -233,10 +243,10 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 
 
 def _wanted(
-    structure: Structure, rows: Sequence[int]
+    structure: Structure, rows: Sequence[int], layout: DerivativeLayout
 ) -> tuple[TracedFunction | None, TracedFunction]:
     """Returns `wanted` and `moving` of an `Observation`."""
-    system, layout = structure.system, DerivativeLayout(structure.output_degrees)
+    system = structure.system
     # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
@@ -266,12 +276,6 @@ def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
     """The exogenous coefficients of friction, and the constraint input of each."""
     forces = [signal.name for signal in system.constraint_input_signals]
     pressed_by = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
-    for name in names:
-        if name not in (*pressed_by, DISTURBANCE):
-            raise ModelError(
-                f"{system.name}: '{name}' varies and is not the coefficient of friction of one "
-                "contact; an observer estimates a disturbance and coefficients of friction"
-            )
     return {name: pressed_by[name] for name in names if name in pressed_by}
 
 

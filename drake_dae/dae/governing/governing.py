@@ -75,10 +75,10 @@ class Governing:
     def function(self) -> TracedFunction:
         """The governed reference as a function; see the class."""
         law, layout = self.law, self.law.layout
-        if any(degree not in (0, 2) for degree in law.degrees) or law.exogenous_degrees:
+        if any(d not in (0, 2) for d in law.degrees) or law.exogenous_degrees or law.deflection:
             raise ReferenceSignalError(
                 "the time of references is governed for rigid joints and laws without exogenous "
-                "signals or observer"
+                "signals, observer or contact_stiffness"
             )
         path = ca.SX.sym("path", 2)
         s, rate = path[0], path[1]

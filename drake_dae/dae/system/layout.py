@@ -26,9 +26,11 @@ class DerivativeLayout:
 
     Attributes:
         degrees: mu_1, ..., mu_p, not negative.
+        more: The number of derivatives of each r_i in a reference after r_i^(mu_i); none if empty.
     """
 
     degrees: tuple[int, ...]
+    more: tuple[int, ...] = ()
 
     @property
     def chain_size(self) -> int:
@@ -37,13 +39,19 @@ class DerivativeLayout:
 
     @property
     def reference_size(self) -> int:
-        """The size of a reference, sum (mu_i + 1)."""
-        return sum(self.degrees) + len(self.degrees)
+        """The size of a reference, sum (mu_i + 1), and further derivatives."""
+        return sum(self.reference_degrees) + len(self.degrees)
+
+    @property
+    def reference_degrees(self) -> tuple[int, ...]:
+        """The number of derivatives of each r_i in a reference, mu_i without further ones."""
+        more = self.more or (0,) * len(self.degrees)
+        return tuple(degree + added for degree, added in zip(self.degrees, more, strict=True))
 
     @cached_property
     def lowest(self) -> Indices:
         """The indices of r_1, ..., r_p in a reference vector, shape (p,)."""
-        return np.cumsum([0, *[degree + 1 for degree in self.degrees]], dtype=np.intp)[:-1]
+        return np.cumsum([0, *[d + 1 for d in self.reference_degrees]], dtype=np.intp)[:-1]
 
     @cached_property
     def highest(self) -> Indices:
@@ -53,7 +61,7 @@ class DerivativeLayout:
     @cached_property
     def chained(self) -> Indices:
         """The index in a reference vector of the target of each chain entry, shape (sum mu_i,)."""
-        return np.setdiff1d(np.arange(self.reference_size), self.highest)
+        return np.repeat(self.lowest, self.degrees) + self.orders
 
     @cached_property
     def owners(self) -> Indices:
@@ -99,7 +107,7 @@ class DerivativeLayout:
 
     def reference_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Returns names and units of the entries of a reference vector."""
-        return _derivatives(signals, [degree + 1 for degree in self.degrees])
+        return _derivatives(signals, [degree + 1 for degree in self.reference_degrees])
 
     def values(self, reference: ArrayLike) -> FloatArray:
         """Returns the values r_1, ..., r_p of a reference vector, shape (p,)."""

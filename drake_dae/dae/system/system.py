@@ -96,6 +96,8 @@ class DaeSystem:
             intended, change units or this number.
         contacts: The unilateral constraint inputs, if friction acts on one of them. The motion is
             well defined only where a unique nonnegative force exists, see `dae.system.contacts`.
+        dry: The names of parameters that are coefficients of Coulomb friction in f, which turns
+            where a velocity does.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -129,6 +131,7 @@ class DaeSystem:
     contacts: tuple[UnilateralInput, ...] = ()
     least_margin: float = SINGULAR
     negligible: float = NEGLIGIBLE
+    dry: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         arguments = {item.name: getattr(self, item.name) for item in fields(self)}

@@ -50,9 +50,22 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
     Raises:
         GainError: The gains do not fit, or are not Hurwitz.
     """
-    system, manifold = structure.system, structure.manifold
-    layout = DerivativeLayout(structure.constraint_degrees)
-    residual = manifold.residual_expression
+    system, layout = structure.system, DerivativeLayout(structure.constraint_degrees)
+    residual = structure.manifold.residual_expression
+    gains = damping_gains(structure, damping)
+    rates = residual[np.flatnonzero(layout.orders).tolist(), :]
+    force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
+    derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
+    return _along(replace(structure, derivatives=derivatives), derivatives)
+
+
+def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
+    """Returns the coefficients c of `damped`.
+
+    Raises:
+        GainError: The gains do not fit, or are not Hurwitz.
+    """
+    system = structure.system
     names = tuple(signal.name for signal in system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
     gains = damping
@@ -63,10 +76,7 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
             f"constraint_damping must be a design such as poles(-200.0) for the constraints "
             f"{', '.join(names) or 'none'} with r_i - 1 = {degrees} poles each"
         )
-    rates = residual[np.flatnonzero(layout.orders).tolist(), :]
-    force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
-    derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
-    return _along(replace(structure, derivatives=derivatives), derivatives)
+    return gains
 
 
 def _along(structure: Structure, derivatives: Derivatives) -> Structure:

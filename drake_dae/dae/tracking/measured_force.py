@@ -157,6 +157,16 @@ def _force_outputs(system: DaeSystem) -> dict[int, ca.SX]:
     return rows
 
 
+def force_outputs_of(system: DaeSystem) -> dict[int, int]:
+    """The outputs that are single constraint inputs, z_i = v_j, as output index i -> index j.
+
+    Raises:
+        ModelError: No output is a constraint input, or a combination of some.
+    """
+    rows = _force_outputs(system)
+    return {i: j for i, row in rows.items() if (j := _single(row)) is not None}
+
+
 def _single(row: ca.SX) -> int | None:
     """The index j of a row whose only entry is a one; None for another row."""
     row = ca.sparsify(row)

@@ -15,6 +15,7 @@ from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.constraint_damping import damped
+from drake_dae.dae.tracking.deflection import Deflection
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.integral import IntegralAction
 from drake_dae.dae.tracking.measured_force import ForceMeasurement
@@ -36,7 +37,7 @@ class TrackingLaw:
     constraint inputs, but can use one with `measured_force`; see `ForceMeasurement`.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
-    numbers.
+    numbers; with a `contact_stiffness` two more for each force.
 
     Args:
         system: The system (1)-(3).
@@ -49,6 +50,8 @@ class TrackingLaw:
         constraint_damping: Damping of constraints that the plant may violate, such as a compliant
             contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi'; see
             `dae.tracking.constraint_damping`. On N* it changes nothing. None for no damping.
+        contact_stiffness: k in N/m of compliant contacts, F = -k phi, for references of forces that
+            change fast: see `deflection`. None if it is not known.
         integral: The names of the outputs whose errors are integrated as well, positions or
             measured forces; see `IntegralAction`. They have one more pole.
 
@@ -58,6 +61,7 @@ class TrackingLaw:
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: The measurement of v in the law; None without one.
+        deflection: The deflection of compliant contacts under the wanted forces, or None.
         exogenous_degrees: The number of derivatives of each entry of w that the law needs.
         coordinates_function: (state, reference, integral, parameters) -> the error coordinates.
         integral: The integrated outputs; then `function` takes "integral" before the parameters,
@@ -81,13 +85,18 @@ class TrackingLaw:
         force_gain: ArrayLike = 0.0,
         constraint_damping: GainDesign | FeedbackGains | None = None,
         integral: Sequence[str] = (),
+        contact_stiffness: float | None = None,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
         self._model = self.structure
         if constraint_damping is not None:
             self._model = damped(self.structure, constraint_damping)
         self.system = system
-        self.layout = DerivativeLayout(self.structure.output_degrees)
+        self.deflection, more = None, tuple[int, ...]()
+        if contact_stiffness is not None:
+            self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)
+            more = self.deflection.more
+        self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
@@ -117,10 +126,13 @@ class TrackingLaw:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         errors = chain - reference[layout.chained.tolist(), :]
-        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
+        ahead = ca.SX.zeros(len(self.degrees))
+        if self.deflection is not None:
+            ahead = self.deflection.force(reference, layout)
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors)) + ahead  # (28)
         control, pivot = structure.control_for(ubar)
         # By the model; outputs with direct feedthrough have their reference values.
-        output = ca.SX(ubar)
+        output = ubar - ahead
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
         outputs = {"control": control, "tracking_error": output - values}  # (29)

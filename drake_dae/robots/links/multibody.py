@@ -248,7 +248,10 @@ class MultibodyExpressions:
         return any(joint.position_start() + k in e.positions for e in sequence if e.is_turn)
 
     def _read_masses(self) -> tuple[Parameter, ...]:
-        """Makes every mass a parameter, and adds the bodies' inertias to their links."""
+        """Makes every mass a parameter, and adds the bodies' inertias to their links.
+
+        A point mass at its body's origin also has the parameter "<body>.center", its place.
+        """
         bodies = [body for body in _bodies(self.plant) if body.default_mass() > 0.0]
         parameters = []
         for body, name in zip(bodies, unique_names(self.plant, bodies), strict=True):
@@ -260,7 +263,13 @@ class MultibodyExpressions:
             lever = rotation @ body.default_com()
             second = rotation @ about_body @ rotation.T
             second += np.outer(lever, offset) + np.outer(offset, lever + offset)
-            inertia = Inertia.of_mass(parameter.symbol, clean(lever + offset), clean(second))
+            if unit.any() or lever.any():
+                inertia = Inertia.of_mass(parameter.symbol, clean(lever + offset), clean(second))
+            else:
+                center = Parameter(f"{name}.center", np.zeros(3), "m")
+                parameters.append(center)
+                place = clean(offset) + ca.mtimes(ca.SX(rotation), center.symbol)
+                inertia = Inertia.of_point(parameter.symbol, place)
             link = self._links[index]
             link.inertia += inertia
             if not self.plant.is_gravity_enabled(body.model_instance()):

@@ -64,6 +64,11 @@ class Inertia:
         """The inertia of a mass symbol with its centre in m and second moment per mass in m^2."""
         return cls(mass, mass * ca.SX(centre), mass * ca.SX(second))
 
+    @classmethod
+    def of_point(cls, mass: ca.SX, place: ca.SX) -> "Inertia":
+        """The inertia of a point mass at a place in m, both symbolic."""
+        return cls(mass, mass * place, mass * (place @ place.T))
+
     def __add__(self, other: "Inertia") -> "Inertia":
         return Inertia(self.mass + other.mass, self.first + other.first, self.second + other.second)
 

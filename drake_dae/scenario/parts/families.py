@@ -9,7 +9,7 @@ from casadi import SX
 from numpy.typing import ArrayLike
 
 from drake_dae.dae import references
-from drake_dae.robots import actuation, force_outputs, known_forces, outputs
+from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
 from drake_dae.scenario import plants
@@ -28,6 +28,7 @@ from drake_dae.systems.task import phases
 # tuples, and lists and dictionaries of these are written directly.
 
 _WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
+_LISTED: dict[Any, Any] = {**_WRITTEN, Sequence[str]: list[str]}
 
 Surface = Annotated[
     surfaces.Plane
@@ -88,7 +89,7 @@ Reference = Annotated[
     | Annotated[references.TextReference, Form(tag="!Text")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
-Load = Annotated[known_forces.KnownForce, Form(_WRITTEN)]
+Load = Annotated[known_forces.KnownForce | joint_friction.JointFriction, Choice(_LISTED)]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]

@@ -70,8 +70,15 @@ class MeasuredForce:
 
 @dataclass(frozen=True)
 class Tracking:
-    """The tracking law (28) of the whole robot; with springs it differentiates four times."""
+    """The tracking law (28) of the whole robot; with springs it differentiates four times.
 
+    Attributes:
+        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
+            of forces change within periods of the contact: its deflection is then fed ahead. It
+            needs rigid joints, and references, no task and no `time_optimal`.
+    """
+
+    contact_stiffness: float | None = None
     is_cascade: ClassVar = False
 
     def loop(self) -> SpringLoop | None:

@@ -11,7 +11,7 @@ from drake_dae.dae.beyond.chain_filter import ChainFilter
 from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.observing.observed import Observed
+from drake_dae.systems.observing.observed import Observed, disturbance_degree
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
@@ -44,6 +44,11 @@ class Estimate:
     @property
     def rates(self) -> ca.SX:
         """The derivatives of r: none."""
+        return ca.SX(0, 1)
+
+    @property
+    def identified(self) -> ca.SX:
+        """Other parameters: none."""
         return ca.SX(0, 1)
 
     @property
@@ -89,6 +94,12 @@ class EstimatorFunctions(Observed):
         super().__init__(law, observing, period)
         system = self._system
         _check_rigid(law, self.observation.rows)
+        if self.observation.identified.parameters:
+            raise ModelError(
+                f"{system.name}: with a state_rate only coefficients of friction of contacts are "
+                "estimated; for other parameters leave it out, and measure the velocities or let "
+                "the encoders form differences by a velocity_bandwidth"
+            )
         self._lag, self._step, self._filters = lag, step, filters
         self.measures = law.measured_force is not None or not system.num_constraints
         forces = 0 if self.measures else system.num_constraints
@@ -183,8 +194,13 @@ class EstimatorFunctions(Observed):
         system, rows = self._system, list(self.observation.rows)
         u, v, speed = ca.SX.sym("u", system.num_controls), self._force, self._system.state[rows]
         push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        slope = [-ca.jacobian(system.f[i], speed[j]) for j, i in enumerate(rows)]
-        damping = ca.substitute(ca.vertcat(*slope), speed, 0 * speed)  # Without Coriolis forces.
+        dry = self._dry(system.state, system.parameter_symbol)
+        smooth, turning = (
+            [-ca.jacobian(force[i], speed[i]) for i in range(len(rows))]
+            for force in (system.f[rows] - dry, dry)
+        )
+        damping = ca.substitute(ca.vertcat(*smooth), speed, 0 * speed)  # Without Coriolis forces.
+        damping += ca.vertcat(*turning)
         inputs = [system.state, u, v, system.parameter_symbol]
         outputs = [system.mass_matrix[rows, rows], push[rows], ca.sparsify(ca.simplify(damping))]
         return ca.Function("balance", inputs, outputs)
@@ -207,7 +223,7 @@ _SAME = 1e-9
 def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
     system, count = law.system, len(rows)
     is_rigid = rows == tuple(range(count, 2 * count)) and system.num_states == 2 * count
-    if not is_rigid or max(law.exogenous_degrees, default=0):
+    if not is_rigid or disturbance_degree(law):
         raise ModelError(
             f"{system.name}: a state_rate is for robots with rigid joints, whose states are "
             "positions and velocities; behind springs, motors or valves measure the velocities, "

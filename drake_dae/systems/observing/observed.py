@@ -23,6 +23,7 @@ class Estimates(Protocol):
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
         rates: r', ..., r^(n), shape (n k,).
+        identified: Estimates of other parameters, shape (c,).
     """
 
     @property
@@ -33,6 +34,18 @@ class Estimates(Protocol):
 
     @property
     def rates(self) -> ca.SX: ...
+
+    @property
+    def identified(self) -> ca.SX: ...
+
+
+def disturbance_degree(law: TrackingLaw) -> int:
+    """The number of derivatives of the disturbance that a law needs."""
+    degrees = iter(law.exogenous_degrees)
+    own = {
+        p.name: [next(degrees) for _ in range(p.value.size)] for p in law.system.exogenous.moving
+    }
+    return max(own[DISTURBANCE])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +88,11 @@ class Observed:
     """
 
     def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
-        self.observation = observation = Observation.of(law.structure)
+        self.observation = observation = Observation.of(law.structure, law.layout)
         self._system, self._observing, self._period = law.system, observing, period
         self._force = ca.SX.sym("constraint_input", law.system.num_constraints)
+        entries = (law.system.parameter_slice(p.name) for p in observation.identified.parameters)
+        self._places = [i for part in entries for i in range(part.start, part.stop)]
         normal_forces = [self._force[i] for i in observation.frictions.values()]
         self._is_lost = ca.vertcat(ca.SX(0, 1), *normal_forces) < observing.least_force
         hold = ca.SX.sym("hold", 1)
@@ -86,9 +101,11 @@ class Observed:
             "hold", {"constraint_input": self._force, "hold": hold}, {"hold": holds}
         )
 
-    def _parameters(self, friction: ca.SX) -> ca.SX:
-        """The model's parameters with other coefficients of friction."""
+    def _parameters(self, friction: ca.SX, identified: ca.SX | None = None) -> ca.SX:
+        """The model's parameters with other coefficients of friction and other estimates."""
         parameters = ca.SX(self._system.parameter_symbol)
+        if identified is not None:
+            parameters[self._places] = identified
         for j, name in enumerate(self.observation.frictions):
             parameters[self._system.parameter_slice(name)] = friction[j]
         return parameters
@@ -131,8 +148,9 @@ class Observed:
         observation, mu = self.observation, estimates.friction
         x, v = self._system.state, self._force
         reference = ca.SX.sym("reference", law.layout.reference_size)
-        parameters, r, pivot = self._parameters(mu), estimates.disturbance, None
-        if mu.numel():
+        theta = estimates.identified
+        parameters, r, pivot = self._parameters(mu, theta), estimates.disturbance, None
+        if mu.numel() or self._system.dry:
             goal = x
             if observation.wanted is not None:
                 wanted = observation.wanted.function(x, reference, delay, parameters)
@@ -142,21 +160,38 @@ class Observed:
                 for state in (x, self._faster(goal))
             )
             r = r + ca.mtimes(goal_friction - friction, mu)
+            r = r + self._dry(goal, parameters) - self._dry(x, parameters)
         size, rates = r.numel(), estimates.rates
         rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
-        zeros = [ca.SX(0.0)] * (rates.numel() // size)
-        for j, name in enumerate(observation.frictions):
-            rows[name] = [[mu[j], *zeros]]
+        numbers = dict(zip(observation.frictions, mu.elements(), strict=True))
+        for name, value in numbers.items():
+            rows[name] = [[value]]
+        known = iter(theta.elements())
+        for p in observation.identified.parameters:
+            rows[p.name] = [[next(known)] for _ in range(p.value.size)]
         stacked, degrees = list[ca.SX](), iter(law.exogenous_degrees)
         for p in self._system.exogenous.moving:
             for row in rows[p.name]:
-                stacked += row[: 1 + next(degrees)]
+                degree = next(degrees)
+                stacked += [*row, *[ca.SX(0.0)] * degree][: 1 + degree]  # Others are constant.
         return self._system.trace(
             "exogenous signals of the observer",
             {"exogenous": ca.vertcat(*stacked)},
             {"held": held, "constraint_input": v, "reference": reference},
             pivot,
         )
+
+    def _dry(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The generalized force of Coulomb friction in joints, shape (k, 1)."""
+        rows = list(self.observation.rows)
+        if not self._system.dry:
+            return ca.SX(len(rows), 1)
+        without = ca.SX(parameters)
+        for name in self._system.dry:
+            without[self._system.parameter_slice(name)] = 0.0
+        symbols = [self._system.state, self._system.parameter_symbol]
+        f = ca.Function("f", symbols, [self._system.f[rows]])
+        return f(state, parameters) - f(state, without)
 
     def _faster(self, state: ca.SX) -> ca.SX:
         """The state with velocities increased by `_SHARP`."""

@@ -1,11 +1,14 @@
 """An observer of model errors: a disturbance, and coefficients of friction."""
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, EventStatus, State
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
@@ -13,6 +16,10 @@ from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.observing_system import ObservingSystem
+from drake_dae.trace.functions import TracedFunction
+
+_ESTIMATES = ("identified", "identified_deviation")
+"""The ports of estimated parameters and of their standard deviations."""
 
 _READ = ("estimated_state", "measured_force", "reference")
 
@@ -50,6 +57,11 @@ class DisturbanceObserver(ObservingSystem):
         friction: mu, shape (c,).
         hold: 1 while the input `hold` is not 0 or a frictional contact is lost, else 0, shape (1,):
             for the integrals of the controller.
+        identified, identified_deviation: All estimated parameters with friction, and their standard
+            deviations, shape (c,) each; only with such parameters.
+
+    If the law's system has other parameters that `with_disturbance` made exogenous, all of them and
+    friction are estimated together, by a Kalman filter of r; see `ParameterFilter`.
 
     `disturbance` and `friction` are held between samples; r starts at 0, and mu at the model's
     coefficients.
@@ -67,7 +79,8 @@ class DisturbanceObserver(ObservingSystem):
     Attributes:
         observation: The observed functions.
         observing, sample_period: The arguments.
-        disturbance_signals, friction_signals: Names and units of the output ports.
+        disturbance_signals, friction_signals, identified_signals: Names and units of the output
+            ports.
 
     Raises:
         ModelError: The law's system has no disturbance, or a number is not valid.
@@ -89,6 +102,7 @@ class DisturbanceObserver(ObservingSystem):
             law, observing, sample_period, control_lag, control_delay
         )
         start = np.zeros(functions.memory.column.numel())
+        start[start.size - functions.filter.start.size :] = functions.filter.start
         self._declare(law, functions, "estimated_state", start)
         self._declare_hold(self.input_port_ticket(self._ports["measured_force"].get_index()))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
@@ -101,6 +115,18 @@ class DisturbanceObserver(ObservingSystem):
         for name, part in (("disturbance", slice(0, self._mu.start)), ("friction", self._mu)):
             value = port_value(self._part, part)
             self.DeclareVectorOutputPort(name, part.stop - part.start, value, sources)
+        identified = self.observation.identified.signals
+        self.identified_signals = (*identified, *self.friction_signals) if identified else ()
+        self._estimates = dict[str, ca.SX]()
+        if count := len(self.identified_signals):
+            memory, filtered = functions.memory, functions.filter
+            parts = filtered.values(memory.friction), filtered.deviations
+            self._estimates = dict(zip(_ESTIMATES, parts, strict=True))
+            held = {"held": memory.column}
+            self._estimated = TracedFunction("estimates", held, self._estimates, often=False)
+            for index, name in enumerate(_ESTIMATES):
+                value = port_value(self._estimate, index)
+                self.DeclareVectorOutputPort(name, count, value, sources)
 
     @property
     def _mu(self) -> slice:
@@ -108,9 +134,27 @@ class DisturbanceObserver(ObservingSystem):
         first = memory.disturbance.numel()
         return slice(first, first + memory.friction.numel())
 
+    @property
+    def further_signals(self) -> dict[str, Sequence[Signal]]:
+        signals = dict(super().further_signals)
+        if self.identified_signals:
+            signals |= dict.fromkeys(_ESTIMATES, self.identified_signals)
+        return signals
+
+    def _estimate(self, index: int, context: Context) -> FloatArray:
+        held = context.get_discrete_state(self._held).value()
+        values: FloatArray = self._estimated.evaluate(held)[index]
+        return values
+
     def _sample(self, context: Context, state: State) -> EventStatus:
         x, u, force = self._inputs(context, "estimated_state", "control", "measured_force")
-        inputs = context.get_discrete_state(self._held).value(), u, force, self._hold_input(context)
+        inputs = (
+            context.get_discrete_state(self._held).value(),
+            u,
+            force,
+            self._hold_input(context),
+            self._reference(context, x),
+        )
         after = self._checked(self._functions.sample, context, x, *inputs)[0]
         state.get_mutable_discrete_state().set_value(self._held, after)
         return EventStatus.Succeeded()
@@ -128,11 +172,12 @@ class DisturbanceObserver(ObservingSystem):
         functions, memory = self._functions, self._functions.memory
         read = ("estimated_state", HELD)
         needed = (*read, "measured_force", "reference", PARAMETERS)
-        sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
-        parts = [memory.disturbance, memory.friction]
-        shown = ca.Function("shown", [memory.column], parts)
+        sampled = (*read, "control", "measured_force", "hold", "reference", PARAMETERS)
+        parts = {"disturbance": memory.disturbance, "friction": memory.friction}
+        parts |= self._estimates
+        shown = ca.Function("shown", [memory.column], list(parts.values()))
         computations = (
             Computation.of(functions.exogenous, needed, ("exogenous",)),
-            Computation(shown, (HELD,), ("disturbance", "friction")),
+            Computation(shown, (HELD,), tuple(parts)),
         )
         return self._block(computations, Computation.of(functions.sample, sampled, (HELD,)))

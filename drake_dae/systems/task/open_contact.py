@@ -135,6 +135,8 @@ def opened_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
             f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
             f"{', '.join(others) or 'nothing'}"
         )
+    if law.deflection is not None:
+        raise ModelError(f"{closed.name}: a contact_stiffness is not for tasks; leave it out")
     contact = _contact(closed, [names.index(name) for name in gone])
     for place, force in zip(contact.places, contact.forces, strict=True):
         distance = closed.constraint_output_signals[force].name

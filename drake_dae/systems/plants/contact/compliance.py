@@ -149,7 +149,7 @@ class CompliantEquations:
         """(x, F) after a step, and a number that is negative where they are not valid."""
         model, links, h = self._model, self._model.links, self._h
         mass, forces = self._balance(control)
-        mass += h * ca.diag(ca.DM(_damping(model)))
+        mass += h * (ca.diag(ca.DM(_damping(model))) + _resistance(model))
         free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
         step = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
         velocity = ca.mtimes(links.velocity_map, step.velocities)
@@ -185,6 +185,13 @@ class CompliantEquations:
         for name, part in stage_ports(model, size).items():
             outputs[name] = dae.state[part]
         return outputs
+
+
+def _resistance(model: RobotModel) -> ca.SX:
+    """D of the friction -D v of joints, at the velocities before the step, shape (nv, nv)."""
+    kinematics = model.links.kinematics()
+    size = model.links.v.numel()
+    return sum((load.resistance(kinematics) for load in model.known_forces), ca.SX(size, size))
 
 
 def _damping(model: RobotModel) -> FloatArray:

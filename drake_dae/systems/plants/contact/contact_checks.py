@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
@@ -22,7 +23,8 @@ def check_model(model: RobotModel) -> None:
     if model.dae.exogenous or model.known_forces:
         raise ModelError(
             "Drake's contact as the plant takes no exogenous signals and no known_forces; forces "
-            "that the law does not know are disturbance forces (plant_disturbances)"
+            "that the law does not know are disturbance forces (plant_disturbances). Use "
+            "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
@@ -50,6 +52,7 @@ def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -
     changeable += [
         *model.links.parameters,
         *(p for stage in model.stages for p in stage.parameters),
+        *(p for load in model.known_forces for p in load.parameters),
     ]
     known = {parameter.name: parameter for parameter in changeable}
     for name, value in parameters.items():
@@ -85,3 +88,10 @@ def check_same(plant: MultibodyPlant, model: RobotModel) -> None:
             f"add_robot must add the robot of the model, with positions "
             f"{', '.join(model_names[0])}; it has {', '.join(names[0]) or 'none'}"
         )
+
+
+def point_mass(mass: float, center: FloatArray) -> SpatialInertia:
+    """The inertia of a point mass in kg at a place in m, shape (3,)."""
+    squares = center @ center - center**2
+    unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
+    return SpatialInertia(mass, center, unit)

@@ -37,6 +37,7 @@ from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
     check_same,
+    point_mass,
 )
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contact.contact_material import (
@@ -258,17 +259,20 @@ class ContactPlant(Diagram, Plant):
             balls.append((GetScopedFrameByName(plant, name), center))
         return balls
 
-    def _other_masses(self) -> list[tuple[RigidBody, float]]:
-        """The bodies with another mass than in the model, each with its own."""
+    def _other_masses(self) -> list[tuple[RigidBody, float, FloatArray | None]]:
+        """The bodies with another mass or place than in the model, with their own."""
         drawn = self.model.links.plant
         assert drawn is not None  # check_model.
         bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
         changed = []
         with_mass = (body for body in bodies if body.default_mass() > 0.0)
-        for body, parameter in zip(with_mass, self.model.links.parameters, strict=True):
-            value = self._values[self.dae.parameter_slice(parameter.name)].item()
-            if value != body.default_mass():
-                changed.append((self.multibody.get_body(body.index()), value))
+        names = [parameter.name for parameter in self.model.links.parameters]
+        values = {name: self._values[self.dae.parameter_slice(name)] for name in names}
+        masses = [name for name in values if name.endswith(".mass")]
+        for body, name in zip(with_mass, masses, strict=True):
+            mass, center = values[name].item(), values.get(f"{name.removesuffix('mass')}center")
+            if mass != body.default_mass() or (center is not None and center.any()):
+                changed.append((self.multibody.get_body(body.index()), mass, center))
         return changed
 
     def parameters(self, context: Context) -> FloatArray:
@@ -316,8 +320,11 @@ class ContactPlant(Diagram, Plant):
         """Sets (q, v) and changed masses in a context of the scene."""
         multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(multibody_context, links)
-        for body, mass in self._masses:
-            body.SetMass(multibody_context, mass)
+        for body, mass, center in self._masses:
+            if center is None:
+                body.SetMass(multibody_context, mass)
+            else:
+                body.SetSpatialInertiaInBodyFrame(multibody_context, point_mass(mass, center))
 
     def traced(self) -> Block:
         count = self.multibody.num_multibody_states()

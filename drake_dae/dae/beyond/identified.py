@@ -1,0 +1,97 @@
+"""Parameters of a model that an observer estimates: how momentum and distances depend on them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.functions import TracedFunction
+
+
+def check_bounded(system: DaeSystem, parameters: Sequence[Parameter]) -> None:
+    """Checks that parameters have bounds, from which their estimation starts.
+
+    Raises:
+        ModelError: One has none.
+    """
+    for parameter in parameters:
+        if parameter.bounds is None or not np.all(parameter.low < parameter.high):
+            raise ModelError(
+                f"{system.name}: '{parameter.name}' has no bounds. Besides a disturbance and "
+                "coefficients of friction of contacts, an observer estimates parameters with a "
+                "lowest and a highest value, which differ (`bounds`)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """The parameters theta of a system that an observer estimates, c numbers.
+
+    An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
+    momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
+    An error of a surface leaves a distance phi(x) that is not zero in contact.
+
+    Attributes:
+        parameters: The parameters, in the order of theta.
+        slopes: (x, u, v, parameters) -> the derivatives with respect to theta of p, of its rate
+            without inputs, and of the part from the inputs, shape (k, c) each; and the distances
+            phi that depend on theta, shape (j,), with their derivatives, shape (j, c).
+        pressed: The constraint input of each of these distances.
+    """
+
+    parameters: tuple[Parameter, ...]
+    slopes: TracedFunction
+    pressed: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls,
+        system: DaeSystem,
+        parameters: tuple[Parameter, ...],
+        momentum: dict[str, ca.SX],
+        inputs: dict[str, ca.SX],
+    ) -> "Identified":
+        """Derives the functions.
+
+        Args:
+            system: The system.
+            parameters: The parameters, each with bounds.
+            momentum: p, its rate without inputs, and the part from the inputs.
+            inputs: Name -> symbol of u and v.
+
+        Raises:
+            ModelError: A parameter has no bounds, or redundant constraints depend on one.
+        """
+        check_bounded(system, parameters)
+        theta = ca.vertcat(ca.SX(0, 1), *(parameter.symbol for parameter in parameters))
+        pressed = tuple(i for i in range(system.k.numel()) if ca.depends_on(system.k[i], theta))
+        if pressed and system.sharing is not None:
+            raise ModelError(
+                f"{system.name}: no surface is estimated where constraints are redundant"
+            )
+        gaps = system.k[list(pressed), :]
+        outputs = {name: ca.jacobian(value, theta) for name, value in momentum.items()}
+        outputs |= {"gaps": gaps, "gap slopes": ca.jacobian(gaps, theta)}
+        dense = {name: ca.densify(value) for name, value in outputs.items()}
+        slopes = system.trace("slopes of parameters", dense, inputs, often=False)
+        return cls(parameters, slopes, pressed)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of theta."""
+        return tuple(signal for parameter in self.parameters for signal in parameter.signals)
+
+    @property
+    def low(self) -> FloatArray:
+        """The lowest values, shape (c,)."""
+        return np.concatenate([np.zeros(0), *(p.low for p in self.parameters)])
+
+    @property
+    def high(self) -> FloatArray:
+        """The highest values, shape (c,)."""
+        return np.concatenate([np.zeros(0), *(p.high for p in self.parameters)])

@@ -1,0 +1,233 @@
+"""A Kalman filter of a model's parameters, from the disturbance that they leave."""
+
+from dataclasses import dataclass
+from itertools import accumulate
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.beyond.identified import Identified
+
+GAP = 2e-5
+"""The standard deviation of a measured distance to a surface, in m."""
+
+COMPLIANCE = 3e-5
+"""The standard deviation of the unknown compliance of a contact, in m/N."""
+
+MEMORY = 100.0
+"""The time in s in which a parameter may move by its range."""
+
+_SETTLING = 1.0
+"""The time in s in which the size of what no parameter explains is averaged."""
+
+_LEAST = 1e-6
+"""The least share of the start in this size, so that it stays positive."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilterMemory:
+    """The discrete state of a `ParameterFilter`, as columns that are stacked.
+
+    Attributes:
+        values: The estimated parameters theta, followed by the compliances, shape (c,).
+        covariance: The lower triangle of P, by columns, shape (c (c + 1) / 2,).
+        regressor: Y, shape (k c,).
+        momentum, drift: dp/dtheta and that of the rate of p without inputs, of the sample before,
+            shape (k c,) each.
+        spread: s^2, the mean square of the disturbance that is left, shape (1,).
+    """
+
+    values: ca.SX
+    covariance: ca.SX
+    regressor: ca.SX
+    momentum: ca.SX
+    drift: ca.SX
+    spread: ca.SX
+
+    @classmethod
+    def of(cls, size: int, count: int) -> "FilterMemory":
+        """Symbols for k positions and c numbers."""
+        parts = (count, count * (count + 1) // 2, *3 * (size * count,), 1 if count else 0)
+        return cls(*(ca.SX.sym("filter", part) for part in parts))
+
+    @property
+    def column(self) -> ca.SX:
+        """The whole state as one column."""
+        return ca.vertcat(*vars(self).values())
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """The name of each attribute -> its part of the column."""
+        ends = accumulate(part.numel() for part in vars(self).values())
+        return {
+            name: slice(end - part.numel(), end)
+            for (name, part), end in zip(vars(self).items(), ends, strict=True)
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A sample of the functions of a `ParameterFilter`, as expressions.
+
+    Attributes:
+        momentum, drift, inputs: The derivatives of `Identified.slopes`, shape (k, c') each.
+        friction: C of the contacts that slide, zero for others, shape (k, f).
+        gaps, gap_slopes: The distances in contact, shape (j, 1), and their derivatives, (j, c').
+        forces: The constraint force at each of these distances, shape (j, 1).
+        is_closed: 1 for each of these contacts that is closed, shape (j, 1).
+        inertia: The diagonal of M, shape (k, 1).
+        hold: Not 0 while nothing is estimated.
+    """
+
+    momentum: ca.SX
+    drift: ca.SX
+    inputs: ca.SX
+    friction: ca.SX
+    gaps: ca.SX
+    gap_slopes: ca.SX
+    forces: ca.SX
+    is_closed: ca.SX
+    inertia: ca.SX
+    hold: ca.SX
+
+
+class ParameterFilter:
+    """Estimates parameters theta with their covariance P, from the disturbance r that is left.
+
+    The true parameters leave r = 0 and, in contact, phi(x) = -c lambda with the compliance c of the
+    contact. With the low-pass filtered regressor Y of the observer, a sample measures
+
+        r = Y (theta* - theta) + noise,    -phi - c lambda = dphi/dtheta (theta* - theta) + noise.
+
+    r is scaled by the root of the diagonal of M; its noise is s^2, the mean square of what
+    remained, times the samples in which it does not change, 2 / (k_o T). Between samples P returns
+    to P_0, the variance of numbers that are equally likely within their bounds, in `MEMORY`: so the
+    standard deviation of a parameter that the motion does not excite stays that of its bounds.
+
+    Args:
+        identified: The parameters.
+        frictions: Largest coefficient of friction of each contact.
+        size: k, the number of velocities.
+        rate, period: k_o in 1/s, T in s.
+
+    Attributes:
+        memory: The symbols of the discrete state.
+        start: Its initial value.
+        num_parameters, count: The number of theta with frictions, and with compliances.
+    """
+
+    def __init__(
+        self,
+        identified: Identified,
+        start: FloatArray,
+        largest_friction: float,
+        size: int,
+        rate: float,
+        period: float,
+    ) -> None:
+        known, self._period = identified.low.size, period
+        frictions, contacts = start.size - known, len(identified.pressed)
+        self.num_parameters = start.size
+        count = start.size + contacts
+        self._low = np.concatenate([identified.low, np.zeros(frictions), np.zeros(contacts)])
+        high = np.full(frictions, largest_friction), np.full(contacts, np.inf)
+        self._high = np.concatenate([identified.high, *high])
+        self._size, self._count, self._contacts = size, count, contacts
+        deviations = (self._high - self._low)[: start.size] / 12.0**0.5
+        self._prior = np.concatenate([deviations, np.full(contacts, COMPLIANCE)]) ** 2
+        self._samples = 2.0 / (rate * period)
+        self.memory = memory = FilterMemory.of(size, count)
+        self.start = np.zeros(memory.column.numel())
+        self.start[memory.parts["values"]] = np.concatenate([start, np.zeros(contacts)])
+        rows, columns = np.tril_indices(count)
+        by_columns = np.lexsort((rows, columns))
+        triangle = np.diag(self._prior)[rows[by_columns], columns[by_columns]]
+        self.start[memory.parts["covariance"]] = triangle
+        self.start[memory.parts["spread"]] = 1.0
+
+    def values(self, friction: ca.SX) -> ca.SX:
+        """theta with the given coefficients of friction, shape (c,)."""
+        return self._values(friction)[: self.num_parameters]
+
+    def _values(self, friction: ca.SX) -> ca.SX:
+        values, end = ca.SX(self.memory.values), self.num_parameters
+        values[end - friction.numel() : end] = friction
+        return values
+
+    @property
+    def deviations(self) -> ca.SX:
+        """The standard deviation of each of these, shape (c,)."""
+        return ca.sqrt(ca.fmax(ca.diag(self._covariance), 0))[: self.num_parameters]
+
+    @property
+    def prior(self) -> FloatArray:
+        """The standard deviations before the first sample, shape (c,)."""
+        return np.sqrt(self._prior[: self.num_parameters])
+
+    @property
+    def _covariance(self) -> ca.SX:
+        lower = ca.SX(ca.Sparsity.lower(self._count), self.memory.covariance)
+        return ca.tril2symm(lower)
+
+    def regressor(self, sample: Sampled) -> ca.SX:
+        """-G, the derivative of a sample of d with respect to theta* - theta, shape (k, c)."""
+        memory, shape = self.memory, (self._size, self._count)
+        wide = self._size, self._contacts
+        momentum, drift = self._slopes(sample)
+        before = (ca.reshape(part, *shape) for part in (memory.momentum, memory.drift))
+        last, drifted = before
+        inputs = ca.horzcat(sample.inputs, sample.friction, ca.SX(*wide))
+        return (drift + drifted) / 2.0 + inputs - (momentum - last) / self._period
+
+    def _slopes(self, sample: Sampled) -> tuple[ca.SX, ca.SX]:
+        nothing = ca.SX(self._size, self._count - sample.momentum.shape[1])
+        return ca.horzcat(sample.momentum, nothing), ca.horzcat(sample.drift, nothing)
+
+    def after(
+        self, sample: Sampled, regressor: ca.SX, r: ca.SX, friction: ca.SX, is_first: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """The discrete state after a sample, and the change of theta with compliances.
+
+        Args:
+            sample: The sample.
+            regressor: Y, low-pass filtered as r is, shape (k, c).
+            r: The disturbance that is left, shape (k, 1).
+            friction: The estimated coefficients of friction, shape (f, 1).
+            is_first: Not 0 at the first sample.
+        """
+        before = self._values(friction)
+        memory, count = self.memory, self._count
+        prior, share = ca.diag(ca.DM(self._prior)), self._period / MEMORY
+        P = self._covariance + share * (prior - self._covariance)
+        scale = 1.0 / ca.sqrt(sample.inertia)
+        rest, rows = scale * r, scale * regressor
+        used = ca.logic_not(ca.logic_or(is_first, sample.hold))
+        noise = memory.spread * self._samples
+        measured = [(rows[i, :], rest[i], noise, used) for i in range(self._size)]
+        for j in range(self._contacts):
+            c = before[self.num_parameters + j]
+            compliant = ca.SX(1, self._contacts)
+            compliant[j] = sample.forces[j]
+            known = sample.gap_slopes.shape[1]
+            row = ca.horzcat(
+                sample.gap_slopes[j, :], ca.SX(1, self.num_parameters - known), compliant
+            )
+            gap = -(sample.gaps[j] + c * sample.forces[j])
+            measured.append((row, gap, GAP**2 * self._samples, used * sample.is_closed[j]))
+        change = ca.SX.zeros(count)
+        for row, error, variance, is_used in measured:
+            row = ca.densify(row)
+            moved = ca.mtimes(P, row.T)
+            gain = is_used * moved / (variance + ca.mtimes(row, moved))
+            change += gain * (error - ca.mtimes(row, change))
+            P -= ca.mtimes(gain, moved.T)
+        values = ca.fmin(ca.fmax(before + change, self._low), self._high)
+        change = values - before
+        remaining = ca.sumsqr(rest - ca.mtimes(rows, change)) / self._size
+        gained = used * self._period / _SETTLING
+        spread = memory.spread + gained * (ca.fmax(remaining, _LEAST) - memory.spread)
+        triangle = ca.vertcat(*(P[j:, j] for j in range(count)))
+        slopes = (ca.vec(part) for part in self._slopes(sample))
+        column = ca.vertcat(values, triangle, ca.vec(regressor), *slopes, spread)
+        return column, change
