@@ -13,6 +13,7 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.diagrams.drives import LinkWithNoise
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
@@ -49,6 +50,7 @@ class ClosedLoop:
         plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
         observer: The observer of the disturbance or the state, or None.
+        link: The link to the drives, with jitter and losses, or None.
         memory: A cache for rollouts and starts.
     """
 
@@ -65,6 +67,7 @@ class ClosedLoop:
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
     observer: Observer | None = None
+    link: LinkWithNoise | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:

@@ -12,6 +12,8 @@ from drake_dae import Record, build_scenario, grid_variations, load_scenario, sw
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.records.phases import phase_spans
 
 # At rest 20 mm before the wall, which opens and closes without bouncing.
@@ -59,6 +61,14 @@ def told(file, tmp_path, capsys, *settings):
     code = main(["simulate", str(file), *BARE, *words, "--out", str(tmp_path / "run")])
     found = json.loads(capsys.readouterr().out)
     return code, found, (tmp_path / "run" / "summary.txt").read_text()
+
+
+def rolled(found):
+    """The rollout of a scenario, and its changes of phases."""
+    completed, loop = build_completed(found)
+    context = start_scenario(completed.scenario, loop)
+    result = roll_scenario(completed.scenario, loop, context)
+    return result, loop.changes(result.context or context)
 
 
 def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys):
@@ -181,3 +191,46 @@ def test_the_hardest_touch_is_told_with_its_phase():
     (note,) = [one for one in completed.notes if "A touch" in one]
     # 30 + 13 + 4 N, and 0.5 + 19.6 + 6 N.
     assert "A touch by GuardedMove at 0.02 m/s is expected to stay below 47" in note
+
+
+def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
+    """The bias is found within 0.1 s; from then on 10 N/s reach the 2 N of the move in 0.2 s."""
+    settings = (
+        "force_feedback=!MeasuredForce {sample_period: 0.002, drift: 10}",
+        "task.tare_time=0.1",
+        "task.phases.0.speed=0.01",
+        "task.phases.0.force=2",
+    )
+    found = rolled(load_scenario(file, list(settings)))
+    (touch,) = [change.time for change in found[1] if change.phase == "Press"]
+    # The mean of the drift while the bias is found is that of its middle.
+    assert touch == pytest.approx(0.05 + 2.0 / 10.0, abs=0.02)
+    assert not found[0].record["constraint_force"][found[0].record.time < touch].any()
+
+
+@pytest.mark.parametrize(
+    ("plant", "jitter"),
+    [
+        ("!Unilateral {restitution: {wall: 0.0}}", 0.0004),
+        ("!CompliantContact {time_step: 0.0005, stiffness: 1.0e5}", 0.0005),
+    ],
+)
+def test_a_task_goes_on_while_controls_are_late_and_lost(file, plant, jitter):
+    """Every tenth control is lost, three in a row, and half of them are late: it is done."""
+    link = f"period: 0.002, delay: 0.001, jitter: {jitter}, loss: 0.04, burst: 3, most_lost: 20"
+    change = [f"plant={plant}", f"sampling={{{link}}}", "task.phases.1.tolerance=3", "duration=2"]
+    found, changes = rolled(load_scenario(file, change))
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    lost = found.record["lost_controls"][:, 0]
+    assert lost.max() >= 3.0
+    assert 0.05 < np.mean(lost > 0.0) < 0.2
+
+
+def test_a_task_ends_where_the_robot_stops_by_itself(file):
+    """With the reason and the record up to there."""
+    link = "sampling={period: 0.002, loss: 0.01, burst: 20, most_lost: 20}"
+    found, changes = rolled(load_scenario(file, [link]))
+    assert "20 controls in a row were lost (sampling.most_lost)" in str(found.failure)
+    assert found.record.time[-1] <= found.failure.time
+    assert changes[-1].phase not in ("done", "held")

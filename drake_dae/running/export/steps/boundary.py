@@ -223,8 +223,8 @@ def _check_steps(compiled: CompiledDiagram) -> None:
         (phases, "leads through phases in Python, which no C has; a rollout does"),
         (
             compiled.noise,
-            "draws random numbers, which are none of a controller's: leave it out, or put it "
-            "behind a sensor",
+            "draws random numbers, which are none of a controller's: leave it out (in a scenario "
+            "sampling.jitter and sampling.loss), or put it behind a sensor",
         ),
     ):
         if places:
