@@ -62,6 +62,7 @@ from drake_dae.simulation.remarks import (
     reference_remarks,
     stop_remarks,
     surface_remarks,
+    touch_remarks,
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
@@ -264,7 +265,6 @@ def _write(run: _CommandRun) -> bool:
         lines = [summary(record, predicted, limits, *outcome, accuracy, reasons, bound)]
         changes = loop.changes(run.context)
         stopped = stop_remarks(run.statistics, run.scenario.duration) if changes else []
-        failed = bool(run.failure or (stopped and changes[-1].failed))
         job = judge_job(
             record,
             predicted,
@@ -272,7 +272,7 @@ def _write(run: _CommandRun) -> bool:
             [*shortfalls(record, limits), *map(str, behind)],
             limits.pushing,
             changes,
-            is_cut_short=failed or run.is_interrupted,
+            is_cut_short=bool(run.failure) or run.is_interrupted,
             notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
@@ -294,7 +294,7 @@ def _write(run: _CommandRun) -> bool:
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         lines += reference_remarks(followed)
         if changes:
-            lines += ["", *map(str, changes), *stopped]
+            lines += ["", *map(str, changes), *stopped, *touch_remarks(changes)]
         text = "\n".join(lines)
         if write.record:
             signals = record.signals["tracking_error"].signals

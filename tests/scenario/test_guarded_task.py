@@ -94,6 +94,7 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     assert (code, found["job"]["outcome"]) == (2, "bad")
     assert [one["phase"] for one in found["phases"]] == ["feel", "Press", "leave", "held"]
     story = " ".join(text.split("\n\n")[0].split())
+    assert story.startswith("BAD: the task was given up at")
     assert ", and has left the contact: Press is ended by a force of 9" in story
     assert found["phases"][-1]["force"] <= 0.5
     # By an error it fails, too.
@@ -146,6 +147,11 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
             "task.phases.0.direction={tool.x: 1}",
             "phase 1 of the task, feel: direction: no out",
         ),
+        (
+            "task.phases.0.direction={tool.z: 1}",
+            "phase 1 of the task, feel: direction: it does not lead to the surface; give it a "
+            "negative component of 'wall.distance'",
+        ),
         ("sampling=null", "guard of the force: it counts in samples, .*in a scenario: sampling"),
     ],
 )
@@ -191,6 +197,17 @@ def test_the_hardest_touch_is_told_with_its_phase():
     (note,) = [one for one in completed.notes if "A touch" in one]
     # 30 + 13 + 4 N, and 0.5 + 19.6 + 6 N.
     assert "A touch by GuardedMove at 0.02 m/s is expected to stay below 47" in note
+
+
+def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
+    """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
+    biased = "force_feedback=!MeasuredForce {sample_period: 0.002, bias: 3}"
+    settings = (biased, "task.phases.0.force=2", TOLERANT)
+    _, _, text = told(file, tmp_path, capsys, *settings)
+    assert "before the surface of the model: a bias of the force sensor feels like a touch" in text
+    code, found, text = told(file, tmp_path, capsys, *settings, "task.tare_time=0.1")
+    assert (code, found["phases"][-1]["phase"]) == (0, "done")
+    assert "feels like a touch" not in text
 
 
 def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):

@@ -250,6 +250,11 @@ def _rates(task: Task, index: int, law: TrackingLaw, place: int) -> FloatArray:
                 "along outputs in m"
             )
         rates[names.index(name)] = rate
+    if task.plan.phases[index].speed_of_approach and not rates[place] < 0.0:
+        raise ModelError(
+            f"{task.plan.where(index)}: direction: it does not lead to the surface; give it a "
+            f"negative component of '{names[place]}'"
+        )
     return rates
 
 
