@@ -239,9 +239,10 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
         controller: The controller of the integrals.
 
     Returns:
-        Its output port, for the controller's `hold`; empty if there is no such integral.
+        Its output port, for the controller's `hold`; empty if there is no such integral, or the
+        controller opens contacts and does so itself.
     """
-    if not controller.HasInputPort("hold"):
+    if controller.takes_over or not controller.HasInputPort("hold"):
         return []
     law = controller.law
     inputs = law.measured_force.inputs if law.measured_force else {}

@@ -3,9 +3,9 @@
     python tests/campaign/random_tasks.py --count 1000 --seed 0
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
-phases and retries allow. Without pushes and payloads the force of every touch on Drake's contact has
-to stay below the expected peak, and the impulse on a contact that opens below speed times mass at
-the tool. Returns 1 if one does not.
+phases and retries allow. Without pushes and payloads the force of every touch on Drake's contact
+has to stay below the expected peak, and the impulse on a contact that opens below speed times mass
+at the tool. Returns 1 if one does not.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -108,7 +109,11 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     guards = _guards(draw, force)
     phases.append(f"!Press {{force: {force}, tolerance: {tolerance}, over: 0.3, {ends}, {guards}}}")
     for _ in range(draw.randrange(4)):
-        goal, force, reaction = draw.uniform(0.2, 0.4), draw.uniform(3.0, 40.0), draw.choice(after_loss)
+        goal, force, reaction = (
+            draw.uniform(0.2, 0.4),
+            draw.uniform(3.0, 40.0),
+            draw.choice(after_loss),
+        )
         goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
         failing = f"on_failure: {reaction}, {_guards(draw, force)}"
         move, dwell = f"!Move {{{goals}, {failing}}}", "!Dwell {duration: 0.3}"
@@ -192,7 +197,7 @@ def main() -> int:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     kinds, bad = Counter[str](), 0
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
         for seed in range(options.seed, options.seed + options.count):
             began = time.perf_counter()
             found = outcome(*random_task(random.Random(seed)), Path(folder))
@@ -202,6 +207,7 @@ def main() -> int:
                 print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)
     for kind, count in kinds.most_common():
         print(f"{count:6} {kind}")
+    print(f"{kinds.total():6} tasks, {bad} of them ended as none may")
     return int(bad > 0)
 
 

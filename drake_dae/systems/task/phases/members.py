@@ -56,7 +56,7 @@ class Approach(Phase):
         return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
-        if now.time >= self.within:
+        if self.has_waited(now):
             return super().lateness(now, contact_force)
         return (
             f"{self.name} is {-now.distance:.3g} m behind the surface of the model without "
@@ -204,7 +204,7 @@ class Release(Phase):
         return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
-        if now.time >= self.within:
+        if self.has_waited(now):
             return super().lateness(now, contact_force)
         return (
             f"{self.name} has gone {now.away:.3g} m away, and a force of {now.force:.3g} N is "
