@@ -168,10 +168,13 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
     except Exception as error:
         return f"RAW: {error!r}"
     limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
-    pairs = pairwise(changes)
-    touches = [after.time for before, after in pairs if after.in_contact > before.in_contact]
-    for touch in touches if limit and is_model else ():
-        record = found.record
+    for before, after in pairwise(changes) if limit and is_model else ():
+        record, touch = found.record, after.time
+        air = (record.time > before.time) & (record.time < touch)
+        # A phase that begins while the tool still presses does not touch.
+        is_free = (record["constraint_force"][air, 0] == 0.0).any()
+        if not (after.in_contact > before.in_contact and is_free):
+            continue
         near = np.abs(record.time - touch - 0.02) < 0.03
         peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
         if peak > float(limit[1]):

@@ -12,7 +12,10 @@ from runs import run_scenario, scenario
 from drake_dae import Record, build_scenario, load_scenario, shipped_model, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.start import start_scenario
 
 # At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
 SHORT = """
@@ -128,13 +131,21 @@ SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
     ("changes", "problem"),
     [
         (["task.phases.1.force=600"], "joint2_motor needs .* limit 120 N m"),
-        (["task.phases.2.duration=5"], "the run ended during phase 3, Move"),
+        pytest.param(
+            ["task.phases.2.duration=5"],
+            "the run ended during phase 3, Move",
+            marks=pytest.mark.thorough,
+        ),
         (["task.phases.0.within=0.1"], "Approach has waited 0.1 s for a force of 0.5 N"),
         (
             [SOFT, "task.phases.1.guards=[{of: force, most: 40}]"],
             r"Approach may touch with 7[0-9.]+ N, and a guard of Press ends it at 40 N",
         ),
-        (["task.phases.2.references={tool.z: 1.8}"], "task: phase|singular|joint"),
+        pytest.param(
+            ["task.phases.2.references={tool.z: 1.8}"],
+            "task: phase|singular|joint",
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_problems_of_a_task_are_known_before_it_runs(file, changes, problem):
@@ -142,6 +153,7 @@ def test_problems_of_a_task_are_known_before_it_runs(file, changes, problem):
     assert re.search(problem, "\n".join(found.problems)), found.problems
 
 
+@pytest.mark.thorough
 def test_a_guard_that_bears_the_touch_is_no_problem(file):
     """The contact throws the tool back within 20 ms; 40 samples last longer."""
     guard = "task.phases.1.guards=[{of: force, most: 40, samples: 40}]"
@@ -158,6 +170,39 @@ def test_several_integrals_serve_a_task_whose_contact_opens(file):
     loop, context, record = run_scenario(load_scenario(file, sampled))
     assert loop.changes(context)[-1].phase == "done"
     assert_allclose(record["tracking_error"][-1, 1], 0.0, atol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_polishing_with_friction_on_drakes_contact_keeps_the_contact_and_the_path():
+    """Within 0.02 mm and 0.05 N two seconds after the transition; the touch does not bounce.
+
+    It touches at 0.015 m/s and presses within 0.1 s: 20 N stop the rebound of 33 kg. The law does
+    not know the friction of 0.3; the equations of Drake's contact are those of its plant.
+    """
+    found = scenario(
+        "wall_polish",
+        "plant=!CompliantContact {radius: 1.0e-5, friction: 0.3}",
+        "constraints.0.friction=0",
+        "gains=null",
+        "constraint_damping=null",
+        "task.gains=null",
+        "task.phases.1.speed=0.015",
+        "task.phases.2.over=0.1",
+        "duration=10",
+    )
+    completed, loop = build_completed(found)
+    context = start_scenario(completed.scenario, loop)
+    rolled = roll_scenario(completed.scenario, loop, context)
+    record, changes = rolled.record, loop.changes(rolled.context)
+    times = {change.phase: change.time for change in changes}
+    force, errors = record["constraint_force"][:, 0], record["tracking_error"]
+    assert force[record.time > times["Press"]].min() > 0.0
+    assert force.max() < 27.0
+    late = record.time > times["Move 2"] + 2.0
+    assert record.time[late][0] < 7.0
+    assert np.linalg.norm(errors[late][:, :2], axis=1).max() < 2e-5
+    assert np.abs(errors[late, 6]).max() < 0.05
 
 
 @pytest.mark.parametrize(
