@@ -99,13 +99,17 @@ class ClosedLoop:
         return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the force sensor's noise; the default is the same in every run.
+        """Sets the seed of the noise of the force sensor, and of the losses and jitter of the link.
+
+        Without it they are the same in every run of a loop.
 
         Args:
             context: The diagram's context.
             seed: The seed of the random numbers.
         """
         seed_noise(self.noise, context, seed)
+        if self.link is not None:
+            self.link.set_seed(context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x of the plant, without a projection onto the constraints.

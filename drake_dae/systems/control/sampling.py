@@ -40,7 +40,7 @@ class Sampling:
             n p / (n p + 1 - p).
         most_lost: The number of lost controls in a row at which the robot stops by itself, which
             ends the run with an error; 20 for a Franka arm. None for never.
-        seed: The seed of jitter and loss.
+        seed: The seed of jitter and loss in a scenario; in Python see `ClosedLoop.set_seed`.
 
     Raises:
         ModelError: The period is not positive, the delay is negative or very many periods, or
