@@ -20,7 +20,6 @@ from drake_dae.scenario.advice.advice import reaction_time, touch_peak
 from drake_dae.scenario.build import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
 from drake_dae.scenario.plants import IdealConstraints
-from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.job import JobOutcome, judge_job
@@ -173,6 +172,8 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
+    from drake_dae.scenario.rolled import roll_scenario
+
     ideal = _ideal(scenario)
     loop = build_loop(ideal, model, structure)
     controller, context = loop.controller, start_scenario(ideal, loop)
