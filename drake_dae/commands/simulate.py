@@ -62,6 +62,7 @@ from drake_dae.simulation.remarks import (
     reference_remarks,
     stop_remarks,
     surface_remarks,
+    touch_remarks,
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
@@ -264,7 +265,6 @@ def _write(run: _CommandRun) -> bool:
         lines = [summary(record, predicted, limits, *outcome, accuracy, reasons, bound)]
         changes = loop.changes(run.context)
         stopped = stop_remarks(run.statistics, run.scenario.duration) if changes else []
-        failed = bool(run.failure or (stopped and changes[-1].failed))
         job = judge_job(
             record,
             predicted,
@@ -272,7 +272,7 @@ def _write(run: _CommandRun) -> bool:
             [*shortfalls(record, limits), *map(str, behind)],
             limits.pushing,
             changes,
-            is_cut_short=failed or run.is_interrupted,
+            is_cut_short=bool(run.failure) or run.is_interrupted,
             notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
@@ -294,7 +294,7 @@ def _write(run: _CommandRun) -> bool:
         followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
         lines += reference_remarks(followed)
         if changes:
-            lines += ["", *map(str, changes), *stopped]
+            lines += ["", *map(str, changes), *stopped, *touch_remarks(changes)]
         text = "\n".join(lines)
         if write.record:
             signals = record.signals["tracking_error"].signals
@@ -380,6 +380,9 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
+        "controls are late or lost on their way (sampling)": not (
+            scenario.sampling is None or scenario.sampling.is_exact
+        ),
         "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]

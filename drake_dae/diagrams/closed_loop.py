@@ -13,6 +13,7 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.diagrams.drives import LinkWithNoise
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
@@ -49,6 +50,7 @@ class ClosedLoop:
         plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
         observer: The observer of the disturbance or the state, or None.
+        link: The link to the drives, with jitter and losses, or None.
         memory: A cache for rollouts and starts.
     """
 
@@ -65,6 +67,7 @@ class ClosedLoop:
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
     observer: Observer | None = None
+    link: LinkWithNoise | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -96,13 +99,17 @@ class ClosedLoop:
         return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the force sensor's noise; the default is the same in every run.
+        """Sets the seed of the noise of the force sensor, and of the losses and jitter of the link.
+
+        Without it they are the same in every run of a loop.
 
         Args:
             context: The diagram's context.
             seed: The seed of the random numbers.
         """
         seed_noise(self.noise, context, seed)
+        if self.link is not None:
+            self.link.set_seed(context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x of the plant, without a projection onto the constraints.

@@ -71,7 +71,7 @@ def add_observer(
             "closed contact: make the law with measured_force=True (in a scenario: force_feedback: "
             "!MeasuredForce {sample_period: ...})"
         )
-    late = 0.0 if sampling is None else sampling.delay + step
+    late = 0.0 if sampling is None else sampling.mean_delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
     observed_state = state
     if controller.observed is not None:
@@ -114,7 +114,7 @@ def control_lag(plant: Plant, sampling: Sampling | None) -> float:
     """
     step = plant.time_step
     period = step if sampling is None else sampling.period
-    rest = 0.0 if sampling is None else sampling.rest
+    rest = 0.0 if sampling is None else sampling.rest + sampling.jitter / 2.0
     return min((rest + step) / period, 1.0) if period else 0.0
 
 

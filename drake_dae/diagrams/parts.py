@@ -1,7 +1,6 @@
 """The parts of a closed loop: adding them to a diagram, and checks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -22,9 +21,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import SIGNAL, Controller
-from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
@@ -183,30 +180,6 @@ def add_feasible(
     return block
 
 
-def add_drives(
-    builder: DiagramBuilder,
-    control: OutputPort,
-    sampling: Sampling | None,
-    control_limits: ArrayLike | None,
-) -> tuple[OutputPort, ControlLimits | None]:
-    """Adds hold and limits behind a control; returns the control at the plant, and the limits."""
-    limits = None
-    if sampling is not None:
-        hold = builder.AddSystem(ControlHold(control.size(), sampling))
-        builder.Connect(control, hold.get_input_port())
-        control = hold.get_output_port()
-    if control_limits is not None:
-        limits = builder.AddSystem(ControlLimits(control_limits))
-        if limits.limits.size != control.size():
-            raise WiringError(
-                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
-                "controls"
-            )
-        builder.Connect(control, limits.get_input_port())
-        control = limits.GetOutputPort("control")
-    return control, limits
-
-
 def add_watch(
     builder: DiagramBuilder,
     plant: Plant,
@@ -296,15 +269,3 @@ def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> Vector
     if plant.time_step:
         return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})
-
-
-def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
-    """The sampling of the hold; a discrete plant adds a delay of one of its own steps."""
-    step = plant.time_step
-    if step and sampling.delay < step * (1.0 - 1e-9):
-        raise WiringError(
-            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
-            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
-            "delay at each step of the plant needs no sampling"
-        )
-    return replace(sampling, delay=max(sampling.delay - step, 0.0))

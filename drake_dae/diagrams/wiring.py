@@ -12,18 +12,17 @@ from drake_dae.dae.references import Reference, references_by_name
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.drives import LinkWithNoise, add_drives, hold_before
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.observing import Observer, add_observer
 from drake_dae.diagrams.parts import (
     add_block,
-    add_drives,
     add_feasible,
     add_hold,
     add_signals,
     add_watch,
     check_parts,
     contact_reference,
-    hold_before,
     log_steps,
     open_holds,
 )
@@ -171,7 +170,7 @@ def wire_loop(
     if parts.governed is not None and control_limits is not None:
         feasible = add_feasible(builder, controller, parts.governed, control_limits, state)
         control, control_limits = feasible.GetOutputPort("control"), None
-    control, limits = add_drives(builder, control, sampling, control_limits)
+    control, link, limits = add_drives(builder, plant, control, sampling, control_limits)
     if controller.HasOutputPort("feedback"):
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
@@ -210,7 +209,7 @@ def wire_loop(
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {
         **_of_plant(plant, moving, reference, law, control),
-        **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
+        **_of_parts(plant, controller, measured, link, limits, observer, parts.sensor),
     }
     if feasible is not None:
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
@@ -242,6 +241,7 @@ def wire_loop(
         moving,
         measured,
         observer,
+        link,
     )
 
 
@@ -320,6 +320,7 @@ def _of_parts(
     plant: Plant,
     controller: Controller,
     measured: MeasuredState | None,
+    link: LinkWithNoise | None,
     limits: ControlLimits | None,
     observer: Observer | None,
     sensor: ForceSensor | None,
@@ -332,6 +333,8 @@ def _of_parts(
         named[name] = (measured.output, dae.state_signals)
     if observer is not None and estimates:
         named["estimated_state"] = (observer.GetOutputPort("estimated_state"), dae.state_signals)
+    if link is not None:
+        named["lost_controls"] = (link.block.GetOutputPort("lost_controls"), link.block.signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     for block in (controller, observer):

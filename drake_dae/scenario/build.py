@@ -15,8 +15,8 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.observing import control_lag
-from drake_dae.diagrams.parts import hold_before
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
@@ -199,7 +199,7 @@ def _controller(
         return None
     assert sampling is not None  # law_robot.
     lag = control_lag(plant, hold_before(plant, sampling))
-    return SpringCascade(law, model, scenario.spring_loop, period, lag, sampling.delay)
+    return SpringCascade(law, model, scenario.spring_loop, period, lag, sampling.mean_delay)
 
 
 def make_plant(

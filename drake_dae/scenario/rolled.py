@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.drives import LINK_NOISE, link_seed
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
@@ -191,6 +192,8 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
         seeds["force_noise"] = scenario.force_feedback.seed
     if scenario.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+    if scenario.sampling is not None:
+        seeds[LINK_NOISE] = link_seed(scenario.sampling.seed)
     return seeds
 
 

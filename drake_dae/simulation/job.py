@@ -49,6 +49,7 @@ class OutputQuality:
             second half of the run.
         largest: The largest |z - r| in the second half of the run.
         rms: The root mean square of z - r in the second half of the run.
+        settled: The largest |z - r| in the second half of the run, from `since` on.
     """
 
     signal: Signal
@@ -58,6 +59,7 @@ class OutputQuality:
     follows_prediction: bool
     largest: float
     rms: float
+    settled: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -225,13 +227,14 @@ def _judge_outputs(
         )
     settled = [output for output in outputs if output.since is not None]
     if settled and not problems:
-        worst = max(settled, key=lambda output: output.largest / output.tolerance)
+        worst = max(settled, key=lambda output: output.settled / output.tolerance)
         since = max(output.since for output in settled if output.since is not None)
         which = "every output" if len(settled) == len(outputs) else "every other output"
         unit = f" {worst.signal.unit}".rstrip()
+        when = "in the second half of the run" if since <= middle else "there"
         remarks.append(
-            f"{which} is at its reference from {since:.3g} s on; in the second half of the run "
-            f"{worst.signal.name} comes closest to its tolerance, with {worst.largest:.2g} of "
+            f"{which} is at its reference from {since:.3g} s on; {when} "
+            f"{worst.signal.name} comes closest to its tolerance, with {worst.settled:.2g} of "
             f"{worst.tolerance:.2g}{unit}"
         )
     return bool(short)
@@ -249,15 +252,18 @@ def _qualities(
     first = int(np.searchsorted(record.time, (record.time[0] + record.time[-1]) / 2.0))
     for i, signal in enumerate(signals):
         tolerance = tolerances.get(signal.name, float(tolerated[i]))
+        since = _within_since(record.time, error[:, i], tolerance)
+        late = np.inf if since is None else since
         qualities.append(
             OutputQuality(
                 signal,
                 tolerance,
-                _within_since(record.time, error[:, i], tolerance),
+                since,
                 _within_since(record.time, predicted[:, i], tolerance),
                 bool(np.all(np.abs(error - predicted)[first:, i] <= tolerance)),
                 float(np.max(np.abs(error[first:, i]))),
                 float(rms[i]),
+                float(np.max(np.abs(error[first:, i][record.time[first:] >= late]), initial=0.0)),
             )
         )
     return qualities

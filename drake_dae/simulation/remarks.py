@@ -1,7 +1,8 @@
 """Remarks on a run: surfaces, limits, references, and its end."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,12 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits
+from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.trace.functions import TracedFunction
+
+_AT_ONCE, _AWAY = 0.1, 1e-3
+"""A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
+none: a tool does not come that far."""
 
 
 def surface_remarks(model: RobotModel, record: Record) -> list[str]:
@@ -167,3 +173,22 @@ def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]
         return []
     left = duration - statistics.simulated_time
     return [f"The task stops the run there, {left:.4g} s early."] if left > 1e-9 * duration else []
+
+
+def touch_remarks(changes: Sequence[PhaseChange]) -> list[str]:
+    """Remarks on touches that a task felt as soon as a phase began, away from the surface.
+
+    Args:
+        changes: The starts of phases of a run.
+    """
+    texts = []
+    for before, after in pairwise(changes):
+        lasted, away = after.time - before.time, after.distance
+        touched = after.in_contact > before.in_contact
+        if touched and not after.failed and lasted < _AT_ONCE and away > _AWAY:
+            texts.append(
+                f"{before.phase} felt {after.force:.3g} N {1e3 * lasted:.3g} ms after its start, "
+                f"{1e3 * away:.3g} mm before the surface of the model: a bias of the force sensor "
+                "feels like a touch. Find the bias by task.tare_time"
+            )
+    return texts

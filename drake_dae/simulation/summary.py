@@ -104,7 +104,7 @@ def summary(
     kind = "in compliant contact" if is_compliant else "before each step's projection"
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
-    notes += _identified(record)
+    notes += [*_identified(record), *_lost(record)]
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     ended = ""
     if run is not None:
@@ -244,6 +244,16 @@ def _estimated(record: Record) -> list[str]:
         names = ", ".join(unknown)
         found.append(f"not identified       {names}: this motion does not excite them")
     return found
+
+
+def _lost(record: Record) -> list[str]:
+    """The controls that did not arrive at the drives."""
+    if "lost_controls" not in record.signals:
+        return []
+    lost = record["lost_controls"][:, 0]
+    total = max(float(record.time[-1] - record.time[0]), 1e-300)
+    share = float(np.diff(record.time) @ (lost[1:] > 0.0)) / total
+    return [f"lost controls        in {share:.2%} of the time, at most {lost.max():g} in a row"]
 
 
 def _number(value: float, size: float, digits: int) -> str:

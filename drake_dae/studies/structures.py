@@ -92,8 +92,10 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
         deviation = force["noise_deviation"]
         if not own["task"]:  # The guards of a task depend on the noise.
             deviation = float(np.any(np.array(deviation) != 0.0))
-        errors = {"seed": 0, "bias": 0.0, "noise_deviation": deviation}
+        errors = {"seed": 0, "bias": 0.0, "drift": 0.0, "noise_deviation": deviation}
         own["force_feedback"] = {**force, **errors}
+    if own["sampling"]:
+        own["sampling"] = {**own["sampling"], "seed": 0}
     if own["encoders"]:
         own["encoders"] = {**own["encoders"], "seed": 0}
     return own

@@ -22,10 +22,17 @@ SAMPLED = (
     "integral=[tool.y, tool.z, wall.force]",
 )
 DRAKE = "plant=!MultibodyPlant"
+COMPUTED = ("gains=null", "constraint_damping=null", "task.gains=null")
+GENTLE = ("task.phases.1.speed=0.015", "task.phases.2.over=0.1")
 PLANTS = {
     "ideal": (),
     "point 1e5 N/m, law without integrals": (f"{DRAKE} {{stiffness: 1.0e5}}",),
     "point 1e5 N/m": (f"{DRAKE} {{stiffness: 1.0e5}}", *SAMPLED),
+    "point, friction 0.3, computed gains": (
+        f"{DRAKE} {{radius: 1.0e-5, friction: 0.3}}",
+        *COMPUTED,
+        *GENTLE,
+    ),
     "hydroelastic 1e8 Pa": (f"{DRAKE} {{contact_model: hydroelastic, modulus: 1.0e8}}", *SAMPLED),
     "hydroelastic 1e7 Pa": (f"{DRAKE} {{contact_model: hydroelastic, modulus: 1.0e7}}", *SAMPLED),
 }

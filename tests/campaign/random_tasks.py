@@ -1,10 +1,11 @@
-"""Random tasks of the two-link arm: phases, sensors, pushes, payloads, a wall that is elsewhere.
+"""Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads, lost controls.
 
     python tests/campaign/random_tasks.py --count 1000 --seed 0
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
-phases and retries allow. Without pushes and payloads the force of every touch has to stay below the
-expected peak. Returns 1 if one does not.
+phases and retries allow. Without pushes and payloads the force of every touch on Drake's contact
+has to stay below the expected peak, and the impulse on a contact that opens below speed times mass
+at the tool. Returns 1 if one does not.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,6 +30,8 @@ from drake_dae.scenario.start import start_scenario
 
 ENDED = ("done", "held")
 REACTIONS = ("hold", "stop", "fail", "leave")
+ABOVE = 1.1
+"""The largest impulse beside the expected one: the distance is controlled, to a few percent."""
 DURATIONS = (6.0, 60.0)
 """In s; a task that has not ended in the first time is run for the second."""
 TEXT = """
@@ -39,7 +43,7 @@ constraints:
   friction: 0.0
 outputs:
 - {{frame: tool, axes: z}}
-sampling: {{period: 0.001, delay: 0.001}}
+sampling: {{period: 0.001, delay: 0.001{link}}}
 start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
 duration: 6
 plant: {plant}
@@ -57,11 +61,16 @@ task:
 def random_task(draw: random.Random) -> tuple[str, bool]:
     """A scenario, and whether the touch is that of the model."""
     noise, bias = draw.choice((0.0, 0.1, 0.3)), draw.choice((0.0, 0.0, -1.0, 0.5, 1.0))
-    sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}}}"
+    drift = draw.choice((0.0, 0.0, 0.05, -0.05))
+    sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}, drift: {drift}}}"
+    lost = f", loss: {draw.uniform(0.0, 0.01)}, burst: {draw.randrange(1, 5)}"
+    link = draw.choice(("", "", f"{lost}, most_lost: 20, seed: {draw.randrange(1000)}"))
     settings, gains, moved = [], "", False
     if draw.random() < 0.25:
         plant = "!Unilateral {restitution: {wall: 0.0}}"
         settings += ["gains: {all: [-25]}", draw.choice(("", "observer: {rate: 30}"))]
+        if link and draw.random() < 0.5:
+            link = ", jitter: 0.0005" + link
         settings.append(draw.choice(("", "encoders: {position_noise: 1e-6, velocity_noise: 1e-3}")))
         gains = '  gains: {outputs: {wall.distance: [-8], "*": [-25]}}'
     else:
@@ -85,7 +94,7 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
         settings.append(f"plant_parameters: {{wall.position: [{place}, 0, 0]}}")
     if draw.random() < 0.3:
         settings.append("saturation: true")
-    lost = (*REACTIONS, "approach", "touch", "away")
+    after_loss = (*REACTIONS, "approach", "touch", "away")
     retries, spent = draw.randrange(3), draw.choice(("away", *REACTIONS))
     speed, again = draw.uniform(0.01, 0.1), f"retries: {retries}, if_spent: {spent}"
     late = draw.choice((*REACTIONS, "touch", "away"))
@@ -95,12 +104,16 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
         phases = [f"!GuardedMove {{{touch}, {felt}}}"]
     else:
         phases = [f"!Approach {{{touch}}}"]
-    ends = f"within: 3, on_failure: {draw.choice(lost)}, if_lost: {draw.choice(lost)}"
+    ends = f"within: 3, on_failure: {draw.choice(after_loss)}, if_lost: {draw.choice(after_loss)}"
     force, tolerance = draw.uniform(3.0, 40.0), max(1.0, 5.0 * noise)
     guards = _guards(draw, force)
     phases.append(f"!Press {{force: {force}, tolerance: {tolerance}, over: 0.3, {ends}, {guards}}}")
     for _ in range(draw.randrange(4)):
-        goal, force, reaction = draw.uniform(0.2, 0.4), draw.uniform(3.0, 40.0), draw.choice(lost)
+        goal, force, reaction = (
+            draw.uniform(0.2, 0.4),
+            draw.uniform(3.0, 40.0),
+            draw.choice(after_loss),
+        )
         goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
         failing = f"on_failure: {reaction}, {_guards(draw, force)}"
         move, dwell = f"!Move {{{goals}, {failing}}}", "!Dwell {duration: 0.3}"
@@ -114,6 +127,7 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     text = TEXT.format(
         plant=plant,
         sensor=sensor,
+        link=link,
         settings="\n".join(filter(None, settings)),
         tare=0.1 if bias else draw.choice((0.0, 0.1)),
         gains=gains,
@@ -154,14 +168,24 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
     except Exception as error:
         return f"RAW: {error!r}"
     limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
-    pairs = pairwise(changes)
-    touches = [after.time for before, after in pairs if after.in_contact > before.in_contact]
-    for touch in touches if limit and is_model else ():
-        record = found.record
+    for before, after in pairwise(changes) if limit and is_model else ():
+        record, touch = found.record, after.time
+        air = (record.time > before.time) & (record.time < touch)
+        # A phase that begins while the tool still presses does not touch.
+        is_free = (record["constraint_force"][air, 0] == 0.0).any()
+        if not (after.in_contact > before.in_contact and is_free):
+            continue
         near = np.abs(record.time - touch - 0.02) < 0.03
         peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
         if peak > float(limit[1]):
             return f"HARD: {peak:.3g} N, expected below {limit[1]} N"
+    speeds = [phase.speed_of_approach or 0.0 for phase in completed.scenario.task.make().phases]
+    for event in found.record.events if is_model else ():
+        states = loop.controller.law.structure
+        row = np.searchsorted(found.record.time, event.time) - 1
+        mobility = float(states.constraint_matrix(found.record["state"][row])[0, 0])
+        if max(event.impulses, default=0.0) > ABOVE * max(speeds) / mobility:
+            return f"HARD: {max(event.impulses):.3g} N s, expected {max(speeds) / mobility:.3g} N s"
     if found.failure is None and changes[-1].phase not in ENDED:
         return f"HANGS: {changes[-1]}"
     if found.failure is not None:
@@ -176,7 +200,7 @@ def main() -> int:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     kinds, bad = Counter[str](), 0
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
         for seed in range(options.seed, options.seed + options.count):
             began = time.perf_counter()
             found = outcome(*random_task(random.Random(seed)), Path(folder))
@@ -186,6 +210,7 @@ def main() -> int:
                 print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)
     for kind, count in kinds.most_common():
         print(f"{count:6} {kind}")
+    print(f"{kinds.total():6} tasks, {bad} of them ended as none may")
     return int(bad > 0)
 
 

@@ -1,11 +1,12 @@
 """A small part of the campaign: a mistake ends as a message, a robot as numbers that are right."""
 
+import random
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from campaign import bad_files, bad_inputs, drops, random_robots
+from campaign import bad_files, bad_inputs, drops, random_robots, random_tasks
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
 
@@ -52,6 +53,16 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
 def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
     outcome = drops.attempt(seed, tmp_path, duration=0.5)
     assert outcome.kind == RESULT, outcome
+
+
+# Task 154 releases a contact whose model error is larger than its contact_force.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seed", [3, 5, 154, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 37))]
+)
+def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: int, tmp_path: Path):
+    found = random_tasks.outcome(*random_tasks.random_task(random.Random(seed)), tmp_path)
+    assert not found.startswith(("RAW", "HARD", "HANGS")), found
 
 
 @pytest.mark.slow

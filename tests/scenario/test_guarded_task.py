@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.records.phases import phase_spans
 
 # At rest 20 mm before the wall, which opens and closes without bouncing.
@@ -61,6 +63,14 @@ def told(file, tmp_path, capsys, *settings):
     return code, found, (tmp_path / "run" / "summary.txt").read_text()
 
 
+def rolled(found):
+    """The rollout of a scenario, and its changes of phases."""
+    completed, loop = build_completed(found)
+    context = start_scenario(completed.scenario, loop)
+    result = roll_scenario(completed.scenario, loop, context)
+    return result, loop.changes(result.context or context)
+
+
 def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys):
     """The guard has it at 9 N; pressing to 10 N takes 0.1 s. The record is read again."""
     guards = ["task.phases.1.guards.0={of: force, most: 9, samples: 2}", TOLERANT]
@@ -84,6 +94,7 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     assert (code, found["job"]["outcome"]) == (2, "bad")
     assert [one["phase"] for one in found["phases"]] == ["feel", "Press", "leave", "held"]
     story = " ".join(text.split("\n\n")[0].split())
+    assert story.startswith("BAD: the task was given up at")
     assert ", and has left the contact: Press is ended by a force of 9" in story
     assert found["phases"][-1]["force"] <= 0.5
     # By an error it fails, too.
@@ -136,6 +147,11 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
             "task.phases.0.direction={tool.x: 1}",
             "phase 1 of the task, feel: direction: no out",
         ),
+        (
+            "task.phases.0.direction={tool.z: 1}",
+            "phase 1 of the task, feel: direction: it does not lead to the surface; give it a "
+            "negative component of 'wall.distance'",
+        ),
         ("sampling=null", "guard of the force: it counts in samples, .*in a scenario: sampling"),
     ],
 )
@@ -181,3 +197,97 @@ def test_the_hardest_touch_is_told_with_its_phase():
     (note,) = [one for one in completed.notes if "A touch" in one]
     # 30 + 13 + 4 N, and 0.5 + 19.6 + 6 N.
     assert "A touch by GuardedMove at 0.02 m/s is expected to stay below 47" in note
+
+
+def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
+    """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
+    biased = "force_feedback=!MeasuredForce {sample_period: 0.002, bias: 3}"
+    settings = (biased, "task.phases.0.force=2", TOLERANT)
+    _, _, text = told(file, tmp_path, capsys, *settings)
+    assert "before the surface of the model: a bias of the force sensor feels like a touch" in text
+    code, found, text = told(file, tmp_path, capsys, *settings, "task.tare_time=0.1")
+    assert (code, found["phases"][-1]["phase"]) == (0, "done")
+    assert "feels like a touch" not in text
+
+
+def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
+    """The bias is found within 0.1 s; from then on 10 N/s reach the 2 N of the move in 0.2 s."""
+    settings = (
+        "force_feedback=!MeasuredForce {sample_period: 0.002, drift: 10}",
+        "task.tare_time=0.1",
+        "task.phases.0.speed=0.01",
+        "task.phases.0.force=2",
+    )
+    found = rolled(load_scenario(file, list(settings)))
+    (touch,) = [change.time for change in found[1] if change.phase == "Press"]
+    # The mean of the drift while the bias is found is that of its middle.
+    assert touch == pytest.approx(0.05 + 2.0 / 10.0, abs=0.02)
+    assert not found[0].record["constraint_force"][found[0].record.time < touch].any()
+
+
+@pytest.mark.parametrize(
+    ("plant", "jitter"),
+    [
+        ("!Unilateral {restitution: {wall: 0.0}}", 0.0004),
+        ("!CompliantContact {time_step: 0.0005, stiffness: 1.0e5}", 0.0005),
+    ],
+)
+def test_a_task_goes_on_while_controls_are_late_and_lost(file, plant, jitter):
+    """Every tenth control is lost, three in a row, and half of them are late: it is done."""
+    link = f"period: 0.002, delay: 0.001, jitter: {jitter}, loss: 0.04, burst: 3, most_lost: 20"
+    change = [f"plant={plant}", f"sampling={{{link}}}", "task.phases.1.tolerance=3", "duration=2"]
+    found, changes = rolled(load_scenario(file, change))
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    lost = found.record["lost_controls"][:, 0]
+    assert lost.max() >= 3.0
+    assert 0.05 < np.mean(lost > 0.0) < 0.2
+
+
+def test_a_task_ends_where_the_robot_stops_by_itself(file):
+    """With the reason and the record up to there."""
+    link = "sampling={period: 0.002, loss: 0.01, burst: 20, most_lost: 20}"
+    found, changes = rolled(load_scenario(file, [link]))
+    assert "20 controls in a row were lost (sampling.most_lost)" in str(found.failure)
+    assert found.record.time[-1] <= found.failure.time
+    assert changes[-1].phase not in ("done", "held")
+
+
+HELD_PHASES = {
+    "Press": "!Press {force: 10, over: 1.0, within: 3, if_lost: away, on_failure: fail}",
+    "Dwell": "!Dwell {duration: 1.0, if_lost: away, on_failure: fail}",
+    "Wait": "!Wait {duration: 1.0, if_lost: away, on_failure: fail}",
+    "Move": "!Move {references: {tool.z: 0.31}, duration: 1.0, if_lost: away, on_failure: fail}",
+}
+JUMP = "wall.force: !PointToPoint {start: [10], end: [-30], start_time: 0.2, end_time: 0.201}"
+PUSH = "plant_disturbances=[{frame: tool, force: [-60, 0, 0], start_time: 0.6, end_time: 1.2}]"
+OPENS = "plant=!Unilateral {restitution: {wall: 0.0}}"
+DELAYED = "sampling={period: 0.002, delay: 0.001}"
+SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
+
+
+@pytest.mark.parametrize(
+    ("phase", "changes"),
+    [
+        *some((phase, [PUSH, SOFT, DELAYED]) for phase in HELD_PHASES),
+        pytest.param("Move", [PUSH, OPENS], marks=pytest.mark.thorough),
+        ("Move", [OPENS]),
+    ],
+)
+def test_a_contact_that_is_lost_on_purpose_leads_to_what_was_chosen(file, phase, changes):
+    """By a push of 60 N away from the wall in each phase; or by a reference that jumps to -30 N."""
+    touch, rest = SHORT.split("  - !Press")[0], SHORT.split("  - !Release {over: 0.1}")[1]
+    held = HELD_PHASES[phase]
+    if PUSH not in changes:
+        held = held.replace("tool.z: 0.31", JUMP)
+    press = "" if phase == "Press" else "  - !Press {force: 10, over: 0.1, tolerance: 3}\n"
+    file.write_text(f"{touch}{press}  - {held}\n  - !Release {{over: 0.1}}{rest}")
+    found, story = rolled(load_scenario(file, [*changes, "duration=3"]))
+    assert found.failure is None
+    (away,) = [change for change in story if change.phase == "away"]
+    assert away.reason == f"the contact of {phase} is lost"
+    assert away.failed
+    assert story[-1].phase == "done"
+    # The task waits for 0.25 s whether the contact comes back.
+    begin = story[[change.phase for change in story].index(phase)].time
+    assert away.time > begin + 0.25

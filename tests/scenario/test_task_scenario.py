@@ -1,16 +1,21 @@
 """Tasks in scenario files: the shipped one, its pictures, and what is refused."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from arms import numbers
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
 
 from drake_dae import Record, build_scenario, load_scenario, shipped_model, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.rolled import roll_scenario
+from drake_dae.scenario.start import start_scenario
 
 # At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
 SHORT = """
@@ -95,10 +100,109 @@ def test_shipped_task_touches_as_designed_and_is_as_predicted():
     assert np.abs(record["tracking_error"] - loop.predicted_error(record)).max() < 5e-5
 
 
-def test_analysis_of_a_task_is_that_of_its_contact(file):
+def test_analysis_of_a_task_tells_its_phases_before_it_runs(file, capsys):
+    """Times, forces and the touch are those of the task; the mass is that of the plant."""
     found = find_feasibility(load_scenario(file))
     assert found.problems == ()
-    assert found.analysis.motion is None
+    needs = found.task
+    assert [each.name for each in needs.phases] == ["Approach", "Press", "Move"]
+    # 20 mm, of which the ramp of 0.1 s takes half.
+    assert needs.phases[0].end == pytest.approx(0.02 / 0.1 + 0.05, abs=5e-3)
+    assert [each.force for each in needs.phases] == pytest.approx([0.0, 10.0, 12.0], abs=1e-3)
+    (touch,) = needs.touches
+    assert touch.speed == pytest.approx(0.1, rel=1e-3)
+    row = np.searchsorted(needs.times, touch.time)
+    arm = numbers("two_link", *np.split(needs.states[row], 2))
+    jacobian = arm.constraint_jacobian[0]
+    mass = 1.0 / (jacobian @ np.linalg.solve(arm.mass, jacobian))
+    assert touch.mass == pytest.approx(mass, rel=1e-6)
+    assert touch.impulse == pytest.approx(0.1 * mass, rel=1e-3)
+    assert touch.peak is None
+    assert main(["analyze", str(file)]) == 0
+    told = capsys.readouterr().out
+    assert "Approach touches at 0.25 s with 0.1 m/s; the mass at the tool is 4.2" in told
+    assert "In the law's model the task was done at" in told
+
+
+SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (["task.phases.1.force=600"], "joint2_motor needs .* limit 120 N m"),
+        pytest.param(
+            ["task.phases.2.duration=5"],
+            "the run ended during phase 3, Move",
+            marks=pytest.mark.thorough,
+        ),
+        (["task.phases.0.within=0.1"], "Approach has waited 0.1 s for a force of 0.5 N"),
+        (
+            [SOFT, "task.phases.1.guards=[{of: force, most: 40}]"],
+            r"Approach may touch with 7[0-9.]+ N, and a guard of Press ends it at 40 N",
+        ),
+        pytest.param(
+            ["task.phases.2.references={tool.z: 1.8}"],
+            "task: phase|singular|joint",
+            marks=pytest.mark.thorough,
+        ),
+    ],
+)
+def test_problems_of_a_task_are_known_before_it_runs(file, changes, problem):
+    found = find_feasibility(load_scenario(file, changes))
+    assert re.search(problem, "\n".join(found.problems)), found.problems
+
+
+@pytest.mark.thorough
+def test_a_guard_that_bears_the_touch_is_no_problem(file):
+    """The contact throws the tool back within 20 ms; 40 samples last longer."""
+    guard = "task.phases.1.guards=[{of: force, most: 40, samples: 40}]"
+    found = find_feasibility(load_scenario(file, [SOFT, guard]))
+    assert found.problems == ()
+    assert found.task.touches[0].peak > 40.0
+
+
+def test_several_integrals_serve_a_task_whose_contact_opens(file):
+    """The task holds them itself while the contact is open."""
+    measured = "force_feedback=!MeasuredForce {sample_period: 0.002}"
+    plant = "plant=!Unilateral {restitution: {wall: 0.0}}"
+    sampled = ["sampling={period: 0.002}", measured, "integral=[tool.z, wall.force]", plant]
+    loop, context, record = run_scenario(load_scenario(file, sampled))
+    assert loop.changes(context)[-1].phase == "done"
+    assert_allclose(record["tracking_error"][-1, 1], 0.0, atol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_polishing_with_friction_on_drakes_contact_keeps_the_contact_and_the_path():
+    """Within 0.02 mm and 0.05 N two seconds after the transition; the touch does not bounce.
+
+    It touches at 0.015 m/s and presses within 0.1 s: 20 N stop the rebound of 33 kg. The law does
+    not know the friction of 0.3; the equations of Drake's contact are those of its plant.
+    """
+    found = scenario(
+        "wall_polish",
+        "plant=!CompliantContact {radius: 1.0e-5, friction: 0.3}",
+        "constraints.0.friction=0",
+        "gains=null",
+        "constraint_damping=null",
+        "task.gains=null",
+        "task.phases.1.speed=0.015",
+        "task.phases.2.over=0.1",
+        "duration=10",
+    )
+    completed, loop = build_completed(found)
+    context = start_scenario(completed.scenario, loop)
+    rolled = roll_scenario(completed.scenario, loop, context)
+    record, changes = rolled.record, loop.changes(rolled.context)
+    times = {change.phase: change.time for change in changes}
+    force, errors = record["constraint_force"][:, 0], record["tracking_error"]
+    assert force[record.time > times["Press"]].min() > 0.0
+    assert force.max() < 27.0
+    late = record.time > times["Move 2"] + 2.0
+    assert record.time[late][0] < 7.0
+    assert np.linalg.norm(errors[late][:, :2], axis=1).max() < 2e-5
+    assert np.abs(errors[late, 6]).max() < 0.05
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Whether a run did its job: the verdict by the user's wish, not by the prediction."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -72,6 +74,16 @@ def test_near_the_path_is_good_though_it_is_not_as_predicted():
     found = judged(run(6e-7, np.where(TIMES < 0.2, -20.0, 0.01)))
     assert found.outcome is JobOutcome.GOOD
     assert "wall.force comes closest to its tolerance, with 0.01 of 0.2 N" in str(found)
+
+
+def test_an_output_that_is_late_as_predicted_is_compared_where_it_is_at_its_reference():
+    """0.2 exp(-0.8 t) is within 2 mm from 5.76 s on, and 3.7 mm in the middle of the run."""
+    late = 0.2 * np.exp(-0.8 * TIMES)
+    found = judged(run(late), np.column_stack([late, np.zeros_like(late)]))
+    assert found.outcome is JobOutcome.GOOD
+    text = re.search(r"from ([0-9.]+) s on; there tool.y comes .*, with ([0-9.]+) of", str(found))
+    assert float(text[1]) == pytest.approx(np.log(100.0) / 0.8, abs=0.01)
+    assert float(text[2]) <= 0.002
 
 
 def test_an_error_that_comes_back_is_bad():

@@ -24,6 +24,7 @@ from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.control.sampling import Sampling
 
 _SOFTER = 5.0
 """The ratio of the poles of positions to those of the distance, of a robot without contact."""
@@ -43,17 +44,42 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
     )
 
 
-def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """A note on the largest force when contact is made, F + v (sqrt(k / A) + k t).
+def touch_peak(felt: float, speed: float, stiffness: float, mobility: float, late: float) -> float:
+    """The largest expected force in N when contact is made, F + v (sqrt(k / A) + k t).
 
-    F is the force that ends the phase. The contact of stiffness k stops the effective mass 1 / A of
-    the tool from the speed v, and in the time t until the law reacts the tool moves on by v t.
+    The contact of stiffness k stops the effective mass 1 / A of the tool from the speed v, and in
+    the time t until the law reacts the tool moves on by v t.
+
+    Args:
+        felt: F, the force that ends the phase, in N.
+        speed: v, in m/s.
+        stiffness: k, in N/m.
+        mobility: A, in 1/kg.
+        late: t, in s.
     """
+    return felt + speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
+
+
+def reaction_time(sampling: Sampling | None, step: float) -> float:
+    """The longest time in s until a law reacts, with lost controls.
+
+    Args:
+        sampling: The sampling of the law; None where it acts at each step of the plant.
+        step: The step of the plant, in s.
+    """
+    if sampling is None:
+        return step
+    lost = sampling.burst if sampling.loss else 0
+    return sampling.period * (1 + sampling.late_samples + lost)
+
+
+def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
+    """A note on the largest `touch_peak` of a task."""
     peaks = []
     for phase in () if task is None else task.make().phases:
         if task is not None and (speed := phase.speed_of_approach):
-            added = speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
-            peaks.append((phase.felt(task.contact_force) + added, speed, phase.name))
+            felt = phase.felt(task.contact_force)
+            peaks.append((touch_peak(felt, speed, stiffness, mobility, late), speed, phase.name))
     if not peaks:
         return ""
     peak, speed, name = max(peaks)
@@ -184,6 +210,6 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {identified}{estimated}"
         f"{loop_note(scenario)}{outlook}"
-        f"{_touch_note(task, stiffness, mobility, period * (1 + late))}"
+        f"{_touch_note(task, stiffness, mobility, reaction_time(sampling, period))}"
     )
     return Completed(chosen, (note,))

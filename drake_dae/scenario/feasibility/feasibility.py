@@ -8,7 +8,6 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
@@ -19,10 +18,12 @@ from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
 from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
+from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts.parts import Poles, Tracking
@@ -48,6 +49,9 @@ _SHORTEST = 1e-6
 _SLACK = 1e-9
 """The excess over a limit that counts, in its unit: a start may be on the limit."""
 
+_Range = tuple[SignalRange, ...]
+_Ranges = tuple[_Range, _Range, _Range, _Range]
+
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
     """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
@@ -68,8 +72,12 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         structure = scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    if scenario.task is not None:  # The requirements of a task depend on the times of contact.
-        return Feasibility(analyze(model.dae), scenario.duration)
+    if scenario.task is not None:
+        needs = task_needs(advised(scenario, model, structure).scenario, model, structure)
+        behind = _in_the_way(needs, model, scene_graph)
+        return Feasibility(
+            analyze(model.dae), scenario.duration, *_ranges(needs, model), behind=behind, task=needs
+        )
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
     laws = None
@@ -115,18 +123,13 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         model.dae, reference=reference, times=times, start=start, exogenous=exogenous
     )
     motion = analysis.motion
-    behind: tuple[LinkBehind | Collision, ...] = ()
-    if motion is not None:
-        shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
-        behind = links_behind(model, *along, motion.parameters, shapes)
-        behind += collisions(shapes, *along)
     return Feasibility(
         analysis,
         scenario.duration,
+        *(((), (), (), ()) if motion is None else _ranges(motion, model)),
         is_resolved=is_resolved,
-        behind=behind,
+        behind=() if motion is None else _in_the_way(motion, model, scene_graph),
         laws=laws,
-        **_ranges(analysis, model),
     )
 
 
@@ -169,11 +172,22 @@ def sample_times(
             return times, is_resolved
 
 
-def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRange, ...]]:
-    """The signals of a `Feasibility` along the reference, by their names there."""
-    motion, dae, limits = analysis.motion, model.dae, Limits.of(model)
-    if motion is None or not motion.times.size:
-        return {}
+def _in_the_way(
+    motion: PinnedMotion | TaskNeeds, model: RobotModel, scene_graph: SceneGraph
+) -> tuple[LinkBehind | Collision, ...]:
+    """The links that move behind a surface, and those that collide."""
+    shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
+    behind: tuple[LinkBehind | Collision, ...] = links_behind(
+        model, *along, motion.parameters, shapes
+    )
+    return behind + collisions(shapes, *along)
+
+
+def _ranges(motion: PinnedMotion | TaskNeeds, model: RobotModel) -> _Ranges:
+    """The controls, joint forces, constraint forces and joints of a `Feasibility`."""
+    dae, limits = model.dae, Limits.of(model)
+    if not motion.times.size:
+        return (), (), (), ()
 
     def ranges(
         signals: Sequence[Signal], values: FloatArray, low: FloatArray, high: FloatArray
@@ -184,14 +198,13 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
     highest, reactions = model.control_limits, dae.force_signals
     least = np.array([-np.inf if limits.can_pull(signal) else 0.0 for signal in reactions])
     unlimited = np.full(least.size, np.inf)
-    ranges_of = {
-        "controls": ranges(dae.control_signals, motion.controls, -highest, highest),
-        "constraint_forces": ranges(reactions, _forces(dae, motion), least, unlimited),
-    }
+    controls = ranges(dae.control_signals, motion.controls, -highest, highest)
+    constraint_forces = ranges(reactions, _forces(dae, motion), least, unlimited)
+    joint_forces: tuple[SignalRange, ...] = ()
     if model.joint_force is not None:
         effort = model.links.effort_limits
         forces = _along(model, model.joint_force, motion.states)
-        ranges_of["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
+        joint_forces = ranges(model.links.actuator_signals, forces, -effort, effort)
     joints: tuple[SignalRange, ...] = ()
     if limits.state is not None:
         joints += ranges(dae.state_signals, motion.states, *limits.state)
@@ -199,11 +212,11 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
         loops = model.loop_joints
         states = _along(model, loops.state, motion.states)
         joints += ranges(loops.signals, states, *limits.loops)
-    ranges_of["joints"] = tuple(r for r in joints if np.isfinite(r.low) or np.isfinite(r.high))
-    return ranges_of
+    limited = tuple(r for r in joints if np.isfinite(r.low) or np.isfinite(r.high))
+    return controls, joint_forces, constraint_forces, limited
 
 
-def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
+def _forces(dae: DaeSystem, motion: PinnedMotion | TaskNeeds) -> FloatArray:
     """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
     if dae.sharing is None:
         return motion.constraint_inputs

@@ -12,6 +12,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.geometry.clearances import LinkBehind
 from drake_dae.robots.geometry.shapes import Collision
 from drake_dae.scenario.feasibility.springs import SpringLaws
+from drake_dae.scenario.feasibility.task import TaskNeeds
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
@@ -82,6 +83,7 @@ class Feasibility:
         behind: Links that move behind a contact surface, and links that collide; see `links_behind`
             and `collisions`.
         laws: The requirements of two laws for springs; None without springs or samples.
+        task: The requirements of a task, phase by phase; None without a task.
     """
 
     analysis: Analysis
@@ -93,6 +95,7 @@ class Feasibility:
     is_resolved: bool = True
     behind: tuple[LinkBehind | Collision, ...] = ()
     laws: SpringLaws | None = None
+    task: TaskNeeds | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -111,6 +114,7 @@ class Feasibility:
             *map(_pulling, _beyond(self.constraint_forces)),
             *map(_left, _beyond(self.joints)),
             *self.wrong_sides,
+            *(() if self.task is None else self.task.problems),
         )
 
     def __repr__(self) -> str:
@@ -136,6 +140,7 @@ class Feasibility:
             },
             "behind": [asdict(link) for link in self.behind],
             "spring_laws": None if self.laws is None else self.laws.to_dict(),
+            "task": None if self.task is None else self.task.to_dict(),
             "problems": list(self.problems),
         }
 
@@ -158,6 +163,8 @@ class Feasibility:
             parts.append([text])
         if self.laws is not None:
             parts.append(self.laws.lines)
+        if self.task is not None:
+            parts += [self.task.table(), self.task.lines]
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
         return parts
 

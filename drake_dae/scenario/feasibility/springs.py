@@ -126,7 +126,7 @@ def spring_laws(
     K, B = (np.array(entries).reshape(p, p) for entries in numbers(dae.nominal_state, values))
     mass, mobilities = _mobilities(links, structure)
     noise = velocity_noise(scenario, sampling.period)
-    late = sampling.delay + sampling.period / 2.0
+    late = sampling.mean_delay + sampling.period / 2.0
     swing = float(np.sqrt(np.max(np.linalg.eigvals((np.linalg.inv(B) + mobilities[0]) @ K).real)))
     pole = swing**2 * late / 20.0
     used = max(pole, _SLOWEST_POLES)

@@ -21,8 +21,8 @@ OWN = object()
 EXAMPLES = Path(__file__).parent / "examples.yaml"
 
 _ONE = (
-    r"(?:m/s\^2|m/s|kg m\^2|N m s/rad|N s/m|m/\(N s\)|N m/rad|N m/A|N/m|rad/s|1/s(?:\^mu_i|\^mu)?"
-    r"|N m|rad|degrees|ohm|Pa|s/m|H|m|s|N|kg)"
+    r"(?:m/s\^2|m/s|kg m\^2|N m s/rad|N s/m|m/\(N s\)|N m/rad|N m/A|N/m|N/s|rad/s"
+    r"|1/s(?:\^mu_i|\^mu)?|N m|rad|degrees|ohm|Pa|s/m|H|m|s|N|kg)"
 )
 _UNIT = re.compile(
     rf"(?:, |\bin )({_ONE}(?:(?:, \.\.\., | or | \(){_ONE}\)?)?)(?=[,.;:)\s]|$)"

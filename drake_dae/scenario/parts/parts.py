@@ -41,6 +41,9 @@ class MeasuredForce:
         bias: A constant error in N or N m, one number for all forces or one per force.
         noise_deviation: The standard deviation of the noise in N or N m, one number for all forces
             or one per force.
+        drift: The rate at which the bias changes, in N/s or N m/s, one number for all forces or one
+            per force. No law and no observer knows it; a task subtracts the bias that it finds
+            within `tare_time`, and feels what the drift adds from then on.
         seed: The seed of the noise.
         gain: Gbar of (59), a number or a matrix row by row; for rigid joints only.
     """
@@ -49,6 +52,7 @@ class MeasuredForce:
     sample_period: float = 0.0
     bias: Numbers = 0.0
     noise_deviation: Numbers = 0.0
+    drift: Numbers = 0.0
     seed: int = 0
     gain: Numbers = 0.0
     is_measured: ClassVar = True
@@ -59,13 +63,12 @@ class MeasuredForce:
 
     def sensor(self, size: int) -> ForceSensor | None:
         """The sensor of m = `size` forces."""
-        return ForceSensor(
-            size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
-        )
+        lags = self.time_constant, self.sample_period
+        return ForceSensor(size, *lags, self.bias, self.noise_deviation, self.drift)
 
     def begin(self, sensor: ForceSensor, context: Context) -> None:
         """Sets the sensor's errors in its context."""
-        sensor.set_errors(context, self.bias, self.noise_deviation)
+        sensor.set_errors(context, self.bias, self.noise_deviation, self.drift)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import check_whole_number
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
@@ -24,17 +25,35 @@ MOST_ON_THE_WAY = 10_000
 class Sampling:
     """A law samples its inputs at t_k = k period; its control acts from t_k + delay on.
 
+    With `jitter` some controls act later, with `loss` some do not arrive; then the drives hold the
+    last control that arrived. The law does not know it: its integrals and its references go on. An
+    observer uses the control at the drives. Measurements are never late and never lost.
+
     Attributes:
         period: T in s, positive.
         delay: The time to compute and send, in s, 0 or more; it may exceed a period, with several
             computations in progress.
+        jitter: A further delay in s, less than a period: each control has it with probability 1/2.
+            No other distribution of delays up to this one has a larger variance.
+        loss: The probability p at each sample that controls begin to be lost, less than 1.
+        burst: The number n of controls in a row that are lost each time; in all a share of
+            n p / (n p + 1 - p).
+        most_lost: The number of lost controls in a row at which the robot stops by itself, which
+            ends the run with an error; 20 for a Franka arm. None for never.
+        seed: The seed of jitter and loss in a scenario; in Python see `ClosedLoop.set_seed`.
 
     Raises:
-        ModelError: The period is not positive, or the delay is negative or very many periods.
+        ModelError: The period is not positive, the delay is negative or very many periods, or
+            another number is out of range.
     """
 
     period: float
     delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    burst: int = 1
+    most_lost: int | None = None
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if not (isfinite(self.period) and self.period > 0.0):
@@ -46,6 +65,30 @@ class Sampling:
                 f"a sampling's delay may be {MOST_ON_THE_WAY} periods at most, here "
                 f"{MOST_ON_THE_WAY * self.period:g} s, got {self.delay:g} s"
             )
+        if not 0.0 <= self.jitter < self.period:
+            raise ModelError(
+                f"a sampling's jitter must be 0 or more and less than its period of "
+                f"{self.period:g} s, got {self.jitter:g} s"
+            )
+        if not 0.0 <= self.loss < 1.0:
+            raise ModelError(
+                "a sampling's loss is a probability of 0 or more and less than 1, got "
+                f"{self.loss:g}"
+            )
+        check_whole_number("a sampling's burst", self.burst, 1)
+        if self.most_lost is not None:
+            check_whole_number("a sampling's most_lost", self.most_lost, 1)
+        check_whole_number("a sampling's seed", self.seed, 0)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether each control arrives, with the same delay."""
+        return not (self.jitter or self.loss)
+
+    @property
+    def mean_delay(self) -> float:
+        """The mean delay of the controls that arrive, in s."""
+        return self.delay + self.jitter / 2.0
 
     @property
     def whole_periods(self) -> int:
@@ -61,7 +104,7 @@ class Sampling:
     @property
     def late_samples(self) -> int:
         """The largest number of samples until a sampled value acts."""
-        return ceil(self.delay / self.period - _SAME)
+        return ceil((self.delay + self.jitter) / self.period - _SAME)
 
 
 @checked(ModelError)
@@ -159,12 +202,12 @@ class ControlHold(LeafSystem):
             function = ca.Function("held", [rows, control], [ca.vertcat(*parts)])
             return Computation(function, (HELD, "control"), (HELD,))
 
-        now, later = rows[:size], rows[size:]
+        now, later = rows[:size, 0], rows[size:, 0]
         period, rest = self.sampling.period, self.sampling.rest
         updates = [Update(computation(later, control), period, 0.0, True)]
         if rest:
-            read = computation(now, later[size:], control)
-            act = ca.Function("act", [rows], [ca.vertcat(later[:size], later)])
+            read = computation(now, later[size:, 0], control)
+            act = ca.Function("act", [rows], [ca.vertcat(later[:size, 0], later)])
             updates = [
                 Update(read, period, 0.0, True),
                 Update(Computation(act, (HELD,), (HELD,)), period, rest, True),

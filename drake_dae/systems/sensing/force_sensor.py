@@ -16,6 +16,7 @@ from drake_dae.systems.blocks.traced import (
     HELD,
     PARAMETERS,
     STATE,
+    TIME,
     Block,
     Computation,
     Update,
@@ -28,7 +29,8 @@ from drake_dae.trace.functions import TracedFunction
 class ForceSensor(DifferentiableSystem):
     """A force sensor with state, so that it can close a loop around a rigid robot:
 
-        time_constant * y' = force - y,    measured_force = y + bias + noise_deviation * noise,
+        time_constant * y' = force - y,
+        measured_force = y + bias + drift * t + noise_deviation * noise,
 
     and, if it samples, measured_force is held between samples. With rigid joints the constraint
     force has direct feedthrough from the control; reading it directly would close an algebraic
@@ -42,7 +44,7 @@ class ForceSensor(DifferentiableSystem):
     Output port:
         measured_force: The measured force, shape (m,); no direct feedthrough from `force`.
 
-    The context holds bias and noise_deviation as numeric parameters; see `set_errors`.
+    The context has bias, noise_deviation and drift as numeric parameters; see `set_errors`.
 
     Args:
         size: The number of forces, m.
@@ -50,10 +52,11 @@ class ForceSensor(DifferentiableSystem):
         sample_period: The time between samples in s; 0 for none, then it must lag.
         bias: A constant error in N, a number or shape (m,).
         noise_deviation: The standard deviation of the noise in N, a number or shape (m,).
+        drift: The rate at which the bias changes in N/s, a number or shape (m,).
 
     Attributes:
-        time_constant, sample_period, bias, noise_deviation: The arguments, the last two as arrays
-            of shape (m,).
+        time_constant, sample_period, bias, noise_deviation, drift: The arguments, the last three as
+            arrays of shape (m,).
 
     Raises:
         ModelError: A number is negative, or there is neither lag nor sampling.
@@ -70,31 +73,37 @@ class ForceSensor(DifferentiableSystem):
         sample_period: float = 0.0,
         bias: ArrayLike = 0.0,
         noise_deviation: ArrayLike = 0.0,
+        drift: ArrayLike = 0.0,
     ) -> None:
         super().__init__()
         self.set_name("force_sensor")
         self.time_constant = float(time_constant)
         self.sample_period = float(sample_period)
         try:
-            errors = [np.asarray(value, dtype=float) for value in (bias, noise_deviation)]
-            self.bias, self.noise_deviation = (np.broadcast_to(value, (size,)) for value in errors)
+            errors = [np.asarray(value, dtype=float) for value in (bias, noise_deviation, drift)]
+            self.bias, self.noise_deviation, self.drift = (
+                np.broadcast_to(value, (size,)) for value in errors
+            )
         except ValueError:
             raise ModelError(
-                f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
-                f"{bias!r} and {noise_deviation!r}"
+                f"a ForceSensor's bias, noise_deviation and drift are numbers or shape ({size},), "
+                f"got {bias!r}, {noise_deviation!r} and {drift!r}"
             ) from None
         positive = [self.time_constant, self.sample_period, *self.noise_deviation]
-        if min(positive) < 0 or not np.all(np.isfinite([*positive, *self.bias])):
+        numbers = [*positive, *self.bias, *self.drift]
+        if min(positive) < 0 or not np.all(np.isfinite(numbers)):
             raise ModelError(
                 "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
-                f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
+                f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}; its "
+                f"bias and drift must be finite, got {bias!r}, {drift!r}"
             )
         if not (self.time_constant or self.sample_period):
             raise ModelError(
                 "a ForceSensor needs a time_constant or a sample_period: without state it would "
                 "close an algebraic loop"
             )
-        self.DeclareNumericParameter(BasicVector(np.concatenate([self.bias, self.noise_deviation])))
+        errors = [self.bias, self.noise_deviation, self.drift]
+        self.DeclareNumericParameter(BasicVector(np.concatenate(errors)))
         self._force_port = self.DeclareVectorInputPort("force", size)
         self._noise_port = None
         if self.noise_deviation.any():
@@ -107,34 +116,41 @@ class ForceSensor(DifferentiableSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
             sources = {self.xd_ticket()}
         else:
-            sources = state_tickets(self) | {self.all_parameters_ticket()}
+            sources = state_tickets(self) | {self.all_parameters_ticket(), self.time_ticket()}
             if self._noise_port is not None:
                 sources.add(self.input_port_ticket(self._noise_port.get_index()))
         self.DeclareVectorOutputPort("measured_force", size, port_value(self._output), sources)
 
-    def set_errors(self, context: Context, bias: ArrayLike, noise_deviation: ArrayLike) -> None:
-        """Sets bias and noise_deviation in a context, numbers or shape (m,).
+    def set_errors(
+        self,
+        context: Context,
+        bias: ArrayLike,
+        noise_deviation: ArrayLike,
+        drift: ArrayLike = 0.0,
+    ) -> None:
+        """Sets bias, noise_deviation and drift in a context, numbers or shape (m,).
 
         Raises:
             ModelError: They do not fit, or there is noise and the sensor was made without.
         """
         self.check_context(context)
         size = self._force_port.size()
-        other = ForceSensor(size, self.time_constant, self.sample_period, bias, noise_deviation)
+        lags = self.time_constant, self.sample_period
+        other = ForceSensor(size, *lags, bias, noise_deviation, drift)
         if other.noise_deviation.any() and self._noise_port is None:
             raise ModelError("a ForceSensor that was made without noise has no port for it")
-        errors = np.concatenate([other.bias, other.noise_deviation])
+        errors = np.concatenate([other.bias, other.noise_deviation, other.drift])
         context.get_mutable_numeric_parameter(0).SetFromVector(errors)
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
-        """Sets the steady state of the sensor for a constant force, shape (m,), without noise."""
+        """Sets the state of the sensor for a constant force, shape (m,), without noise and lag."""
         self.check_context(context)
         value = vector("force", force, self._force_port.size())
         if self.time_constant:
             context.SetContinuousState(value)
         if self.sample_period:
-            bias = context.get_numeric_parameter(0).value()[: value.size]
-            context.SetDiscreteState(self._held, value + bias)
+            bias, _, drift = np.split(context.get_numeric_parameter(0).value(), 3)
+            context.SetDiscreteState(self._held, value + bias + drift * context.get_time())
 
     def largest_stable_gain(self) -> float:
         """The largest gain Gbar of (59) for which a rigid robot's force error decays.
@@ -169,10 +185,10 @@ class ForceSensor(DifferentiableSystem):
             value = context.get_continuous_state_vector().CopyToVector()
         else:
             value = self._force_port.Eval(context)
-        bias, deviation = np.split(context.get_numeric_parameter(0).value(), 2)
+        bias, deviation, drift = np.split(context.get_numeric_parameter(0).value(), 3)
         if self._noise_port is not None:
             value = value + deviation * self._noise_port.Eval(context)
-        return value + bias
+        return value + bias + drift * context.get_time()
 
     def _sample(self, context: Context, state: object) -> None:
         state.set_value(self._held, self._measured(context))  # type: ignore[attr-defined]
@@ -185,13 +201,13 @@ class ForceSensor(DifferentiableSystem):
     def traced(self) -> Block:
         size = self._force_port.size()
         force, y, noise = (ca.SX.sym(name, size) for name in ("force", "y", "noise"))
-        errors = ca.SX.sym("errors", 2 * size)
-        sources = [STATE if self.time_constant else "force", PARAMETERS]
-        inputs, measured = [force, errors], force
+        errors, time = ca.SX.sym("errors", 3 * size), ca.SX.sym("time")
+        sources = [STATE if self.time_constant else "force", PARAMETERS, TIME]
+        inputs, measured = [force, errors, time], force
         if self._noise_port is not None:
             sources, inputs = [*sources, "noise"], [*inputs, noise]
-            measured = measured + errors[size:] * noise
-        measured = measured + errors[:size]
+            measured = measured + errors[size : 2 * size] * noise
+        measured = measured + errors[:size] + errors[2 * size :] * time
         measurement = ca.Function("measured_force", inputs, [measured])
         computations, updates = [], []
         if self.time_constant:
@@ -214,7 +230,7 @@ class ForceSensor(DifferentiableSystem):
             )
         size = self._force_port.size()
         force, y, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
-        errors = ca.SX.sym("errors", 2 * size)
+        errors, time = ca.SX.sym("errors", 3 * size), ca.SX.sym("time")
         rate = TracedFunction(
             "force sensor",
             {"force": force, "state": y},
@@ -223,7 +239,8 @@ class ForceSensor(DifferentiableSystem):
         inputs, measured = {"state": y}, y
         if self._noise_port is not None:
             inputs["noise"] = noise
-            measured = measured + errors[size:] * noise
-        inputs["parameters"] = errors
-        output = TracedFunction("measured force", inputs, {"value": measured + errors[:size]})
+            measured = measured + errors[size : 2 * size] * noise
+        inputs |= {"parameters": errors, "time": time}
+        measured = measured + errors[:size] + errors[2 * size :] * time
+        output = TracedFunction("measured force", inputs, {"value": measured})
         return {"derivative": TracedFormula(rate), "measured_force": TracedFormula(output)}

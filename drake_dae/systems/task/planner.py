@@ -273,6 +273,11 @@ def _rates(
                 "along outputs in m"
             )
         rates[names.index(name)] = rate
+    if task.plan.phases[index].speed_of_approach and not rates[contact.main] < 0.0:
+        raise ModelError(
+            f"{task.plan.where(index)}: direction: it does not lead to the surface; give it a "
+            f"negative component of '{names[contact.main]}'"
+        )
     if not closed:
         rates[contact.others] = rates[contact.main]
     return rates

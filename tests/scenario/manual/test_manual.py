@@ -50,6 +50,7 @@ PURE = {
     ("!SpringCascade", "damping"),
     ("!Adaptive", "parameters"),  # In the unit of each, squared, per J.
     ("!MeasuredForce", "gain"),
+    ("Sampling", "loss"),
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),

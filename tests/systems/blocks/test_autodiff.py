@@ -180,7 +180,7 @@ def test_an_adaptive_controller():
 
 
 def test_a_force_sensor():
-    sensor = ForceSensor(2, time_constant=0.05, bias=[1.0, -2.0], noise_deviation=0.3)
+    sensor = ForceSensor(2, 0.05, bias=[1.0, -2.0], noise_deviation=0.3, drift=[0.2, 0.1])
     check_gradient(sensor, {"force": [3.0, 4.0], "noise": [0.1, 0.2]}, [1.0, 2.0])
 
 

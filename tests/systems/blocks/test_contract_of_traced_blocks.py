@@ -48,6 +48,7 @@ from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
+from drake_dae.systems.sensing.link import ControlLink
 
 
 def measured_law(integral, gain=0.5):
@@ -184,6 +185,9 @@ BLOCKS = {
     "LawSwitch": lambda: LawSwitch(2),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
+    "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
+    "ControlLink": lambda: ControlLink(2, 3, Sampling(0.01, loss=0.3, burst=2, most_lost=20)),
+    "ControlLink of one control": lambda: ControlLink(1, 2, Sampling(0.01, loss=0.3)),
     "DisturbanceObserver": lambda: observer(least_force=1e-3),
     "DisturbanceObserver of a contact that sticks": lambda: observer(
         least_speed=1e3, least_force=1e-3
@@ -214,7 +218,8 @@ BLOCKS = {
     "PathGovernor": lambda: governor(0.0),
     "PathGovernor with samples": lambda: governor(0.01),
     "FeasibleControl": lambda: FeasibleControl(arm("two_link").structure, narrow()),
-    "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2]),
+    "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
+    "ForceSensor that drifts": lambda: ForceSensor(2, 0.02, drift=[0.4, -0.3]),
 }
 
 

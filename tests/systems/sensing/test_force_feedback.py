@@ -296,6 +296,34 @@ def test_noise_has_its_deviation_and_its_seed():
     np.testing.assert_allclose(np.std(first, axis=1), [0.5, 2.0], rtol=0.06)
 
 
+def test_a_bias_that_drifts_moves_the_force_by_the_closed_form():
+    """tau y' = lambda - y, lambda = (1 + G) r - G (y + d t): after the transient
+
+    lambda - r = -G d / (1 + G) (t + tau G / (1 + G)), with the right model and at rest.
+    """
+    gain, lag, rate = 4.0, 0.05, 0.5
+    sensor = ForceSensor(1, lag, drift=rate)
+    arms = arm("two_link")
+    time, errors, *_ = run(arms.model, HOLD, measured=True, gain=gain, sensor=sensor, wrong=1.0)
+    share = gain / (1.0 + gain)
+    # exp(-(1 + G) t / tau) is e^-100 there; the projection leaves 1e-9 N.
+    late = time > 1.0
+    wanted = -share * rate * (time[late] + lag * share)
+    np.testing.assert_allclose(errors[late, 1], wanted, atol=1e-6)
+    assert np.abs(wanted[-1]) > 1.0
+    np.testing.assert_allclose(errors[late, 0], 0.0, atol=1e-8)
+
+
+def test_the_drift_of_a_sensor_is_set_in_a_context():
+    sensor = ForceSensor(2, sample_period=0.1)
+    context = sensor.CreateDefaultContext()
+    context.SetTime(3.0)
+    sensor.set_errors(context, 1.0, 0.0, [0.5, -0.5])
+    sensor.set_force(context, [10.0, 20.0])
+    measured = sensor.GetOutputPort("measured_force").Eval(context)
+    np.testing.assert_allclose(measured, [12.5, 19.5], atol=1e-14)
+
+
 def test_sensor_has_no_direct_feedthrough_from_force():
     for sensor in (ForceSensor(1, 0.01), ForceSensor(1, 0.0, 0.01), ForceSensor(1, 0.01, 0.01)):
         assert not sensor.HasAnyDirectFeedthrough()

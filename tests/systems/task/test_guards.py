@@ -108,14 +108,17 @@ def test_a_move_feels_a_wall_by_its_force_alone():
     assert [change.phase for change in changes] == ["feel", "feel", "Press", "done"]
     assert_allclose([change.time for change in changes[:3]], [0.0, first, touch], atol=1e-5)
     assert changes[1].reason == "feel has moved 0.015 m without a force of 0.5 N, retry 1 of 1"
-    up = GuardedMove(0.03, SPEED, direction={"tool.z": 3.0}, over=OVER, on_failure="Retreat")
+    slanted = {"tool.z": 3.0, "wall.distance": -0.4}
+    up = GuardedMove(0.03, SPEED, direction=slanted, over=OVER, on_failure="Retreat")
     loop, context, changes = ended(
         [up, PRESS, Release(over=0.1), Retreat(0.02, over=0.1)], FAR, 1.0
     )
     assert [change.phase for change in changes] == ["GuardedMove", "Retreat", "done"]
     record = loop.record(context)
     row = np.searchsorted(record.time, changes[1].time)
-    assert_allclose(record["controlled_output"][row, [0, 2]], [0.33, FAR], atol=1e-6)
+    share = 0.03 / np.hypot(3.0, 0.4)
+    moved = [0.3 + 3.0 * share, FAR - 0.4 * share]
+    assert_allclose(record["controlled_output"][row, [0, 2]], moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("comes", [True, False])

@@ -76,7 +76,7 @@ class GuardedMove(Phase):
         return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
-        if now.time >= self.within:
+        if self.has_waited(now):
             return super().lateness(now, contact_force)
         return f"{self.name} has moved {now.travel:.3g} m without {self.awaited(contact_force)}"
 

@@ -177,6 +177,10 @@ class Phase(ABC):
         """A number that is positive until the phase is late; an expression if `now` has them."""
         return self.within - now.time if self.within < inf else inf
 
+    def has_waited(self, now: Moment) -> bool:
+        """Whether it lasts as long as it may; the time of a guard is found a little early."""
+        return now.time > self.within - 1e-6
+
     def lateness(self, now: Moment, contact_force: float) -> str:
         """The reason why it is late, for messages."""
         return f"{self.name} has waited {self.within:g} s for {self.awaited(contact_force)}"

@@ -75,7 +75,7 @@ class Search(Phase):
         return remaining
 
     def lateness(self, now: Moment, contact_force: float) -> str:
-        if now.time >= self.within:
+        if self.has_waited(now):
             return super().lateness(now, contact_force)
         return f"{self.name} has come to {self.radius:g} m without {self.awaited(contact_force)}"
 

@@ -1,0 +1,356 @@
+"""A task before it runs: its requirements phase by phase, by a run of the law's model."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from math import inf, isfinite, pi
+from typing import Any
+
+import numpy as np
+
+from drake_dae.analysis.tables import Table, digits
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.states.margins import RankMargin, find_margin
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Indices
+from drake_dae.errors import SimulationError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.advice.advice import reaction_time, touch_peak
+from drake_dae.scenario.build import build_loop
+from drake_dae.scenario.parts.parts import MeasuredForce
+from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_scenario
+from drake_dae.simulation.job import JobOutcome, judge_job
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.summary import Limits
+from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.task.phases import Phase
+
+_STATES = 10
+"""The number of states of a phase at which margins are taken."""
+
+
+@dataclass(frozen=True)
+class PhaseNeeds:
+    """The requirements of one phase.
+
+    Attributes:
+        name: The phase.
+        begin, end: Its start and end, in s.
+        drive, share: The drive that is closest to its limit, and the largest share of the limit;
+            "" and 0 without limits.
+        joint, room: The joint that is closest to a limit, and the smallest distance, in its unit;
+            "" and infinity without limits.
+        force: The largest force of the contact, in N.
+        margin: The smallest margin of the matrix that the active law inverts, B(x); 0 if singular.
+        is_singular: Whether that is singular.
+    """
+
+    name: str
+    begin: float
+    end: float
+    drive: str
+    share: float
+    joint: str
+    room: float
+    force: float
+    margin: float
+    is_singular: bool
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A touch of a task.
+
+    Attributes:
+        phase: The phase that touches.
+        time: In s.
+        speed: The speed towards the surface, in m/s.
+        mass: The mass at the tool along the normal, 1 / A, in kg.
+        impulse: The impulse that stops it, speed / A, in N s.
+        peak: The largest expected force on the scenario's plant, in N; None for ideal contact.
+    """
+
+    phase: str
+    time: float
+    speed: float
+    mass: float
+    impulse: float
+    peak: float | None = None
+
+    def __str__(self) -> str:
+        text = (
+            f"{self.phase} touches at {self.time:.4g} s with {self.speed:.3g} m/s; the mass at the "
+            f"tool is {self.mass:.3g} kg: "
+        )
+        if self.peak is None:
+            return f"{text}an impulse of {self.impulse:.3g} N s"
+        return f"{text}at most {self.peak:.3g} N are expected"
+
+
+@dataclass(frozen=True, eq=False)
+class TaskNeeds:
+    """The requirements of a task, in an ideal contact where the law's model has it.
+
+    Attributes:
+        record: The record of the run.
+        parameters: The values of all parameters at its times, shape (k, P).
+        phases: The requirements of each phase, in order.
+        touches: The touches.
+        outcome: The end of the task in words.
+        problems: The problems, one text each.
+    """
+
+    record: Record
+    parameters: FloatArray
+    phases: tuple[PhaseNeeds, ...]
+    touches: tuple[Touch, ...]
+    outcome: str
+    problems: tuple[str, ...]
+
+    @property
+    def times(self) -> FloatArray:
+        """The times of the run in s, shape (k,)."""
+        return self.record.time
+
+    @property
+    def states(self) -> FloatArray:
+        """x at these times, shape (k, n)."""
+        return self.record["state"]
+
+    @property
+    def controls(self) -> FloatArray:
+        """u at these times, shape (k, p)."""
+        return self.record["control"]
+
+    @property
+    def constraint_inputs(self) -> FloatArray:
+        """The constraint forces at these times, shape (k, m)."""
+        return self.record["constraint_force"]
+
+    def table(self) -> Table:
+        """A row for each phase."""
+        head = ["phase", "from [s]", "to [s]", "force [N]", "margin", "drive", "", "joint", ""]
+        rows = []
+        for needs in self.phases:
+            drive = f"{needs.share:.0%}" if needs.drive else ""
+            room = f"{needs.room:.3g} left" if isfinite(needs.room) else ""
+            numbers = [digits(number) for number in (needs.begin, needs.end, needs.force)]
+            texts = [f"{needs.margin:.2g}", drive, needs.drive, room, needs.joint]
+            rows.append([needs.name, *numbers, *texts])
+        return Table(head, rows)
+
+    @property
+    def lines(self) -> list[str]:
+        """The touches and the end of the task."""
+        return [*map(str, self.touches), self.outcome]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The requirements as plain data; None for an infinite number."""
+        rows = [asdict(needs) for needs in self.phases]
+        for row in rows:
+            row["room"] = row["room"] if isfinite(row["room"]) else None
+        return {
+            "phases": rows,
+            "touches": [asdict(touch) for touch in self.touches],
+            "outcome": self.outcome,
+        }
+
+
+def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> TaskNeeds:
+    """Runs a task by the law's model in ideal contact, and collects its requirements.
+
+    Args:
+        scenario: The completed scenario with gains, from `advised`.
+        model: Its robot.
+        structure: The structure of the model's system.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    from drake_dae.scenario.rolled import roll_scenario
+
+    ideal = _ideal(scenario)
+    loop = build_loop(ideal, model, structure)
+    controller, context = loop.controller, start_scenario(ideal, loop)
+    assert isinstance(controller, TaskController)
+    found = roll_scenario(ideal, loop, context)
+    record, changes = found.record, loop.changes(found.context or context)
+    phases = _phases(record, changes, controller, model)
+    touches, trips = _touches(record, changes, controller, scenario)
+    plan = controller.task.plan.phases
+    problems = [
+        f"{needs.name} passes a singular configuration, after {needs.begin:.4g} s"
+        for needs in phases
+        if needs.is_singular
+    ]
+    problems += trips
+    outcome, failed = _outcome(record, changes, found.failure)
+    if failed and not (changes and _feels_shape(plan, changes)):
+        problems.append(outcome)
+    outcome = f"In the law's model {outcome}."
+    parameters = np.tile(model.dae.parameter_values, (record.time.size, 1))
+    return TaskNeeds(record, parameters, phases, tuple(touches), outcome, tuple(problems))
+
+
+def _period(scenario: Scenario) -> float:
+    material, sampling = scenario.plant.material, scenario.sampling
+    if sampling is not None:
+        return sampling.period
+    return 0.0 if material is None else material.time_step
+
+
+def _ideal(scenario: Scenario) -> Scenario:
+    """The scenario with the plant of the law's model, exact sensors and an exact link."""
+    force, sampling, period = scenario.force_feedback, scenario.sampling, _period(scenario)
+    if isinstance(force, MeasuredForce):
+        force = replace(force, bias=0.0, noise_deviation=0.0, drift=0.0)
+    if sampling is not None:
+        sampling = replace(sampling, jitter=0.0, loss=0.0)
+    elif period:
+        sampling = Sampling(period)
+    return replace(
+        scenario,
+        plant=IdealConstraints(),
+        plant_parameters={},
+        plant_payloads=[],
+        plant_disturbances=[],
+        force_feedback=force,
+        sampling=sampling,
+        encoders=None,
+        observer=None,
+        saturation=False,
+        may_diverge=True,
+    )
+
+
+def _outcome(
+    record: Record, changes: Sequence[PhaseChange], failure: SimulationError | None
+) -> tuple[str, bool]:
+    """The end of the task in words, and whether it failed or did not end."""
+    if failure is not None:
+        return str(failure), True
+    empty = np.zeros_like(record["tracking_error"])
+    job = judge_job(record, empty, changes=changes)
+    texts = [*job.problems, *job.remarks]
+    return texts[0], job.outcome is not JobOutcome.GOOD
+
+
+def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:
+    """Whether the last phase that failed searches a shape, which the law's model does not have."""
+    places = [change.place for change in changes if change.place < len(plan)]
+    return bool(places) and any(plan[place].is_relative for place in places)
+
+
+def _rows(record: Record, begin: float, end: float) -> Indices:
+    """The indices of the rows of a phase; at the time of a change a row has the values before."""
+    first = int(np.searchsorted(record.time, begin, side="right")) if begin > record.time[0] else 0
+    last = int(np.searchsorted(record.time, end, side="right"))
+    return np.arange(first, max(last, min(first + 1, record.time.size)))
+
+
+def _phases(
+    record: Record,
+    changes: Sequence[PhaseChange],
+    controller: TaskController,
+    model: RobotModel,
+) -> tuple[PhaseNeeds, ...]:
+    limits, needs = Limits.of(model), []
+    ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
+    for change, end in zip(changes, ends, strict=True):
+        rows = _rows(record, change.time, end)
+        if not rows.size or (change.place >= len(controller.task.plan.phases)):
+            continue
+        law = controller.law if change.in_contact else controller.free_law
+        margin = _margin(law.structure, record["state"][rows])
+        needs.append(
+            PhaseNeeds(
+                change.phase,
+                change.time,
+                end,
+                *_nearest_drive(record, rows, limits),
+                *_nearest_joint(record, rows, limits),
+                float(np.max(_contact_force(record, controller)[rows], initial=0.0)),
+                margin.relative,
+                margin.is_singular,
+            )
+        )
+    return tuple(needs)
+
+
+def _contact_force(record: Record, controller: TaskController) -> FloatArray:
+    forces = list(controller.contact.forces)
+    return record["constraint_force"][:, forces].sum(axis=1)
+
+
+def _margin(structure: Structure, states: FloatArray) -> RankMargin:
+    chosen = states[np.unique(np.linspace(0, len(states) - 1, _STATES).astype(int))]
+    return find_margin(Samples(structure.manifold, chosen), structure.control_matrix)
+
+
+def _nearest_drive(record: Record, rows: Indices, limits: Limits) -> tuple[str, float]:
+    if limits.control is None or not np.isfinite(limits.control).any():
+        return "", 0.0
+    shares = np.max(np.abs(record["control"][rows]), axis=0) / limits.control
+    index = int(np.argmax(shares))
+    return record.signals["control"].signals[index].name, float(shares[index])
+
+
+def _nearest_joint(record: Record, rows: Indices, limits: Limits) -> tuple[str, float]:
+    if limits.state is None:
+        return "", inf
+    lower, upper = limits.state
+    values = record["state"][rows][:, : lower.size]
+    signals = record.signals["state"].signals
+    room = np.minimum(values - lower, upper - values).min(axis=0)
+    # Positions; velocities have another unit.
+    room[[index for index in range(room.size) if signals[index].unit.endswith("/s")]] = inf
+    index = int(np.argmin(room))
+    return (signals[index].name, float(room[index])) if isfinite(room[index]) else ("", inf)
+
+
+def _touches(
+    record: Record,
+    changes: Sequence[PhaseChange],
+    controller: TaskController,
+    scenario: Scenario,
+) -> tuple[list[Touch], list[str]]:
+    """The touches, and the guards of the force that they may trip."""
+    touches, problems, material = list[Touch](), list[str](), scenario.plant.material
+    task, forces = controller.task, list(controller.contact.forces)
+    for before, after in pairwise(changes):
+        if not after.in_contact > before.in_contact or before.place >= task.plan.last:
+            continue
+        phase = task.plan.phases[before.place]
+        met = [event.time for event in record.events if before.time < event.time <= after.time]
+        # The last row before the impact, after which the rate is zero.
+        last = max(int(np.searchsorted(record.time, [*met, after.time][0])) - 1, 0)
+        # The fastest point of a face, and the one with most mass.
+        speed = max(float(np.max(-record["distance"][last, len(forces) :])), 0.0)
+        matrix = controller.law.structure.constraint_matrix(record["state"][last])
+        mobility = float(np.min(np.diag(matrix)[forces]))
+        touch = Touch(
+            before.phase, float(record.time[last]), speed, 1.0 / mobility, speed / mobility
+        )
+        if material is not None:
+            felt = phase.felt(task.contact_force)
+            stiffness = material.stiffness_at(felt)
+            late = reaction_time(scenario.sampling, material.time_step)
+            peak = touch_peak(felt, speed, stiffness, mobility, late)
+            touch = replace(touch, peak=peak)
+            lasts = pi / (stiffness * mobility) ** 0.5
+            near = [phase, *task.plan.phases[after.place : task.plan.last][:1]]
+            problems += [
+                f"{before.phase} may touch with {peak:.3g} N, and a guard of {guarded.name} ends "
+                f"it at {guard.most:g} N: touch more slowly, or give the guard more samples"
+                for guarded in near
+                for guard in guarded.guards
+                if guard.of == "force" and guard.most < peak
+                if (guard.samples - 1) * _period(scenario) < lasts
+            ]
+        touches.append(touch)
+    return touches, problems
