@@ -26,7 +26,8 @@ class Insert(Phase):
     disturbances, which would cancel what the hole exerts.
 
     The phase fails if the distance falls behind its reference by more than `lag`, as where the tool
-    jams, or sits on the face beside the hole. The push along the hole is then at most m p^2 lag.
+    jams, or sits on the face beside the hole. The push along the hole is then at most m (p^2 lag +
+    2 p speed).
 
     Attributes:
         depth: The depth of the tool below the surface of the model at which it ends, in m.

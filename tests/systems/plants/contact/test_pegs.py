@@ -77,7 +77,8 @@ def test_a_plate_has_no_hydroelastic_contact():
 
 
 SLIDES = (
-    "constraints.0.surface=!Plate {point: [1.2, 0, 0.3], normal: [-1, 0, 0], half_widths: [1, 0.05]}",
+    "constraints.0.surface=!Plate {point: [1.2, 0, 0.3], normal: [-1, 0, 0], "
+    "half_widths: [1, 0.05]}",
     "constraint_damping=!Poles {all: [-20.0]}",
     "gains.all=[-25.0]",
     "references={tool.z: !PointToPoint {start: [0.3], end: [0.42], end_time: 0.6}, wall.force: 20}",
