@@ -3,7 +3,7 @@
 import jsonschema
 import numpy as np
 import pytest
-from runs import DEAR, scenario_validator
+from runs import DEAR, IN_CONTACT, scenario_validator
 from scenario_texts import run
 
 from drake_dae import (
@@ -72,7 +72,7 @@ def test_actuated_scenario_has_the_predicted_error(name):
 
 # Drake's own contact, and one that opens, have suites of their own: the former touches without a
 # force at the start.
-IDEAL = [name for name in shipped_scenarios() if not name.startswith("wall_")]
+IDEAL = [name for name in shipped_scenarios() if not name.startswith(IN_CONTACT)]
 
 
 @pytest.mark.slow

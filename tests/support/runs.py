@@ -50,6 +50,13 @@ DEAR = (
 """Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
 
 
+IN_CONTACT = ("wall_", "peg_", "edge_")
+"""Prefixes of the names of scenarios with compliant contacts, or contacts that open."""
+
+TASKS = ("wall_polish", "wall_guarded", "peg_in_hole", "edge_search")
+"""The scenarios with a task, which has two laws."""
+
+
 def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
     """The shipped scenarios except for some: all slow but the first one, the dear ones thorough."""
     marks = {

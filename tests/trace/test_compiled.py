@@ -13,7 +13,7 @@ import weakref
 import casadi as ca
 import numpy as np
 import pytest
-from runs import each_scenario, some
+from runs import IN_CONTACT, each_scenario, some
 
 from drake_dae import DaeSystem, build_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
@@ -103,7 +103,7 @@ def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
 
 
 # The dynamics of walls are Drake's, or those of modes.
-SLOW = some(each_scenario(lambda name: name.startswith("wall_")))
+SLOW = some(each_scenario(lambda name: name.startswith(IN_CONTACT)))
 
 
 OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall")

@@ -7,7 +7,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from runs import each_scenario, scenario, some
+from runs import TASKS, each_scenario, scenario, some
 
 from drake_dae import ClosedLoop, build_scenario, export_code
 from drake_dae.cli import main
@@ -40,7 +40,7 @@ def outcome(folder, name, flags: str = "-O1") -> "subprocess.CompletedProcess[st
 @needs_compiler
 @pytest.mark.parametrize(
     "name",
-    some(each_scenario(lambda name: name in ("wall_polish", "wall_guarded"))),  # Two laws.
+    some(each_scenario(lambda name: name in TASKS)),
 )
 def test_the_test_program_passes(name, tmp_path):
     """To 1e-12 of the largest value in each vector, as the program says itself."""

@@ -3,7 +3,7 @@
 First it predicts the largest contact force. Then it prints for each run how its task ended, when,
 and the largest contact force, and last all runs together.
 
-    python examples/insertions.py [--runs COUNT] [--first SEED] [--set KEY=VALUE] [scenario]
+    python examples/insertions [--runs COUNT] [--first SEED] [--set KEY=VALUE] [scenario]
 """
 
 import argparse
@@ -47,7 +47,9 @@ def insert(scenario: str, changes: Sequence[str]) -> tuple[str, float, float]:
         while context.get_time() < LONGEST and not outcome.startswith(("done", "held")):
             config = SimulatorConfig(start_time=context.get_time())
             # Whether errors grow cannot be judged from the start of a part of a run.
-            dd.simulate(loop.diagram, context, 0.5, config, may_diverge=True)
+            run = dd.simulate(loop.diagram, context, 0.5, config, may_diverge=True)
+            if run.interrupted is not None:
+                raise SystemExit(f"ended by {run.interrupted.name}")
             last = loop.changes(context)[-1]
             outcome, time = f"{last.phase}, {last.reason}", last.time
     except dd.DrakeDaeError as error:
