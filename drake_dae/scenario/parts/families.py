@@ -95,7 +95,7 @@ DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)
 Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 _Pegs = Annotated[
-    tuple[Annotated[contact_material.Peg, Form()], ...], pydantic.Strict(False)
+    tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)
 ]  # In data a tuple is a list.
 Plant = Annotated[
     plants.IdealConstraints

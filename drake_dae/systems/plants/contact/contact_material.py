@@ -18,6 +18,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.surface import Vector, axes_along, unit_vector
 
 FRICTION = Signal("plant.friction")
 """The coefficient of friction of all contacts, among `PointMaterial.signals`."""
@@ -83,17 +84,18 @@ class PointMaterial:
 @checked(ModelError)
 @dataclass(frozen=True)
 class Peg:
-    """A round peg at a contact: rings of balls around the normal of its surface.
+    """A round peg at a contact: rings of balls around an axis of the frame of its constraint.
 
-    In the nominal configuration of the robot the peg is normal to the surface, and the middle of
-    its end is the point of the constraint. The first ring is its end, and the last one is `length`
-    behind it. The radius of the balls, `PointMaterial.radius`, rounds its edges. Each ball has the
-    stiffness of the material, so a peg that touches with k balls is k times as stiff.
+    The middle of its end is the point of the constraint. The first ring is its end, and the last
+    one is `length` behind it. The radius of the balls, `PointMaterial.radius`, rounds its edges.
+    Each ball has the stiffness of the material, so a peg that touches with k balls is k times as
+    stiff.
 
     Attributes:
         constraint: The name of the constraint at which it touches.
         radius: Its radius, m.
         length: The distance from its end to the far side of its last ring, m.
+        axis: The direction from its last ring to its end in the frame, of any length, shape (3,).
         rings: The number of rings, 2 or more.
         balls: The number of balls in each ring, 3 or more.
 
@@ -104,12 +106,14 @@ class Peg:
     constraint: str
     radius: float
     length: float
+    axis: Vector = (0.0, 0.0, 1.0)
     rings: int = 3
     balls: int = 8
 
     def __post_init__(self) -> None:
         positive("peg: radius", self.radius)
         positive("peg: length", self.length)
+        object.__setattr__(self, "axis", unit_vector("peg: axis", self.axis))
         if self.rings < 2 or self.balls < 3:
             raise ModelError(
                 "a peg has 2 or more rings of 3 or more balls, got "
@@ -117,9 +121,7 @@ class Peg:
             )
 
     def centers(self, radius: float) -> FloatArray:
-        """The centers of its balls, relative to the middle of its end, m, shape (k, 3).
-
-        The last coordinate is along the axis, away from the surface.
+        """The centers of its balls in the frame, relative to the middle of its end, shape (k, 3).
 
         Args:
             radius: The radius of the balls, m.
@@ -135,7 +137,8 @@ class Peg:
         angles = 2.0 * np.pi * np.arange(self.balls) / self.balls
         ring = (self.radius - radius) * np.column_stack([np.cos(angles), np.sin(angles)])
         heights = np.linspace(radius, self.length - radius, self.rings)
-        return np.vstack([np.insert(ring, 2, height, axis=1) for height in heights])
+        centers = np.vstack([np.insert(ring, 2, -height, axis=1) for height in heights])
+        return np.asarray(centers @ axes_along(self.axis).T)
 
 
 @checked(ModelError)

@@ -30,7 +30,6 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.surface import axes_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.traced import Block, DrakeStepped
 from drake_dae.systems.plants.contact.contact_checks import (
@@ -252,15 +251,16 @@ class ContactPlant(Diagram, Plant):
         # A unit force without sliding gives the normal.
         state[model.links.q.numel() :] = 0.0
         wrenches = loads(state, np.ones(self.dae.num_constraints))
-        pegs = {peg.constraint: peg.centers(material.radius) for peg in material.pegs}
-        balls, ball = [], np.array([[0.0, 0.0, material.radius]])
+        pegs = {peg.constraint: peg for peg in material.pegs}
+        balls = []
         for constraint, name, point, normal in zip(
             model.constraints, loads.frames, wrenches.points, wrenches.forces, strict=True
         ):
             pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
-            places = point + pegs.get(constraint.name, ball) @ axes_along(normal).T
-            frame = GetScopedFrameByName(plant, name)
-            balls.append((frame, [pose.inverse() @ place for place in places]))
+            centers = [pose.inverse() @ (point + material.radius * normal)]
+            if peg := pegs.get(constraint.name):
+                centers = list(pose.inverse() @ point + peg.centers(material.radius))
+            balls.append((GetScopedFrameByName(plant, name), centers))
         return balls
 
     def _other_masses(self) -> list[tuple[RigidBody, float]]:

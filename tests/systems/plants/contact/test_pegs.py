@@ -46,7 +46,9 @@ def test_the_balls_of_a_peg_are_within_it():
     centers = Peg("wall", 0.01, 0.05, rings=4, balls=6).centers(0.002)
     assert centers.shape == (24, 3)
     assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 0.008)
-    assert_allclose(np.unique(centers[:, 2].round(12)), [0.002, 0.052 / 3, 0.098 / 3, 0.048])
+    assert_allclose(np.unique(centers[:, 2].round(12)), [-0.048, -0.098 / 3, -0.052 / 3, -0.002])
+    turned = Peg("wall", 0.01, 0.05, (2.0, 0.0, 0.0), 4, 6).centers(0.002)
+    assert_allclose(np.unique(turned[:, 0].round(12)), np.unique(centers[:, 2].round(12)))
 
 
 @pytest.mark.parametrize(
