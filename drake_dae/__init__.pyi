@@ -103,6 +103,8 @@ from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
 from .robots.surfaces.maps import HeightMap as HeightMap
 from .robots.surfaces.maps import MeshSurface as MeshSurface
+from .robots.surfaces.plate import Hole as Hole
+from .robots.surfaces.plate import Plate as Plate
 from .robots.surfaces.surfaces import Cylinder as Cylinder
 from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
@@ -169,6 +171,7 @@ from .systems.observing.observer import DisturbanceObserver as DisturbanceObserv
 from .systems.observing.observer_rates import Observing as Observing
 from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
+from .systems.plants.contact.contact_material import Peg as Peg
 from .systems.plants.contact.contact_material import PointMaterial as PointMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
@@ -189,6 +192,7 @@ from .systems.task.open_contact import open_contact as open_contact
 from .systems.task.phases import Approach as Approach
 from .systems.task.phases import Dwell as Dwell
 from .systems.task.phases import GuardedMove as GuardedMove
+from .systems.task.phases import Insert as Insert
 from .systems.task.phases import Move as Move
 from .systems.task.phases import PhaseGuard as PhaseGuard
 from .systems.task.phases import Press as Press

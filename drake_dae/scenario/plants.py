@@ -155,9 +155,9 @@ class Unilateral(ScenarioPlant):
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    A ball at the tool touches the surfaces of the constraints. With point contact the force is
-    stiffness times depth. With hydroelastic contact the ball is rigid, and the pressure of the
-    surface is modulus times depth / thickness.
+    A ball at the tool, or a peg of balls, touches the surfaces of the constraints. With point
+    contact the force is stiffness times depth. With hydroelastic contact the ball is rigid, and the
+    pressure of the surface is modulus times depth / thickness.
 
     If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
@@ -173,7 +173,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 
     @property
     def rolled(self) -> ScenarioPlant:
-        if self.contact_model != "point":
+        if self.contact_model != "point" or self.pegs:
             return self
         return CompliantContact(**{f.name: getattr(self, f.name) for f in fields(PointMaterial)})
 

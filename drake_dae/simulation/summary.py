@@ -186,7 +186,7 @@ def _forces(record: Record, limits: Limits) -> list[str]:
     if not forces.signals:
         return []
     pulls = [
-        "pulls: a real contact would open" if _pulls(signal, values, limits) else ""
+        "pulls: a real contact would open" if _pulls(record, signal, values, limits) else ""
         for signal, values in zip(forces.signals, forces.values.T, strict=True)
     ]
     rows = zip(_extremes(record, "constraint_force"), pulls, strict=True)
@@ -266,8 +266,14 @@ def _largest_controls(record: Record, limits: Limits) -> FloatArray:
     return np.full(count, np.inf) if limits.control is None else limits.control
 
 
-def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
-    return bool(np.min(values) < 0.0) and not limits.can_pull(signal)
+def _pulls(record: Record, signal: Signal, values: FloatArray, limits: Limits) -> bool:
+    """Whether an ideal contact would have to pull.
+
+    A compliant one, whose whole force is recorded, cannot. In a hole, its force may have a part
+    against the normal of the surface.
+    """
+    is_ideal = "contact_force" not in record
+    return is_ideal and bool(np.min(values) < 0.0) and not limits.can_pull(signal)
 
 
 def shortfalls(record: Record, limits: Limits) -> list[str]:
@@ -281,7 +287,7 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
     pulling = [
         signal.name
         for signal, values in zip(forces.signals, forces.values.T, strict=True)
-        if _pulls(signal, values, limits)
+        if _pulls(record, signal, values, limits)
     ]
     over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]

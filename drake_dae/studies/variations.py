@@ -245,7 +245,7 @@ def _drawn(key: str, choices: Any, count: int, seed: int) -> list[Any]:
         if not interval or interval[3]:
             return value
         low, high = _ends(key, interval)
-        fraction = float(fractions_at(path)[run])
+        fraction = fractions_at(path)[run].item()
         return low * (1.0 - fraction) + high * fraction
 
     return [filled(value, "", run) for run, value in enumerate(chosen)]

@@ -62,7 +62,7 @@ def test_a_search_ends_where_the_tool_falls_or_with_its_spiral(depth, tmp_path):
     assert names == ["Press", "Search", "leave", "held"]
     assert changes[2].reason == "Search has come to 0.006 m without a fall of 0.0015 m"
     search = Search("tool.yz", 0.006, 0.0015, speed=0.04, over=0.1)
-    wanted = began + search.spiral.travel.duration + 0.1
+    wanted = began + search.path.travel.duration + 0.1
     assert_allclose(ended, np.ceil(wanted / 0.002 - 1e-6) * 0.002, atol=1e-9)
     # It lies on the spiral that began where the tool was: the way out is 6 mm.
     assert_allclose(np.linalg.norm(place - record["controlled_output"][0, :2]), 0.006, atol=2e-4)

@@ -224,6 +224,10 @@ def test_what_no_robot_would_do_is_a_shortfall():
         "motor1 would exceed the limits",
         "q would leave the joint limits",
     ]
+    # A compliant contact, which records its whole force, pushes; in a hole it may push backwards.
+    backwards = ([[0, 0, 20.0], [3.0, 0, -0.5], [0, 0, 15.25]], [("wall.contact_fx", "N")] * 3)
+    compliant = record(constraint_force=pulling, contact_force=backwards, **EXACT)
+    assert shortfalls(compliant, limits)[0] == "motor1 would exceed the limits"
 
 
 def test_the_phases_of_a_task():

@@ -126,10 +126,10 @@ class Constraint(ABC):
         them as well.
     13. `friction_parameter` is the name of its coefficient of friction, if it has one, and
         `sliding` is the sliding velocity.
-    14. `solid` is the geometry for Drake's own contact: an object in the world that acts on frame B
+    14. `solids` are the geometry for Drake's own contact: objects in the world that act on frame B
         of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
-        clearance of that point.
+        clearance of that point, except beyond the ends of a body that the law does not know.
 
     Attributes:
         name: The prefix of the names of its forces, residuals and parameters.
@@ -245,13 +245,13 @@ class Constraint(ABC):
         """
         return RigidTransform()
 
-    def solid(self, values: FloatArray) -> PosedShape | None:
-        """The geometry for Drake's own contact; None if there is none.
+    def solids(self, values: FloatArray) -> tuple[PosedShape, ...]:
+        """The geometry for Drake's own contact; () if there is none.
 
         Args:
             values: The values of its parameters in one vector.
         """
-        return None
+        return ()
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         """The visible object in contact, or None.

@@ -170,7 +170,7 @@ class PointOnSurface(Constraint):
             self.frame,
             self.point,
             self._normal(frames),
-            lambda point: self.surface.distance(self._offset(point)),
+            lambda point: self.surface.clearance(self._offset(point)),
             self._surface_velocity,
             self.surface.has_exact_distance,
         )
@@ -200,9 +200,9 @@ class PointOnSurface(Constraint):
         picture = surface.picture(stands.inverse() @ point, size)
         return None if picture is None else picture.moved(stands)
 
-    def solid(self, values: FloatArray) -> PosedShape | None:
-        solid = self.surface.solid()
-        return None if solid is None else solid.moved(self.placement(values))
+    def solids(self, values: FloatArray) -> tuple[PosedShape, ...]:
+        pose = self.placement(values)
+        return tuple(solid.moved(pose) for solid in self.surface.solids())
 
 
 @checked(ModelError)

@@ -20,9 +20,14 @@ from drake_dae.robots.surfaces.height_file import height_table, read_heights
 from drake_dae.robots.surfaces.mesh_file import heights_of_mesh, read_mesh
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.relief import CELLS, Relief, fit_relief
-from drake_dae.robots.surfaces.surface import Surface, Vector, tangents, triple, unit_vector
-
-Pair = tuple[float, float]
+from drake_dae.robots.surfaces.surface import (
+    Pair,
+    Surface,
+    Vector,
+    tangents,
+    triple,
+    unit_vector,
+)
 
 MOST_LENGTH = 1e9
 """The largest height and distance of a vertex, in m."""

@@ -20,6 +20,7 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 from drake_dae.trace.smoothness import length_of
 
+Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 
 CELLS = 24
@@ -44,8 +45,10 @@ class Surface(ABC):
        with a known shape return that.
     6. `shape` are named numbers of its form that may vary; most surfaces have none. `shaped` is the
        same surface with other values, numbers or symbols.
-    7. `solid` is a Drake shape that fills the side opposite to the free one, for Drake's own
-       contact. A surface may have none.
+    7. `solids` are Drake shapes that together fill the side opposite to the free one, for Drake's
+       own contact; convex if there are several. A surface may have none. `clearance` is the signed
+       distance from the body that compliant plants use. It differs from `distance` where a body
+       ends, which laws do not know.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
        which it is defined, if that is bounded.
     """
@@ -120,9 +123,17 @@ class Surface(ABC):
             return None
         return PosedShape(mesh_of_grid(grid), RigidTransform())
 
-    def solid(self) -> PosedShape | None:
-        """The solid below the surface, with its reference point at the origin."""
-        return None
+    def solids(self) -> tuple[PosedShape, ...]:
+        """The solids below the surface, with its reference point at the origin; () for none."""
+        return ()
+
+    def clearance(self, offset: ca.SX) -> ca.SX:
+        """The signed distance of a point from the body in m; the `distance` if it does not end.
+
+        Args:
+            offset: As for `distance`.
+        """
+        return self.distance(offset)
 
     def _patch(self, center: FloatArray, size: float) -> FloatArray:
         """A grid of points on the surface, shape (k, k, 3); NaN where there is none.

@@ -65,9 +65,9 @@ class Plane(Surface):
         pose = RigidTransform(RotationMatrix(axes_along(normal)), foot - thickness / 2 * normal)
         return PosedShape(geometry.Box(size, size, thickness), pose)
 
-    def solid(self) -> PosedShape:
+    def solids(self) -> tuple[PosedShape, ...]:
         pose = RigidTransform(RotationMatrix(axes_along(self.normal)), np.zeros(3))
-        return PosedShape(geometry.HalfSpace(), pose)
+        return (PosedShape(geometry.HalfSpace(), pose),)
 
 
 @checked(ModelError)
@@ -110,8 +110,9 @@ class Sphere(Surface):
     def picture(self, center: ArrayLike, size: float) -> PosedShape:
         return PosedShape(geometry.Sphere(self.radius), RigidTransform())
 
-    def solid(self) -> PosedShape | None:
-        return None if self.inside else PosedShape(geometry.Sphere(self.radius), RigidTransform())
+    def solids(self) -> tuple[PosedShape, ...]:
+        ball = PosedShape(geometry.Sphere(self.radius), RigidTransform())
+        return () if self.inside else (ball,)
 
 
 @checked(ModelError)
@@ -164,11 +165,10 @@ class Cylinder(Surface):
         pose = RigidTransform(RotationMatrix(axes_along(axis)), np.dot(center, axis) * axis)
         return PosedShape(geometry.Cylinder(self.radius, size), pose)
 
-    def solid(self) -> PosedShape | None:
-        if self.inside:
-            return None
+    def solids(self) -> tuple[PosedShape, ...]:
         pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
-        return PosedShape(geometry.Cylinder(self.radius, _SOLID_LENGTH), pose)
+        bar = PosedShape(geometry.Cylinder(self.radius, _SOLID_LENGTH), pose)
+        return () if self.inside else (bar,)
 
 
 @checked(ModelError)

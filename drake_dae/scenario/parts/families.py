@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
-from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
+from drake_dae.robots.surfaces import implicit, maps, plate, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
@@ -20,18 +20,20 @@ from drake_dae.scenario.parts import time_optimal, written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import disturbance_forces
+from drake_dae.systems.plants.contact import contact_material, disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
 from drake_dae.systems.task import phases
 
 # Vectors and arrays are written as in `_WRITTEN`; numbers, text, booleans, Literals, dataclasses,
 # tuples, and lists and dictionaries of these are written directly.
 
-_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
+_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, surface.Pair: Pair}
 _LISTED: dict[Any, Any] = {**_WRITTEN, Sequence[str]: list[str]}
 
+_Hole = Annotated[plate.Hole, Form(_WRITTEN)]
 Surface = Annotated[
     surfaces.Plane
+    | plate.Plate
     | surfaces.Sphere
     | surfaces.Cylinder
     | surfaces.Ellipsoid
@@ -39,7 +41,7 @@ Surface = Annotated[
     | implicit.ImplicitSurface
     | maps.HeightMap
     | maps.MeshSurface,
-    Choice({**_WRITTEN, Callable[..., SX] | str: str}),
+    Choice({**_WRITTEN, Callable[..., SX] | str: str, plate.Hole: _Hole}),
 ]
 Constraint = Annotated[
     contact.PointOnSurface
@@ -94,13 +96,16 @@ Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+_Pegs = Annotated[
+    tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)
+]  # In data a tuple is a list.
 Plant = Annotated[
     plants.IdealConstraints
     | plants.MultibodyPlant
     | plants.CompliantContact
     | plants.Unilateral
     | plants.OwnPlant,
-    Choice(),
+    Choice({Sequence[contact_material.Peg]: _Pegs}),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
@@ -125,6 +130,7 @@ Phase = Annotated[
     | phases.Wait
     | phases.GuardedMove
     | phases.Search
+    | phases.Insert
     | phases.Release
     | phases.Retreat,
     Choice(_PHASE_DATA),

@@ -85,6 +85,8 @@ class PhaseDecision:
             return "guard", f"{phase.name} is ended by {guard.tripped(value)}"
         if ended[1]:
             return "success", f"after {phase.awaited(contact_force)}"
+        if ended[2] and phase.ends_by_loss:
+            return "success", "after its contact is lost"
         if ended[2]:
             return "lost", f"the contact of {phase.name} is lost"
         return "late", phase.lateness(self.moment, contact_force)

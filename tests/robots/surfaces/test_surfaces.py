@@ -17,6 +17,7 @@ from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.implicit import ImplicitSurface
 from drake_dae.robots.surfaces.maps import HeightMap, MeshSurface
+from drake_dae.robots.surfaces.plate import Hole, Plate
 from drake_dae.robots.surfaces.surface import Surface, tangents
 from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from drake_dae.trace.functions import TracedFunction
@@ -29,6 +30,7 @@ BELL = 0.3 * np.exp(-2.0 * (SIDE**2 + SIDE[:, None] ** 2))
 
 SURFACES = {
     "plane": Plane((0.3, -0.2, 0.5), (1.0, -2.0, 0.5)),
+    "plate": Plate((0.3, -0.2, 0.5), (1.0, -2.0, 0.5), (9.0, 9.0), thickness=2.0),
     "sphere": Sphere((0.1, 0.2, 0.3), 0.7),
     "inside sphere": Sphere((0.1, 0.2, 0.3), 0.7, inside=True),
     "cylinder": Cylinder((0.4, 0.0, 0.1), (1.0, 1.0, 0.3), 0.5),
@@ -99,21 +101,67 @@ def test_distance_grows_with_one_along_the_normal(name):
             assert function(p + d * normal)[0][0] == pytest.approx(d, abs=20 * d * d)
 
 
-@pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].solid() is not None])
+def distance_by_drake(surface):
+    """The signed distance from the solids of a surface, by Drake."""
+    scene = geometry.SceneGraph()
+    source = scene.RegisterSource("test")
+    for number, solid in enumerate(surface.solids()):
+        shape = geometry.GeometryInstance(solid.pose, solid.form, f"solid {number}")
+        shape.set_proximity_properties(geometry.ProximityProperties())
+        scene.RegisterAnchoredGeometry(source, shape)
+    context = scene.CreateDefaultContext()
+
+    def distance(p):
+        query = scene.get_query_output_port().Eval(context)
+        return min(found.distance for found in query.ComputeSignedDistanceToPoint(p))
+
+    return distance
+
+
+@pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].solids()])
 def test_a_solid_has_the_distance_of_its_surface(name):
     """By Drake's signed distance, up to 0.1 m away; round-off alone, 1e-12 has room."""
-    solid, scene = SURFACES[name].solid(), geometry.SceneGraph()
-    source = scene.RegisterSource("test")
-    shape = geometry.GeometryInstance(solid.pose, solid.form, "solid")
-    shape.set_proximity_properties(geometry.ProximityProperties())
-    scene.RegisterAnchoredGeometry(source, shape)
-    context = scene.CreateDefaultContext()
-    query = scene.get_query_output_port().Eval(context)
+    by_drake = distance_by_drake(SURFACES[name])
     function, points = points_on(SURFACES[name])
     for p, d in zip(points, np.linspace(-0.1, 0.1, len(points)), strict=True):
         near = p + d * function(p)[1]
-        (found,) = query.ComputeSignedDistanceToPoint(near)
-        assert found.distance == pytest.approx(function(near)[0][0], abs=1e-12)
+        assert by_drake(near) == pytest.approx(function(near)[0][0], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "hole", [None, Hole(0.005), Hole(0.005, (0.01, 0.004), chamfer=0.001)], ids=str
+)
+def test_the_pieces_of_a_plate_have_its_clearance(hole):
+    """Above it, beside it and in its hole, whose flat sides are wider by 0.2 % of its radius.
+
+    The gradient is the unit normal, as balls need it; round-off alone. Nearer than 0.4 mm to the
+    face the steps of its strips would show.
+    """
+    plate = Plate((0, 0, 0), (-1, 0, 0.3), (0.03, 0.02), thickness=0.02, hole=hole)
+    by_drake, offset = distance_by_drake(plate), ca.SX.sym("offset", 3)
+    clearance = plate.clearance(offset)
+    outputs = {"clearance": clearance, "normal": ca.gradient(clearance, offset)}
+    function = TracedFunction("plate", {"offset": offset}, outputs)
+    axes, random = np.vstack([*tangents(plate.normal), plate.normal]), np.random.default_rng(1)
+    places = random.uniform([-0.04, -0.03, -0.018], [0.04, 0.03, 0.01], (400, 3))
+    if hole is not None:
+        places[::2, :2] = hole.center + random.uniform(-0.006, 0.006, (200, 2))
+    wider, outside = 1e-12 if hole is None else 0.0022 * hole.radius, 0
+    for place in places @ axes:
+        value, normal = function(place)
+        if value[0] > 4e-4:
+            outside += 1
+            assert -1e-12 <= by_drake(place) - value[0] <= wider
+            assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-9)
+        else:
+            assert by_drake(place) < 5e-4
+    assert outside > 200
+
+
+def test_a_hole_that_does_not_fit_its_plate_is_refused():
+    for hole in (Hole(0.02), Hole(0.005, (0.016, 0.0)), Hole(0.005, chamfer=0.03)):
+        with pytest.raises(ModelError, match="does not fit a plate with the half_widths"):
+            Plate((0, 0, 0), (0, 0, 1), (0.02, 0.02), thickness=0.02, hole=hole)
 
 
 @pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].coordinate_signals])

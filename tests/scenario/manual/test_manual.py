@@ -25,6 +25,7 @@ PURE = {
     ("Scenario", "plant_parameters"),  # Likewise.
     ("!ImplicitSurface", "parameters"),  # Likewise.
     ("!Plane", "normal"),
+    ("!Plate", "normal"),
     ("!Sphere", "axis"),
     ("!Cylinder", "axis"),
     ("!Cylinder", "zero"),

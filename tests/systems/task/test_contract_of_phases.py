@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from members import Rise
 
@@ -10,6 +11,7 @@ from drake_dae import (
     ConstantReference,
     Dwell,
     GuardedMove,
+    Insert,
     Move,
     PhaseGuard,
     Press,
@@ -58,6 +60,16 @@ MEMBERS = {
         Search("tool.yz", 0.01, depth=0.002),
         Moment(1.0, 5.0, -0.0019, 0.0, 5.0, away=-0.0019),
         Moment(1.0, 5.0, -0.0021, 0.0, 5.0, away=-0.0021),
+    ),
+    "Search along a line": (
+        Search("tool.yz", 0.1, pattern="line", heading=1.0),
+        Moment(1.0, 5.0, -0.0019, 0.0, 5.0, away=-0.0019),
+        Moment(1.0, 5.0, -0.0021, 0.0, 5.0, away=-0.0021),
+    ),
+    "Insert": (
+        Insert(0.02, lag=0.005),
+        Moment(1.0, 2.0, -0.015, -0.01, -0.019),
+        Moment(2.0, 2.0, -0.0201, -0.01, -0.022),
     ),
     "Rise": (Rise(0.5), Moment(0.4, 0.0, 0.1, 0.0, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
     "Release": (Release(), Moment(0.3, 3.0, 0.0, 0.0, 3.0), Moment(0.5, 0.4, 0.0, 0.0, 0.3)),
@@ -113,6 +125,42 @@ def test_a_press_on_an_edge_says_what_it_waits_for():
     )
     flat = replace(on_edge, force=10.0, eccentricity=0.0)
     assert "for a force within 1 N" in Press(20.0).lateness(flat, CONTACT_FORCE)
+
+
+def test_an_insertion_that_jams_is_late():
+    """The lag is the distance less its reference; 5.1 mm of it are too much, 4.9 mm are not."""
+    going, jammed = (Moment(1.0, 7.0, -0.004, 0.0, -0.004 - lag) for lag in (0.0049, 0.0051))
+    phase = Insert(0.02, lag=0.005)
+    assert phase.remaining(going) > 0.0 > phase.remaining(jammed)
+    text = phase.lateness(jammed, CONTACT_FORCE)
+    assert text == (
+        "Insert lags 0.0051 m behind its reference at a depth of 0.004 m, with a force of 7 N"
+    )
+
+
+def path_of(search):
+    """Points along the path of a search, from its start to its end, shape (k, 2)."""
+    place = search.path.derivatives([0, 0])
+    return np.array([place(time) for time in np.linspace(0.0, search.duration, 4001)])
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_a_line_and_a_raster_go_along_their_heading(heading):
+    """In axes along and across it, from the start: a straight line, and lines over a rectangle."""
+    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    settings = {"radius": 0.01, "heading": heading, "speed": 0.02}
+    line = path_of(Search("tool.yz", pattern="line", **settings)) @ turn
+    np.testing.assert_allclose(line[:, 1], 0.0, atol=1e-15)
+    np.testing.assert_allclose(line[[0, -1], 0], [0.0, 0.01], atol=1e-12)
+    assert np.all(np.diff(line[:, 0]) >= -1e-15)
+    raster = path_of(Search("tool.yz", pattern="raster", pitch=0.003, **settings)) @ turn
+    np.testing.assert_allclose(raster[0], 0.0, atol=1e-15)
+    # Five lines, 3 mm apart, the last one at least 10 mm ahead.
+    np.testing.assert_allclose(raster.min(0), [0.0, -0.01], atol=1e-12)
+    np.testing.assert_allclose(raster.max(0), [0.012, 0.01], atol=1e-12)
+    grid = np.stack(np.meshgrid(np.linspace(0, 0.01, 21), np.linspace(-0.0095, 0.0095, 21)), -1)
+    apart = [np.linalg.norm(raster - place, axis=1).min() for place in grid.reshape(-1, 2)]
+    assert max(apart) < 0.0016
 
 
 @pytest.mark.parametrize("name", MEMBERS)

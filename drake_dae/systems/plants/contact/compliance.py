@@ -19,7 +19,7 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 FITS = 1e-3
-"""The allowed gap or depth of a ball at its contact point, relative to its radius."""
+"""The allowed depth of a ball at its contact point, relative to its radius."""
 
 OUTSIDE = (
     "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
@@ -96,7 +96,7 @@ class CompliantEquations:
         with_forces[: state.size] = state
         depths = self._depths(with_forces, parameters)[0]
         for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
-            if not abs(depth) <= FITS * material.radius:
+            if not depth <= FITS * material.radius:  # Beyond an edge there is a gap.
                 raise ModelError(
                     f"a ball with a radius of {material.radius:g} m does not fit "
                     f"'{constraint.name}' where it shall touch, since the surface bends toward it "

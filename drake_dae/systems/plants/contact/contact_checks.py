@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from numpy.typing import ArrayLike
+from pydrake.geometry import Box, Cylinder
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
@@ -10,10 +11,11 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 
-def check_model(model: RobotModel) -> None:
-    """Refuses a model that Drake's contact cannot represent.
+def check_model(model: RobotModel, material: ContactMaterial) -> None:
+    """Refuses a model or a material that Drake's contact cannot represent.
 
     Raises:
         ModelError: It cannot; the message has the reason.
@@ -30,11 +32,22 @@ def check_model(model: RobotModel) -> None:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
-        if constraint.solid(values) is None:
+        if not (solids := constraint.solids(values)):
             raise ModelError(
                 f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
-                "Plane, or on the outside of a Sphere or a Cylinder, or an ideal plant"
+                "Plane or Plate, or on the outside of a Sphere or a Cylinder, or an ideal plant"
             )
+        if material.contact_model == "hydroelastic" and any(
+            isinstance(solid.form, Box | Cylinder) for solid in solids
+        ):
+            # Drake meshes a long cylinder too coarsely: 2 N of ripple in a force of 20 N.
+            raise ModelError(
+                f"hydroelastic contact needs a Plane or a Sphere as surface of "
+                f"'{constraint.name}'; use point contact (contact_model: point)"
+            )
+    for peg in material.pegs:
+        if peg.constraint not in (names := [constraint.name for constraint in model.constraints]):
+            raise ModelError(f"pegs: {unknown_name('constraint', peg.constraint, names)}")
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:

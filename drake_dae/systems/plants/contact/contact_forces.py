@@ -39,7 +39,7 @@ class ContactForces(LeafSystem):
     Args:
         model: The robot; each constraint is a contact with one force.
         structure: The structure of its system.
-        pairs: For each constraint, the geometry of the robot and that of the surface.
+        pairs: For each constraint, the geometries of the robot and those of the surface.
         parameters: Values of all parameters.
 
     Attributes:
@@ -52,13 +52,16 @@ class ContactForces(LeafSystem):
         self,
         model: RobotModel,
         structure: ConstraintStructure,
-        pairs: Sequence[tuple[GeometryId, GeometryId]],
+        pairs: Sequence[tuple[Sequence[GeometryId], Sequence[GeometryId]]],
         parameters: FloatArray,
     ) -> None:
         super().__init__()
         self.set_name("contact_forces")
         dae = model.dae
-        self._pairs = [tuple(pair) for pair in pairs]
+        self._owners = [
+            {geometry: number for number, pair in enumerate(pairs) for geometry in pair[side]}
+            for side in (0, 1)
+        ]
         self.contact_force_signals = contact_force_signals(model)
         self._manifold, self._parameters = structure.manifold, parameters
         self._normals = contact_normals(model)
@@ -73,7 +76,7 @@ class ContactForces(LeafSystem):
         self._contact, self._constraint, *_ = (
             self.DeclareVectorOutputPort(name, size, port_value(value), sources)
             for name, size, value in (
-                ("contact_force", 3 * len(self._pairs), self._contact_force),
+                ("contact_force", len(self.contact_force_signals), self._contact_force),
                 ("constraint_force", dae.num_constraints, self._force),
                 ("constraint_residual", len(structure.manifold.residual_signals), self._residual),
                 ("controlled_output", dae.num_outputs, self._outputs),
@@ -82,7 +85,7 @@ class ContactForces(LeafSystem):
 
     def _contact_force(self, context: Context) -> FloatArray:
         results: ContactResults = self._results.Eval(context)
-        total = np.zeros((len(self._pairs), 3))
+        total = np.zeros((len(self.contact_force_signals) // 3, 3))
         for i in range(results.num_point_pair_contacts()):
             point = results.point_pair_contact_info(i)
             pair = point.point_pair()
@@ -98,10 +101,11 @@ class ContactForces(LeafSystem):
     def _add(
         self, total: FloatArray, felt_by: GeometryId, other: GeometryId, force: FloatArray
     ) -> None:
-        if (felt_by, other) in self._pairs:
-            total[self._pairs.index((felt_by, other))] += force
-        elif (other, felt_by) in self._pairs:
-            total[self._pairs.index((other, felt_by))] -= force
+        of_robot, of_surfaces = self._owners
+        if felt_by in of_robot and other in of_surfaces:
+            total[of_robot[felt_by]] += force
+        elif other in of_robot and felt_by in of_surfaces:
+            total[of_robot[other]] -= force
 
     def _force(self, context: Context) -> FloatArray:
         contact = self._contact.Eval(context).reshape(-1, 3)

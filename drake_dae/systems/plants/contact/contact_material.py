@@ -1,5 +1,6 @@
 """The compliance and friction of Drake's own contact."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,6 +18,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.surface import Vector, axes_along, unit_vector
 
 FRICTION = Signal("plant.friction")
 """The coefficient of friction of all contacts, among `PointMaterial.signals`."""
@@ -81,6 +83,66 @@ class PointMaterial:
 
 @checked(ModelError)
 @dataclass(frozen=True)
+class Peg:
+    """A round peg at a contact: rings of balls around an axis of the frame of its constraint.
+
+    The middle of its end is the point of the constraint. The first ring is its end, and the last
+    one is `length` behind it. The radius of the balls, `PointMaterial.radius`, rounds its edges.
+    Each ball has the stiffness of the material, so a peg that touches with k balls is k times as
+    stiff.
+
+    Attributes:
+        constraint: The name of the constraint at which it touches.
+        radius: Its radius, m.
+        length: The distance from its end to the far side of its last ring, m.
+        axis: The direction from its last ring to its end in the frame, of any length, shape (3,).
+        rings: The number of rings, 2 or more.
+        balls: The number of balls in each ring, 3 or more.
+
+    Raises:
+        ModelError: A number is not valid.
+    """
+
+    constraint: str
+    radius: float
+    length: float
+    axis: Vector = (0.0, 0.0, 1.0)
+    rings: int = 3
+    balls: int = 8
+
+    def __post_init__(self) -> None:
+        positive("peg: radius", self.radius)
+        positive("peg: length", self.length)
+        object.__setattr__(self, "axis", unit_vector("peg: axis", self.axis))
+        if self.rings < 2 or self.balls < 3:
+            raise ModelError(
+                "a peg has 2 or more rings of 3 or more balls, got "
+                f"{self.rings} rings of {self.balls}"
+            )
+
+    def centers(self, radius: float) -> FloatArray:
+        """The centers of its balls in the frame, relative to the middle of its end, shape (k, 3).
+
+        Args:
+            radius: The radius of the balls, m.
+
+        Raises:
+            ModelError: The balls are too large for it.
+        """
+        if not radius < min(self.radius, self.length / 2.0):
+            raise ModelError(
+                f"a peg with a radius of {self.radius:g} m and a length of {self.length:g} m has "
+                f"no room for balls with a radius of {radius:g} m"
+            )
+        angles = 2.0 * np.pi * np.arange(self.balls) / self.balls
+        ring = (self.radius - radius) * np.column_stack([np.cos(angles), np.sin(angles)])
+        heights = np.linspace(radius, self.length - radius, self.rings)
+        centers = np.vstack([np.insert(ring, 2, -height, axis=1) for height in heights])
+        return np.asarray(centers @ axes_along(self.axis).T)
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
 class ContactMaterial(PointMaterial):
     """The contact model of Drake's MultibodyPlant for a robot.
 
@@ -94,6 +156,7 @@ class ContactMaterial(PointMaterial):
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer, m; hydroelastic contact only.
+        pegs: The pegs with which the robot touches at some constraints, in place of a ball.
 
     Raises:
         ModelError: A number is not valid.
@@ -102,11 +165,15 @@ class ContactMaterial(PointMaterial):
     contact_model: Literal["point", "hydroelastic"] = "point"
     modulus: float = 1e7
     thickness: float = 0.01
+    pegs: Sequence[Peg] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("time_step", "modulus", "thickness"):
             positive(name, getattr(self, name))
+        object.__setattr__(self, "pegs", tuple(self.pegs))
+        for peg in self.pegs:
+            peg.centers(self.radius)
 
     def stiffness_at(self, force: float) -> float:
         """The slope of the normal force over depth, in N/m, at a normal force in N.

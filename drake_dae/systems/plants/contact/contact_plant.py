@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
     CollisionFilterDeclaration,
-    Cylinder,
     GeometryId,
     GeometrySet,
     HalfSpace,
@@ -69,8 +68,8 @@ class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
 
     Compliant contact with friction satisfies the constraints approximately, and may open. For each
-    constraint there is a ball on the robot at its point, and its surface in the world; nothing else
-    of the robot collides.
+    constraint there is a ball on the robot at its point, or a peg of balls, and its surface in the
+    world; nothing else of the robot collides.
 
     The plant steps at t_n = n time_step: its ports then have x(t_n), before the step to t_(n+1),
     which uses the control at t_n. The force is that of the step to t_n. After
@@ -93,7 +92,7 @@ class ContactPlant(Diagram, Plant):
         query_object: Drake's, of the scene with the contact geometry.
 
     Args:
-        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with a `solid`.
+        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with `solids`.
         add_robot: Adds the robot to a plant, as it was added to the plant of the model.
         material: The contact material.
         structure: The structure of the model's system.
@@ -127,7 +126,7 @@ class ContactPlant(Diagram, Plant):
         pushed: bool = False,
     ) -> None:
         super().__init__()
-        check_model(model)
+        check_model(model, material)
         self.model: RobotModel = model
         self.dae, self.structure = model.dae, structure
         self.time_step, self._friction = material.time_step, material.friction
@@ -199,50 +198,51 @@ class ContactPlant(Diagram, Plant):
 
     def _add_contacts(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, material: ContactMaterial
-    ) -> list[tuple[GeometryId, GeometryId]]:
-        """A ball on the robot and a solid in the world for each constraint, and nothing else."""
+    ) -> list[tuple[list[GeometryId], list[GeometryId]]]:
+        """Balls on the robot and solids in the world for each constraint, and nothing else."""
         pairs = []
-        for constraint, (frame, center) in zip(
-            self.model.constraints, self._balls(plant, material.radius), strict=True
+        for constraint, (frame, centers) in zip(
+            self.model.constraints, self._balls(plant, material), strict=True
         ):
-            solid = constraint.solid(own_values(constraint, self.dae, self._values))
-            assert solid is not None  # check_model.
-            if material.contact_model == "hydroelastic" and isinstance(solid.form, Cylinder):
-                # Drake meshes a long cylinder too coarsely: 2 N of ripple in a force of 20 N.
-                raise ModelError(
-                    f"hydroelastic contact needs a Plane or a Sphere as surface of "
-                    f"'{constraint.name}'; use point contact (contact_model: point)"
-                )
+            solids = constraint.solids(own_values(constraint, self.dae, self._values))
             friction = material.friction
             if friction is None:
                 name = constraint.friction_parameter
                 friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
-            ball = plant.RegisterCollisionGeometry(
-                frame.body(),
-                RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
-                Sphere(material.radius),
-                f"{constraint.name}_ball",
-                ball_properties(material, friction),
-            )
-            touched = plant.RegisterCollisionGeometry(
-                plant.world_body(),
-                solid.pose,
-                solid.form,
-                f"{constraint.name}_surface",
-                surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
-            )
-            pairs.append((ball, touched))
+            balls = [
+                plant.RegisterCollisionGeometry(
+                    frame.body(),
+                    RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
+                    Sphere(material.radius),
+                    f"{constraint.name}_ball{number or ''}",
+                    ball_properties(material, friction),
+                )
+                for number, center in enumerate(centers)
+            ]
+            touched = [
+                plant.RegisterCollisionGeometry(
+                    plant.world_body(),
+                    solid.pose,
+                    solid.form,
+                    f"{constraint.name}_surface{number or ''}",
+                    surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
+                )
+                for number, solid in enumerate(solids)
+            ]
+            pairs.append((balls, touched))
         # The robot's own shapes do not collide, and a ball collides only with its own surface.
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
-        for ball, touched in pairs:
-            allowed = GeometrySet([ball]), GeometrySet([touched])
+        for balls, touched in pairs:
+            allowed = GeometrySet(balls), GeometrySet(touched)
             manager.Apply(CollisionFilterDeclaration().AllowBetween(*allowed))
         return pairs
 
-    def _balls(self, plant: MultibodyPlant, radius: float) -> list[tuple[Frame, FloatArray]]:
-        """The frame of each constraint on the robot, and the position of the ball in it."""
+    def _balls(
+        self, plant: MultibodyPlant, material: ContactMaterial
+    ) -> list[tuple[Frame, list[FloatArray]]]:
+        """The frame of each constraint on the robot, and the centers of its balls in it."""
         model, values, drawn = self.model, self._values, self.model.links.plant
         assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
@@ -252,11 +252,16 @@ class ContactPlant(Diagram, Plant):
         # A unit force without sliding gives the normal.
         state[model.links.q.numel() :] = 0.0
         wrenches = loads(state, np.ones(self.dae.num_constraints))
+        pegs = {peg.constraint: peg for peg in material.pegs}
         balls = []
-        for name, point, normal in zip(loads.frames, wrenches.points, wrenches.forces, strict=True):
+        for constraint, name, point, normal in zip(
+            model.constraints, loads.frames, wrenches.points, wrenches.forces, strict=True
+        ):
             pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
-            center = pose.inverse() @ (point + radius * normal)
-            balls.append((GetScopedFrameByName(plant, name), center))
+            centers = [pose.inverse() @ (point + material.radius * normal)]
+            if peg := pegs.get(constraint.name):
+                centers = list(pose.inverse() @ point + peg.centers(material.radius))
+            balls.append((GetScopedFrameByName(plant, name), centers))
         return balls
 
     def _other_masses(self) -> list[tuple[RigidBody, float, FloatArray | None]]:

@@ -74,7 +74,7 @@ class Phase(ABC):
        the law uses, and reach the goals within `over`.
     4. `margin` is positive until the phase succeeds. The phase fails if it lasts longer than
        `within`, or `remaining` becomes 0; if one of its guards trips; and, with `holds_contact`, if
-       the contact is lost.
+       the contact is lost. With `ends_by_loss` it succeeds if the contact is lost.
     5. The successor is the name of a phase, or "next", the next one in the list; "done", the task
        is done, and the robot rests; "approach", back to the last phase that leads into contact, at
        most `retries` of the task times; "hold", the robot rests in its present state with contact
@@ -104,6 +104,7 @@ class Phase(ABC):
     begins_in_contact: ClassVar[bool | None] = None
     ends_in_contact: ClassVar[bool | None] = None
     holds_contact: ClassVar[bool] = False
+    ends_by_loss: ClassVar[bool] = False
     is_relative: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf

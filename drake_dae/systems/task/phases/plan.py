@@ -188,7 +188,7 @@ class PhasePlan:
         if phase.retries is not None:
             self._check_word(place, "if_spent", phase.if_spent)
         outcomes: list[Outcome] = ["success", "guard", "late"]
-        if phase.holds_contact and self.contacts[place]:
+        if phase.holds_contact and self.contacts[place] and not phase.ends_by_loss:
             outcomes.append("lost")
         for outcome in outcomes:
             at, key, word, tried = place, phase.key_of(outcome), phase.chosen(outcome), set[int]()
