@@ -48,6 +48,7 @@ def main() -> int:
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
     _live_figures(texts.values(), library, out)
     sphinx = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    sphinx += ["-d", str(out / "doctrees")]  # No part of the site.
     code = subprocess.run([*sphinx, source, site]).returncode
     if not code:
         print(f"open {site / 'index.html'}")
