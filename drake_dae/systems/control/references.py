@@ -229,8 +229,8 @@ def traced_references(
             whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ModelError(
                 f"a {type(whole).__name__} is no expression of time, or one of more than "
-                f"{MOST_IN_EXPRESSION} polynomials, and a rollout needs one: take an "
-                "ExpressionReference, PointToPointReference or SinusoidReference, fewer "
+                f"{MOST_IN_EXPRESSION} polynomials, and rollouts, exports and pages need one: "
+                "take an ExpressionReference, PointToPointReference or SinusoidReference, fewer "
                 "polynomials (by a larger tolerance, corner or smoothing), or run the loop by "
                 "simulate"
             )
