@@ -6,10 +6,11 @@ import signal
 import time
 
 import pytest
+from browser import low_contrast, needs_chromium
 from command_line import command
 
 from drake_dae.cli import main
-from drake_dae.commands.gallery import CARD
+from drake_dae.commands.gallery import CARD, TEMPLATE, Card
 from drake_dae.scenario.shipped import shipped_scenarios
 
 
@@ -108,3 +109,18 @@ def test_names_that_share_a_folder_are_refused(tmp_path, capsys):
     assert main(["gallery", "two_link_wall", file, "--out", str(tmp_path / "gallery")]) == 1
     assert "two scenarios are named 'two_link_wall'" in capsys.readouterr().err
     assert not (tmp_path / "gallery").exists()
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_words_of_a_card_stand_out_from_light_and_dark(tmp_path):
+    words = ("good", "bad", "undecided")
+    cards = [Card("what it is", "source: 1", word, "why", "1 s", ["none"]) for word in words]
+    text = TEMPLATE.read_text("utf-8").replace(
+        "<!-- cards -->", "".join(card.to_html(card.outcome) for card in cards)
+    )
+    (tmp_path / "index.html").write_text(text, "utf-8")
+    assert low_contrast(tmp_path / "index.html") == {}
+    faded = text.replace(".bad {", ".bad { opacity: 1; } p {").replace("#b3261e", "#c99")
+    (tmp_path / "faded.html").write_text(faded, "utf-8")
+    assert "what it is" in low_contrast(tmp_path / "faded.html")

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from browser import in_page, needs_chromium
+from browser import in_page, low_contrast, needs_chromium
 from runs import scenario
 
 from drake_dae import build_commanded, write_page
@@ -164,6 +164,13 @@ def test_names_stay_text_a_phone_shows_all_of_it_and_a_screen_reader_names_it(pa
         assert 0.0 <= left < right <= found["wide"][1] + 1e-6
         assert below <= top < bottom <= found["tall"] + 1e-6
         below = bottom - 1e-6
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_its_words_stand_out(page):
+    assert low_contrast(page) == {}
 
 
 def test_a_page_is_small_and_loads_nothing(page):
