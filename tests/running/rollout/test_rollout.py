@@ -392,7 +392,9 @@ def test_without_a_compiler_it_warns_and_goes_on(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", each_scenario(lambda name: name.startswith("wall_")))
+@pytest.mark.parametrize(
+    "name", each_scenario(lambda name: name.startswith(("wall_", "biped_step")))
+)
 def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
     """To 1e-10 of the largest value: forces of light mechanisms cancel more than those of arms."""
     chosen = scenario(name, "duration=0.02", *fixed())
