@@ -41,6 +41,7 @@ _MODULES = {
     "render": "plot",
     "diagram": "plot",
     "excite": "identify",
+    "analyze": "new",
 }
 """Command -> its module, if the module has another name."""
 

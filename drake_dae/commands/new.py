@@ -1,6 +1,7 @@
-"""`drake-dae new`: writes a scenario for a robot of which only the file is known."""
+"""`drake-dae new` and `analyze`: write a scenario for a robot, and examine one without a run."""
 
 import argparse
+import json
 import logging
 import re
 import warnings
@@ -9,11 +10,30 @@ from pathlib import Path
 from drake_dae.arrays import number_in
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.new.new_scenario import new_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Writes a scenario for the robot that the options name; returns the exit code."""
+    """Runs the command that the options name; returns the exit code."""
+    return {"new": _new, "analyze": _analyze}[options.command](options)
+
+
+def _analyze(options: argparse.Namespace) -> int:
+    """Prints the report on the scenario that the options name."""
+    path = find_scenario(options.scenario)
+    report = find_feasibility(load_scenario(path, options.settings))
+    if options.json:
+        print(json.dumps({"scenario": path.stem, **report.to_dict()}, indent=2))
+    else:
+        print(f"{path.stem}\n\n{report}")
+    return 2 if report.problems else 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    """Writes a scenario for the robot that the options name."""
     robot = Path(options.robot)
     out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
     if out.exists():

@@ -55,6 +55,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_export(commands, scenario)
     _add_page(commands, scenario)
     _add_live(commands, scenario)
+    _add_gallery(commands)
     _add_pictures(commands, scenario)
     cache = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
     cache.flag("--clear", "remove it all")
@@ -215,6 +216,29 @@ def _add_live(commands: Any, scenario: CommandParser) -> None:
         metavar="FILE",
     )
     live.path("--out", "folder for what is saved (default: live/<scenario>-<time>)")
+
+
+def _add_gallery(commands: Any) -> None:
+    gallery = commands.add_parser(
+        "gallery",
+        help="run scenarios and show them on one page",
+        description="Runs scenarios and writes a page with a card for each: picture, animation, a "
+        "page to steer it, verdict, figures and YAML. A scenario runs again only if its file or "
+        "drake_dae has changed, so that the same command continues a gallery that was interrupted.",
+        epilog="exit code: 0, or 1 for an error, also where a scenario failed: its card says why",
+    )
+    gallery.add_argument(
+        "scenarios",
+        metavar="NAME",
+        nargs="*",
+        help="a shipped scenario or a YAML file (default: all shipped scenarios, some minutes)",
+    )
+    gallery.path(
+        "--out",
+        "folder for the page, index.html, and the runs (default: gallery)",
+        metavar="DIR",
+        default=Path("gallery"),
+    )
 
 
 def _add_pictures(commands: Any, scenario: CommandParser) -> None:

@@ -25,8 +25,8 @@ WINDOW = 0.01
 peak of an impact hardly counts."""
 
 MEANINGFUL = 1e-6
-"""An output whose size is below this fraction of the largest number at the start is not judged: its
-size may be round-off."""
+"""Outputs and controls whose size is below this fraction of the largest number at the start are not
+judged: their size may be round-off."""
 
 Sizes = dict[str, float]
 """Unit -> the largest number in it."""
@@ -55,8 +55,9 @@ class StateGrowth:
     @classmethod
     def controls(cls, plant: Plant, time: float, sizes: Sizes) -> Self:
         """The growth of the controls of a plant; those in a unit without a size are not judged."""
-        size = [sizes.get(signal.unit, 0.0) or np.inf for signal in plant.dae.control_signals]
-        return cls(plant.dae.control_signals, time, np.array(size))
+        size = np.array([sizes.get(signal.unit, 0.0) for signal in plant.dae.control_signals])
+        is_judged = size > MEANINGFUL * max(sizes.values(), default=0.0)
+        return cls(plant.dae.control_signals, time, np.where(is_judged, size, np.inf))
 
     def look(
         self, times: FloatArray, values: FloatArray, states: FloatArray

@@ -47,7 +47,10 @@ def main() -> int:
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
     _live_figures(texts.values(), library, out)
+    # Sphinx keeps an older one, with an older search.js in it.
+    (site / "_static" / "searchtools.js").unlink(missing_ok=True)
     sphinx = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    sphinx += ["-d", str(out / "doctrees")]  # No part of the site.
     code = subprocess.run([*sphinx, source, site]).returncode
     if not code:
         print(f"open {site / 'index.html'}")

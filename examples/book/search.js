@@ -1,10 +1,33 @@
-// Sphinx's weights, and a preference: pages that answer a question come first, lists of them last.
+// Sphinx's search finds pages with all words of a question. Here a page is the better the more words it has:
+// rare words count more than common ones, and long pages, which have many words, less than short ones.
+document.addEventListener("DOMContentLoaded", () => {
+  const withAll = Search.performTermsSearch;
+  Search.performTermsSearch = (words, excluded) => {
+    const { docnames, terms } = Search._index;
+    const lengths = docnames.map(() => 0), found = new Map();
+    for (const pages of Object.values(terms)) for (const page of [pages].flat()) lengths[page] += 1;
+    const mean = lengths.reduce((sum, length) => sum + length) / lengths.length;
+    for (const word of words) {
+      const pages = withAll(new Set([word]), excluded);
+      const rarity = Math.log(docnames.length / Math.max(pages.length, 1));
+      for (const page of pages) {
+        const sum = found.get(page[0]) ?? page.with(4, 0);
+        const length = lengths[docnames.indexOf(page[0])] / mean;
+        sum[4] += (rarity * page[4]) / (0.5 + 0.5 * length);
+        found.set(page[0], sum);
+      }
+    }
+    return [...found.values()];
+  };
+});
+
+// Pages that answer a question come first, lists of them last; the name of an object leads to it.
 var Scorer = {
   score: ([docname, , , , score]) => {
-    if (docname.startsWith("how_to/index_") || docname === "reference/error_codes") return score - 10;
-    return docname.startsWith("how_to/") ? score + 8 : score;
+    if (docname.startsWith("how_to/index_") || docname === "reference/error_codes") return score * 0.5;
+    return docname.startsWith("how_to/") ? score * 1.5 : score;
   },
-  objNameMatch: 11,
+  objNameMatch: 99,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },
   objPrioDefault: 0,

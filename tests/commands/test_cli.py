@@ -14,7 +14,7 @@ from recordings import animation
 import drake_dae
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.commands import analyze, simulate
+from drake_dae.commands import new, simulate
 from drake_dae.commands.run_folder import FILES, PART
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures.plots import PATHS, PLOTS
@@ -332,7 +332,7 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
         warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
         raise ScenarioError(("", "empty"))
 
-    for command_of in (simulate, analyze):
+    for command_of in (simulate, new):
         monkeypatch.setattr(command_of, "find_scenario", warn)
     assert main(["simulate", "two_tanks"]) == 1
     assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty [E10]\n"

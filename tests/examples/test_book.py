@@ -5,11 +5,13 @@ import os
 import re
 import subprocess
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 from book.generated import public_names, uses
 from book.notebooks import has_code, notebook
 from book.pages import BOOK, PageError, blocks, compare, pages, run_page
+from browser import BUDGET, CHROMIUM, OPTIONS, low_contrast
 
 MARKED = re.MULTILINE | re.DOTALL
 
@@ -165,3 +167,26 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
         loaded = re.findall(r"<(?:script|img|iframe)[^>]+src=\"(http[^\"]+)\"", text)
         loaded += re.findall(r"<link[^>]+rel=\"stylesheet\"[^>]+href=\"(http[^\"]+)\"", text)
         assert loaded == [], html
+    assert not list((tmp_path / "site").rglob("*.doctree"))
+    if CHROMIUM:
+        for page in ("index", "how_to/gains", "reference/errors", "tutorials/first_contact"):
+            assert low_contrast(tmp_path / "site" / f"{page}.html") == {}, page
+        for question, answer in QUESTIONS.items():
+            assert f"how_to/{answer}.html" in first_of_search(tmp_path / "site", question, tmp_path)
+
+
+QUESTIONS = {
+    "fmu for dymola": "export_c_fmu",
+    "unknown tool weight force error": "wrong_payload",
+    "yaml autocomplete vscode": "editor_completion",
+}
+"""Question with words that no page has -> the page that answers it."""
+
+
+def first_of_search(site: Path, question: str, folder: Path) -> list[str]:
+    """The addresses of the first three pages that the search of the site finds."""
+    address = f"{(site / 'search.html').as_uri()}?q={quote(question)}"
+    words = [CHROMIUM, *OPTIONS, f"--user-data-dir={folder / 'profile'}", BUDGET, "--dump-dom"]
+    done = subprocess.run([*words, address], capture_output=True, text=True, timeout=120)
+    found = re.findall(r'<li class="kind-\w+"><a href="([^"?#]*)', done.stdout)
+    return list(dict.fromkeys(found))[:3]

@@ -1,38 +1,46 @@
-"""`examples/gallery` shows scenarios on one page."""
+"""`examples/gallery` adds cards to those of `drake-dae gallery`."""
 
 import re
-from pathlib import Path
 
 import gallery.__main__
 import pytest
-from gallery.__main__ import MISSING, main
+from gallery.__main__ import PAGE, SYSTEMS, main, robot_data, system_card
 
-from drake_dae.scenario.shipped import shipped_scenarios
-
-
-def test_card_of_a_robot_that_is_not_installed_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(gallery.__main__, "robot_data", lambda: None)
-    quadruped = Path(gallery.__main__.HERE.parent / "tasks" / "quadruped.yaml")
-    assert main([str(quadruped), "--out", str(tmp_path)]) == 0
-    assert MISSING.format(name="quadruped") in (tmp_path / "index.html").read_text("utf-8")
+from drake_dae.commands.gallery import PICTURE
+from drake_dae.errors import GeometryWarning
 
 
 @pytest.mark.slow
-def test_cards_show_runs_and_keep_markup_as_text(tmp_path, capsys):
-    text = shipped_scenarios()["two_link_wall"].read_text("utf-8")
-    marked = tmp_path / "marked.yaml"
-    marked.write_text(re.sub("^description: .*", "description: <b>bold</b> & more", text), "utf-8")
-    out = tmp_path / "gallery"
-    assert main([str(marked), "--out", str(out)]) == 0
-    assert "runs marked" in capsys.readouterr().out
-    page = (out / "index.html").read_text("utf-8")
-    assert "&lt;b&gt;bold&lt;/b&gt; &amp; more" in page
-    assert "<b>bold" not in page
-    # It can be steered where zig is installed, and says what is missing where not.
-    assert ("bench.html" in page) != ("pip install" in page)
-    assert '<b class="good">good</b>: every output is at its reference' in page
-    for file in re.findall(r'(?:href|src)="([^"]+)"', page):
-        assert (out / file).is_file(), file
-    # What has not changed does not run again.
-    assert main([str(marked), "--out", str(out)]) == 0
-    assert "runs marked" not in capsys.readouterr().out
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_systems_that_are_no_robots_are_as_predicted(name, tmp_path):
+    """Their constraint is algebra of first order, so that projection leaves round-off alone."""
+    folder = tmp_path / name
+    folder.mkdir()
+    card = system_card(PAGE, folder)
+    assert card.outcome == "good"
+    assert card.remark.startswith("Tracked as predicted: ")
+    assert float(re.findall(r"residual (\S+) at most", card.figures)[0]) < 1e-9
+    assert "\n" not in card.description
+    assert "DaeSystem.from_functions" in card.source
+    for _, file in card.files:
+        assert (folder / file).is_file()
+    assert f'<img src="{name}/outputs.png"' in card.to_html(name)
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore", category=GeometryWarning)
+def test_robots_of_manufacturers_and_tasks_have_cards(tmp_path, monkeypatch):
+    """Of one of each kind: all take minutes."""
+    if robot_data() is None:
+        pytest.skip("pip install example-robot-data")
+    monkeypatch.setattr(gallery.__main__, "VENDORS", {"ur5": gallery.__main__.VENDORS["ur5"]})
+    monkeypatch.setattr(gallery.__main__, "SYSTEMS", {})
+    monkeypatch.setattr(gallery.__main__, "shipped_scenarios", dict)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", "")
+    assert main(["--out", str(tmp_path)]) == 0
+    page = (tmp_path / "index.html").read_text("utf-8")
+    names = re.findall(r'<article id="(\w+)">', page)
+    assert {"quadruped", "peg_in_hole", "ur5"} <= set(names)
+    assert page.count("off prediction by") == len(names)
+    assert all((tmp_path / name / PICTURE).stat().st_size > 10_000 for name in names)

@@ -70,7 +70,7 @@ def test_actuated_scenario_has_the_predicted_error(name):
     assert np.abs(record["tracking_error"][-1, -1]) < 0.3 * 5.0
 
 
-# Drake's own contact, and one that opens, have suites of their own: the former touches without a
+# Drake's own contact, and those that open, have suites of their own: the former touches without a
 # force at the start.
 IDEAL = [name for name in shipped_scenarios() if not name.startswith(IN_CONTACT)]
 
@@ -85,6 +85,7 @@ def test_shipped_scenario_runs_from_its_start_errors(name):
     assert scenario.description
     loop, record, distance = run(scenario)
     assert record.time[-1] == 0.3
+    assert np.max(np.abs(record["constraint_residual"])) < 1e-9
     for i, signal in enumerate(loop.plant.dae.output_signals):
         wanted = scenario.start.errors.get(signal.name, 0.0)
         # With a degree of 0 the law meets the reference at once, if its model is right.

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from html import unescape
 from pathlib import Path
 
@@ -57,6 +58,8 @@ const place = (ball) => bench.view.on_screen(ball.position);
 const besides = ([x, y], dx, dy) => [x + dx, y + dy];
 """
 
+LOW_CONTRAST = Path(__file__).with_name("low_contrast.js").read_text("utf-8")
+
 _RESULT = re.compile(r'<pre id="result"[^>]*>(.*?)</pre>', re.DOTALL)
 
 
@@ -103,7 +106,23 @@ def opened(address: str, profile: Path, width: int = 1000, height: int = 700):
     return result
 
 
-def shown(page: Path, script: str = "", fragment: str = "", size: str = "900,700") -> str:
+def low_contrast(page: Path) -> dict[str, float]:
+    """Texts with a contrast that is too low, light or dark; a page of some length is asserted."""
+    low: dict[str, float] = {}
+    for flags in ((), ("--blink-settings=preferredColorScheme=0",)):
+        has_text, found = json.loads(unescape(shown(page, LOW_CONTRAST, flags=flags)))
+        assert has_text
+        low |= found
+    return low
+
+
+def shown(
+    page: Path,
+    script: str = "",
+    fragment: str = "",
+    size: str = "900,700",
+    flags: Sequence[str] = (),
+) -> str:
     """The last text that a script returns which is called again and again.
 
     Args:
@@ -111,6 +130,7 @@ def shown(page: Path, script: str = "", fragment: str = "", size: str = "900,700
         script: The body of a function in JavaScript that returns a text.
         fragment: The end of the address, "#t=1".
         size: The window's width and height in pixels.
+        flags: Further options of Chromium.
     """
     told = (
         '<pre id="told"></pre><script>{ const tell = () => { try {'
@@ -123,7 +143,7 @@ def shown(page: Path, script: str = "", fragment: str = "", size: str = "900,700
     copy = page.with_name(f"told-{page.name}")
     copy.write_text(f"{head}{told}{end}{tail}", "utf-8")
     with tempfile.TemporaryDirectory() as user:
-        command = [CHROMIUM, *OPTIONS, f"--user-data-dir={user}", f"--window-size={size}"]
+        command = [CHROMIUM, *OPTIONS, *flags, f"--user-data-dir={user}", f"--window-size={size}"]
         command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri() + fragment]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     (found,) = re.findall(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)

@@ -157,7 +157,8 @@ def page_of(bench: Bench, data: object, engine: Sequence[str], connected: str = 
         f"<title>{html.escape(bench.data['title'])}</title>"
     )
     before, mark, after = bench.scene.page.rpartition("</body>")
-    return before.replace("<title>Drake MeshCat</title>", head, 1) + added + mark + after
+    before = before.replace("<title>Drake MeshCat</title>", head, 1)
+    return before.replace("<html>", '<html lang="en">', 1) + added + mark + after
 
 
 def web_text(name: str) -> str:

@@ -40,7 +40,8 @@ def find_packages(
 
     A package is searched near the file that names it: a folder above the file, or a subfolder of
     the package's name in such a folder, that has a package.xml with the name. Then it is searched
-    in ROS_PACKAGE_PATH, and last as a subfolder of `places`.
+    in ROS_PACKAGE_PATH by the name in its package.xml, and last as a subfolder of its name in the
+    folders of ROS_PACKAGE_PATH and in `places`.
 
     Args:
         file: A path, or a URL of a package.
@@ -64,7 +65,7 @@ def find_packages(
                 if folder is None and ros.Contains(name):
                     folder = Path(ros.GetPath(name))
                 if folder is None:
-                    inside = (place / name for place in places)
+                    inside = (place / name for place in (*_ros_folders(), *places))
                     folder = next((path for path in inside if path.is_dir()), None)
                 if folder is None:
                     missing[name] = str(origin) if origin.name else ""
@@ -122,6 +123,11 @@ def _package_name(file: Path) -> str:
         return ""
     match = re.search(r"<name>\s*([^<]*?)\s*</name>", text)
     return match[1] if match else ""
+
+
+def _ros_folders() -> list[Path]:
+    """The folders in ROS_PACKAGE_PATH."""
+    return [Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if part]
 
 
 def _ros_packages() -> PackageMap:

@@ -227,9 +227,9 @@ def traced_references(
         if row is None:
             whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ModelError(
-                f"a {type(whole).__name__} is no expression of time, and a rollout needs one: take "
-                "an ExpressionReference, PointToPointReference or SinusoidReference, or run the "
-                "loop by simulate"
+                f"a {type(whole).__name__} is no expression of time, and rollouts, exports and "
+                "pages need one: take an ExpressionReference, PointToPointReference or "
+                "SinusoidReference, or run the loop by simulate"
             )
         rows.append(row)
     return ca.vertcat(*rows)

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from browser import in_page, needs_chromium
+from browser import in_page, low_contrast, needs_chromium
 from runs import scenario
 
 from drake_dae import build_commanded, write_page
@@ -122,12 +122,20 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
 
 @needs_chromium
 @pytest.mark.slow
-def test_names_stay_text_and_a_phone_shows_all_of_it(page, tmp_path):
+def test_names_stay_text_a_phone_shows_all_of_it_and_a_screen_reader_names_it(page, tmp_path):
     found = in_page(
         page.read_text(),
         """
   const box = (id) => document.getElementById(id).getBoundingClientRect();
+  const controls = [...document.querySelectorAll("body > :not(.dg) :is(button, select, input)")];
+  const isNamed = (one) => one.ariaLabel || (one.matches("button") && one.textContent.trim())
+    || [...one.labels].some(({ control }) => control === one);
   return {
+    language: document.documentElement.lang,
+    controls: controls.length,
+    hidden: controls.filter((one) => one.tabIndex < 0).map(({ outerHTML }) => outerHTML),
+    nameless: controls.filter((one) => !isNamed(one)).map(({ outerHTML }) => outerHTML),
+    value: document.querySelector("input[type=range]").ariaValueText,
     title: document.title, head: document.getElementById("bench-title").textContent,
     images: document.images.length, bold: document.querySelectorAll("#bench-panel b").length,
     wide: [document.documentElement.scrollWidth, innerWidth],
@@ -145,6 +153,10 @@ def test_names_stay_text_and_a_phone_shows_all_of_it(page, tmp_path):
     )
     assert found["title"] == found["head"] == TITLE
     assert found["images"] == found["bold"] == 0
+    assert found["language"] == "en"
+    assert found["controls"] > 15
+    assert found["hidden"] == found["nameless"] == []
+    assert found["value"] == "1 "  # Of the speed, which has no unit.
     assert set(found["loaded"]) <= {"data:", "blob:"}
     assert found["wide"][0] <= found["wide"][1]
     below = 0.0
@@ -152,6 +164,13 @@ def test_names_stay_text_and_a_phone_shows_all_of_it(page, tmp_path):
         assert 0.0 <= left < right <= found["wide"][1] + 1e-6
         assert below <= top < bottom <= found["tall"] + 1e-6
         below = bottom - 1e-6
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_its_words_stand_out(page):
+    assert low_contrast(page) == {}
 
 
 def test_a_page_is_small_and_loads_nothing(page):

@@ -79,6 +79,15 @@ def test_the_file_itself_may_be_in_ros_package_path(tmp_path: Path, monkeypatch)
     assert joints(tmp_path, "package://panda_description/urdf/panda.urdf") == 7
 
 
+def test_a_folder_in_ros_package_path_has_the_name_that_files_use(tmp_path: Path, monkeypatch):
+    """As in the package example-robot-data, whose package.xml has another name."""
+    write_panda(tmp_path)
+    package = tmp_path / "panda_description" / "package.xml"
+    package.write_text("<package><name>another</name></package>", "utf-8")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
+    assert joints(tmp_path, "package://panda_description/urdf/panda.urdf") == 7
+
+
 def test_packages_of_the_scenario_come_first(tmp_path: Path):
     """The meshes of the file's own package are no more: those of the named one are read."""
     write_panda(tmp_path)

@@ -44,6 +44,7 @@ class Panel {
     const step = control.kind === "signal" ? 1 : "any";
     Object.assign(slider, { type: "range", min: control.low, max: control.high, step });
     slider.dataset.control = control.label;
+    slider.ariaLabel = name.textContent; // The label's first control is the output.
     slider.addEventListener("input", () => this.set(i, Number(slider.value)));
     label.append(name, shown, slider);
     this.rows[i] = { slider, shown, value: control.value };
@@ -74,6 +75,7 @@ class Panel {
     head.textContent = "All parameters";
     number.type = "number";
     number.step = "any";
+    [select.ariaLabel, number.ariaLabel] = ["parameter", "value of the parameter"];
     data.inputs.forEach(({ name }, i) => select.append(new Option(name, i)));
     const show = () => {
       number.value = this.present[select.value];
@@ -130,7 +132,7 @@ class Panel {
   show(i) {
     const { slider, shown, value } = this.rows[i];
     slider.value = value;
-    shown.textContent = `${short(value)} ${data.controls[i].unit}`;
+    shown.textContent = slider.ariaValueText = `${short(value)} ${data.controls[i].unit}`;
   }
   /* As at the start. */
   reset() {

@@ -1,7 +1,8 @@
 /* Curves over the last seconds on a canvas. */
 const SECONDS = 8;
 const ROUND_OFF = 1e-12; /* Less than this part of what is compared is no error of a loop. */
-const COLORS = ["#1a5fb4", "#c01c28", "#8833bb", "#9c6a00", "#0a7d6c", "#555"];
+/* Readers who see red or green less distinguish them, too; each has a contrast of 3 or more to white. */
+const COLORS = ["#1a5fb4", "#c01c28", "#1f9eb5", "#f86000", "#210300", "#b1005d"];
 
 class Plot {
   constructor(canvas) {
