@@ -205,10 +205,10 @@ class ObserverFunctions(Observed):
 
         While a contact sticks where it should slide, its coefficient rises with `BREAK_RATE`, so
         that it breaks away before the reference is far. Then samples of d are averaged, without a
-        low-pass, until `friction_rate` is faster.
+        low-pass, until `friction_rate` is faster. Not with a law that needs derivatives of d.
         """
         memory, observation = self.memory, self.observation
-        if observation.wanted is None:
+        if observation.wanted is None or memory.rates.numel():  # Springs answer jumps by swings.
             return 0.0 * memory.friction, memory.experience
         goal = observation.wanted.function(x, reference, self._delay, parameters)[0]
         wanted, actual = (

@@ -304,3 +304,19 @@ def test_a_contact_breaks_away_for_the_first_time_without_a_swing(acceleration):
     assert 1e3 * np.linalg.norm(error[late, :2], axis=1).max() < 0.1
     assert np.abs(error[late, -1]).max() < 0.1
     assert abs(record["friction"][-1, 0] - 0.45) < 0.005
+
+
+@pytest.mark.slow
+def test_behind_springs_friction_does_not_jump():
+    """The tracking law differentiates the estimates; with a jump it loses the contact at 0.7 s."""
+    loop, context = build_scenario(
+        load_scenario(
+            "wall_flexible_contact",
+            ["plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}"],
+        )
+    )
+    start, parameters = start_values(loop, context)
+    (run,) = rollout(loop, start, parameters, np.linspace(0.0, 1.0, 1001))
+    assert run.failure is None
+    error = (run.record["controlled_output"] - run.record["desired_output"])[-1]
+    assert 1e3 * np.linalg.norm(error[:2]) < 0.1
