@@ -12,9 +12,21 @@ from pydrake.multibody.tree import (
     PrismaticJoint,
     RevoluteJoint,
 )
+from pydrake.systems.analysis import SimulatorConfig
 from random_plants import random_inertia
 
-from drake_dae import JointPositions, Plane, PointOnSurface, RobotModel, RobotPlant
+from drake_dae import (
+    JointPositions,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    RobotPlant,
+    TrackingLaw,
+    make_closed_loop,
+    poles,
+    rollout,
+    start_values,
+)
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
@@ -130,3 +142,32 @@ def test_a_plant_of_many_joints_obeys_drakes_equations(size, most):
     wanted = np.linalg.solve(matrix, [*load, -bias])
     np.testing.assert_allclose(rates[size:], wanted[:-1], rtol=0, atol=1e-9 * np.abs(wanted).max())
     assert most is None or robot.dynamics.num_operations < most
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_law_of_sixty_joints_tracks_as_predicted():
+    """To the accuracy of the integrator, 1e-7 rad; the force to round-off of large torques."""
+    size = 60
+    plant = chain(size)
+    context = plant.CreateDefaultContext()
+    q = 0.1 * np.random.default_rng(1).normal(size=size)
+    plant.SetPositions(context, q)
+    point = plant.GetFrameByName("link59").CalcPoseInWorld(context).translation()
+    wall = PointOnSurface("link59", Plane(point, [-1.0, 0.0, 0.0]), name="wall")
+    joints = [f"j{i}" for i in range(size) if i != 1]
+    model = RobotModel.from_multibody(plant, [wall], [JointPositions(joints)], nominal_positions=q)
+    law = TrackingLaw(model.dae, poles(-4.0))
+    robot = RobotPlant(model, structure=law.structure, feedback=True)
+    references = {name: float(q[int(name[1:])]) + 0.01 for name in joints}
+    loop = make_closed_loop(robot, law, {**references, "wall.force": 5.0})
+    context = loop.diagram.CreateDefaultContext()
+    robot.set_consistent_state(robot.GetMyMutableContextFromRoot(context), model.dae.nominal_state)
+    start, parameters = start_values(loop, context)
+    config = SimulatorConfig(accuracy=1e-7)
+    (run,) = rollout(loop, start, parameters, [0.0, 0.5, 1.0], config=config, compiled=False)
+    assert run.failure is None
+    record = run.record
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record))
+    assert off[:, :-1].max() < 1e-7
+    np.testing.assert_allclose(record["constraint_force"], 5.0, rtol=1e-6)
