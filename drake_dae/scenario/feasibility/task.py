@@ -236,8 +236,7 @@ def _outcome(
         return str(failure), True
     empty = np.zeros_like(record["tracking_error"])
     job = judge_job(record, empty, changes=changes)
-    texts = [*job.problems, *job.remarks]
-    return texts[0], job.outcome is not JobOutcome.GOOD
+    return [*job.problems, *job.remarks][0], job.outcome is not JobOutcome.GOOD
 
 
 def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:
@@ -259,7 +258,7 @@ def _phases(
     controller: TaskController,
     model: RobotModel,
 ) -> tuple[PhaseNeeds, ...]:
-    limits, needs = Limits.of(model), []
+    limits, needs, forces = Limits.of(model), [], list(controller.contact.forces)
     ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
     for change, end in zip(changes, ends, strict=True):
         rows = _rows(record, change.time, end)
@@ -274,17 +273,12 @@ def _phases(
                 end,
                 *_nearest_drive(record, rows, limits),
                 *_nearest_joint(record, rows, limits),
-                float(np.max(_contact_force(record, controller)[rows], initial=0.0)),
+                float(np.max(record["constraint_force"][rows][:, forces].sum(1), initial=0.0)),
                 margin.relative,
                 margin.is_singular,
             )
         )
     return tuple(needs)
-
-
-def _contact_force(record: Record, controller: TaskController) -> FloatArray:
-    forces = list(controller.contact.forces)
-    return record["constraint_force"][:, forces].sum(axis=1)
 
 
 def _margin(structure: Structure, states: FloatArray) -> RankMargin:
@@ -329,7 +323,6 @@ def _touches(
         met = [event.time for event in record.events if before.time < event.time <= after.time]
         # The last row before the impact, after which the rate is zero.
         last = max(int(np.searchsorted(record.time, [*met, after.time][0])) - 1, 0)
-        # The fastest point of a face, and the one with most mass.
         speed = max(float(np.max(-record["distance"][last, len(forces) :])), 0.0)
         matrix = controller.law.structure.constraint_matrix(record["state"][last])
         mobility = float(np.min(np.diag(matrix)[forces]))

@@ -205,9 +205,8 @@ class ContactPlant(Diagram, Plant):
             self.model.constraints, self._balls(plant, material), strict=True
         ):
             solids = constraint.solids(own_values(constraint, self.dae, self._values))
-            friction = material.friction
+            friction, name = material.friction, constraint.friction_parameter
             if friction is None:
-                name = constraint.friction_parameter
                 friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
             balls = [
                 plant.RegisterCollisionGeometry(
@@ -234,9 +233,8 @@ class ContactPlant(Diagram, Plant):
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
-        for balls, touched in pairs:
-            allowed = GeometrySet(balls), GeometrySet(touched)
-            manager.Apply(CollisionFilterDeclaration().AllowBetween(*allowed))
+        for pair in pairs:
+            manager.Apply(CollisionFilterDeclaration().AllowBetween(*map(GeometrySet, pair)))
         return pairs
 
     def _balls(
