@@ -55,7 +55,7 @@ def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path:
     assert outcome.kind == RESULT, outcome
 
 
-# Task 154 releases a contact whose model error is larger than its contact_force.
+# Task 154 releases a contact whose model error exceeds its contact_force.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [3, 5, 154, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 37))]

@@ -7,16 +7,12 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.references import PointToPointReference, Reference
+from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
 _AWAY = 0.02
 """The distance in m from its start at which a Release has left the contact."""
-
-_PULL, _SMOOTH = 5.0, 6
-"""The force in N by which a Release pulls if zero does not suffice, and the number of continuous
-derivatives of that course, as many as springs and motors need."""
 
 
 @checked(ModelError)
@@ -197,9 +193,8 @@ class Dwell(_Lasting):
 class Release(Phase):
     """The force goes smoothly to zero; the phase ends below the task's contact_force.
 
-    If a force is left then, since the model is not exact, the goal goes on to -5 N, so that the
-    tool is pulled off. The phase is also late if the tool is 20 mm away and a force is still
-    measured, which is then the bias of a sensor.
+    It is also late if the tool is 20 mm away and a force is still measured, which is then the bias
+    of a sensor.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -212,8 +207,7 @@ class Release(Phase):
     begins_in_contact, ends_in_contact = True, False
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
-        pull = PointToPointReference(0.0, -_PULL, self.over, 2.0 * self.over, _SMOOTH)
-        return {contact_output: pull}
+        return {contact_output: 0.0}
 
     def margin(self, now: Moment, contact_force: float) -> float:
         return now.force - contact_force

@@ -101,7 +101,9 @@ class PhasePlan:
         self.phases: tuple[Phase, ...] = tuple(phases)
         self.contacts = contacts_of(phases)
         if self._leaves():
-            self.phases = (*phases, Release(name=LEAVE, on_success=STOP, on_failure=STOP))
+            # A model error may be larger than the task's contact_force, and holds the tool.
+            leave = Release(name=LEAVE, within=5.0, on_success=STOP, on_failure=STOP)
+            self.phases = (*phases, leave)
             self.contacts = (*self.contacts[:-1], True, False)
         self._edges = {place: self._all_from(place) for place in range(self.last)}
         self._check_reached()
