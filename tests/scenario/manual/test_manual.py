@@ -26,6 +26,7 @@ PURE = {
     ("!ImplicitSurface", "parameters"),  # Likewise.
     ("!Plane", "normal"),
     ("!Plate", "normal"),
+    ("Peg", "axis"),
     ("!Sphere", "axis"),
     ("!Cylinder", "axis"),
     ("!Cylinder", "zero"),
