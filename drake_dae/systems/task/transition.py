@@ -165,11 +165,14 @@ class SampledTask(TracedTask):
         """Whether the law in contact is active in the next phase, or while the robot rests."""
         end, plan = len(self._phases), self.task.plan
         closed = ca.mtimes(ca.DM([[*map(float, self.task.contacts[:end]), 0.0]]), _at(to, end + 1))
-        succeeds = ca.logic_and(ca.logic_not(ended[0]), ended[1])
         was = self._named["contact"] > 0.5
-        last = self._in_phase(
-            lambda place: ca.if_else(succeeds, float(plan.ends_in_contact(place)), was), was
-        )
+
+        def after(place: int) -> ca.SX:
+            lost = ended[2] if self._phases[place].ends_by_loss else ca.SX(0)
+            succeeds = ca.logic_and(ca.logic_not(ended[0]), ca.logic_or(ended[1], lost))
+            return ca.if_else(succeeds, float(plan.ends_in_contact(place)), was)
+
+        last = self._in_phase(after, was)
         rests = ca.logic_and(last, self._force >= self.task.contact_force)
         return ca.if_else(to > end - 0.5, rests, closed)
 
@@ -178,9 +181,12 @@ class SampledTask(TracedTask):
         end = len(self._phases)
 
         def after(place: int, number: int) -> ca.SX:
+            outcome = _OUTCOMES[number]
+            if outcome == "lost" and self._phases[place].ends_by_loss:
+                outcome = "success"
+            change = ca.vertcat(*self._successor(place, outcome))
             if number == len(_OUTCOMES) - 1:
-                return ca.vertcat(*self._successor(place, _OUTCOMES[number]))
-            change = ca.vertcat(*self._successor(place, _OUTCOMES[number]))
+                return change
             return ca.if_else(ended[number], change, after(place, number + 1))
 
         to, approaches, ending = ca.vertsplit(

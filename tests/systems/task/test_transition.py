@@ -1,5 +1,7 @@
 """Phases that change within a traced update, against the supervisor in Drake's Simulator."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from arms import error_controlled
@@ -30,6 +32,14 @@ TOUCH, PRESS = Approach(SPEED, over=OVER, name="touch"), Press(10.0, over=0.05)
 GENTLE = PhaseGuard("force", 8.0, samples=3)
 FEEL = GuardedMove(0.004, SPEED, over=0.02, name="feel")
 AWAY = Retreat(0.01, over=0.2, tolerance=0.005)
+
+
+@dataclass(frozen=True)
+class Until(Dwell):
+    """It rests until its contact is lost, as a `Search` does at an edge."""
+
+    ends_by_loss, ends_in_contact, begins_in_contact = True, False, True
+
 
 TASKS = {
     "all succeed": [TOUCH, PRESS, Move({"tool.z": CLIMB}, 0.3, over=0.1), Release(over=0.1), AWAY],
@@ -67,6 +77,7 @@ TASKS = {
         Retreat(0.03, over=0.2, name="back"),
     ],
     "lost, at rest": [TOUCH, PRESS],
+    "lost, as it should": [TOUCH, PRESS, Until(2.0), Retreat(0.04, over=0.2)],
     "a signal that never comes": [Wait("ready", within=0.1, if_late="hold")],
     "fails": [FEEL],
 }
