@@ -76,6 +76,7 @@ def _open(page: Path) -> None:
 def _page(options: argparse.Namespace) -> int:
     """Writes a scenario as a page."""
     from drake_dae.running.bench.page import write_page
+    from drake_dae.scenario.shipped import shipped_scenarios
 
     name, scenario, built = _built(options)
     file, bundle = options.out or Path(f"{name}.html"), options.shared_bundle
@@ -85,9 +86,9 @@ def _page(options: argparse.Namespace) -> int:
             built.loop, built.context, file, None, title, built.left_out, shared_bundle=bundle
         )
     except ModelError as error:
-        raise ModelError(
-            f"{name} cannot be a page ({error}); `drake-dae live {options.scenario}` runs it"
-        ) from error
+        is_shipped = Path(options.scenario) in shipped_scenarios().values()
+        command = f"drake-dae live {name if is_shipped else options.scenario}"
+        raise ModelError(f"{name} cannot be a page ({error}); `{command}` runs it") from error
     sizes = {str(path): path.stat().st_size for path in files}
     if options.json:
         print(json.dumps({"files": sizes, "left_out": list(built.left_out)}, indent=2))
