@@ -21,7 +21,7 @@ from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
-from drake_dae.errors import AssumptionError, ModelError, ScenarioError
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
@@ -234,7 +234,10 @@ def make_plant(
         scenario.plant_disturbances,
         pushed,
     )
-    return scenario.plant.plant(robot)
+    try:
+        return scenario.plant.plant(robot)
+    except InconsistentStateError as error:  # Its default state is projected.
+        raise ScenarioError(("start.positions", str(error))) from error
 
 
 def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:

@@ -9,6 +9,7 @@ import scipy.linalg
 from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
+from drake_dae.trace.round_off import positive
 
 T = TypeVar("T")
 
@@ -212,7 +213,9 @@ def are_dependent(gradients: FloatArray) -> bool:
     """Whether rows, whose lengths do not matter, are linearly dependent."""
     if not np.all(np.isfinite(gradients)):
         return True
-    length = np.linalg.norm(gradients, axis=1, keepdims=True)
-    if gradients.shape[0] > gradients.shape[1] or not np.all(length > 0.0):
+    # By their largest entries first: their squares may be too large for a number.
+    rows = gradients / positive(np.abs(gradients).max(axis=1, keepdims=True, initial=0.0))
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    if rows.shape[0] > rows.shape[1] or not np.all(length > 0.0):
         return True
-    return bool(np.linalg.svd(gradients / length, compute_uv=False)[-1] < DEPENDENT)
+    return bool(np.linalg.svd(rows / length, compute_uv=False)[-1] < DEPENDENT)

@@ -138,10 +138,13 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("gains.all=[-4+1j]", ["gains.all.0: expected a number, got '-4+1j'"]),
         ("outputs.0=!Foo {}", ["outputs.0: expected one of !PointCoordinates, ", "got !Foo"]),
         # The robot's file.
-        ("robot.file=no.urdf", ["robot.file: no file '", "scenarios/no.urdf", "folder"]),
+        ("robot.file=no.urdf", ["robot.file: no file '", "/no.urdf", "folder"]),
         ("robot.file=/tmp", ["robot.file: no file '/tmp'"]),
         ("robot.file=package://x/y.urdf", ["robot.file: ", "unknown package 'x'"]),
-        ("robot.file=two_link_wall.yaml", ["robot.file: ", "two_link_wall.yaml", ".urdf"]),
+        (
+            f"robot.file={find_scenario('two_link_wall')}",
+            ["robot.file: ", "two_link_wall.yaml", ".urdf"],
+        ),
         # Constraints.
         ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "did you mean 'tool'?", "link2"]),
         ("constraints.0.point=[1, 2]", ["constraints.0.point: expected 3 numbers, got [1, 2]"]),

@@ -114,12 +114,17 @@ def shortest_step(
 ) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
     """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
 
-    It is -(C S)' N^-1 residual with N = C S (C S)'. An error of N^-1 grows with the square of the
-    condition of C, and only makes Newton's method slower. The lengths of the parts of the gradients
+    It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
+    grows with the square of the condition of C, and only makes Newton's method slower. The lengths of the parts of the gradients
     that are orthogonal to those before are returned as well.
     """
     if not gradient.shape[0]:
         return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
     scaled = ca.mtimes(gradient, ca.diag(scale))
+    # By their largest entries: the squares of entries may be too large for a number.
+    largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
+    sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
+    scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
     normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
-    return (lambda residual: -ca.mtimes(scaled.T, normal.solve(residual))), normal.lengths
+    lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
+    return (lambda residual: -ca.mtimes(scaled.T, normal.solve(residual / sizes))), lengths

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
@@ -132,7 +132,11 @@ class MultibodyExpressions:
 
         Args:
             rotors: The addition of the rotors to the diagonal of M, shape (nv,).
+
+        Raises:
+            ModelError: They have another shape.
         """
+        rotors = vector("rotors", rotors, self.plant.num_velocities())
         return ArticulatedBodies(self._links, rotors) if is_one_by_one(self._links) else None
 
     def landmarks(self) -> ca.SX:

@@ -238,7 +238,10 @@ def _range(
     signal: Signal, times: FloatArray, values: FloatArray, low: float, high: float
 ) -> SignalRange:
     """The range of a signal within its limits, with times."""
-    least, largest = int(np.argmin(values)), int(np.argmax(values))
+    # The first of those that differ by round-off.
+    near = 1e-9 * np.max(np.abs(values))
+    least = int(np.argmax(values <= values.min() + near))
+    largest = int(np.argmax(values >= values.max() - near))
     beyond = (values < low - _SLACK) | (values > high + _SLACK)
     return SignalRange(
         signal,

@@ -80,7 +80,10 @@ def read_into(
         name, described = str(description.file), description.folders
     is_url = name.startswith("package://")
     if not is_url and not _is_file(name):
-        raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
+        raise ModelError(
+            f"no file '{name}'; a relative path starts in the scenario's folder, that of a shipped "
+            "scenario in the working directory"
+        )
     parser = Parser(plant)
     missing: dict[str, str] = {}
     base = [robot.base.weld] if robot.base is not None else []

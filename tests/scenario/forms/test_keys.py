@@ -37,8 +37,8 @@ def test_other_messages_are_unchanged():
     ("name", "setting", "words"),
     [
         (
-            "two_link_wall",
-            "start={positions: {joint1: 0}}",
+            "two_link_wall",  # A stretched arm that touches the wall.
+            "start={positions: {joint1: 0.927295218, joint2: 0}}",
             ["outputs: Assumption (4)", "start.positions"],
         ),
         (

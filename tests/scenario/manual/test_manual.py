@@ -38,6 +38,7 @@ PURE = {
     ("!JointCoupler", "ratio"),
     ("!AxisNormalToSurface", "axis"),
     ("!Blade", "axis"),
+    ("Peg", "axis"),
     ("!RollingWheel", "axle"),
     ("!RollingWheel", "normal"),
     ("!RollingBall", "along"),
