@@ -115,8 +115,8 @@ def shortest_step(
     """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
 
     It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
-    grows with the square of the condition of C, and only makes Newton's method slower. The lengths of the parts of the gradients
-    that are orthogonal to those before are returned as well.
+    grows with the square of the condition of C, and only makes Newton's method slower. The lengths
+    of the parts of the gradients that are orthogonal to those before are returned as well.
     """
     if not gradient.shape[0]:
         return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
@@ -127,4 +127,6 @@ def shortest_step(
     scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
     normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
     lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
-    return (lambda residual: -ca.mtimes(scaled.T, normal.solve(residual / sizes))), lengths
+    # CasADi lets the infinities of constant gradients cancel each other.
+    regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
+    return lambda residual: regular - ca.mtimes(scaled.T, normal.solve(residual / sizes)), lengths
