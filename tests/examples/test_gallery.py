@@ -41,6 +41,6 @@ def test_robots_of_manufacturers_and_tasks_have_cards(tmp_path, monkeypatch):
     assert main(["--out", str(tmp_path)]) == 0
     page = (tmp_path / "index.html").read_text("utf-8")
     names = re.findall(r'<article id="(\w+)">', page)
-    assert {"quadruped", "peg_in_hole", "ur5"} <= set(names)
+    assert {"quadruped", "ideal_peg", "ur5"} <= set(names)
     assert page.count("off prediction by") == len(names)
     assert all((tmp_path / name / PICTURE).stat().st_size > 10_000 for name in names)

@@ -40,7 +40,7 @@ def test_task_is_tracked_as_predicted(task, tmp_path, monkeypatch, capsys):
     assert "\nTracked as predicted:" in capsys.readouterr().out
 
 
-NEAR = {"peg_in_hole", "deburring", "grinding", "writing"}
+NEAR = {"ideal_peg", "deburring", "grinding", "writing"}
 
 
 @pytest.mark.slow
