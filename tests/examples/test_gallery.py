@@ -8,6 +8,7 @@ from gallery.__main__ import PAGE, SYSTEMS, main, robot_data, system_card
 
 from drake_dae.commands.gallery import PICTURE
 from drake_dae.errors import GeometryWarning
+from drake_dae.scenario.shipped import shipped_scenarios
 
 
 @pytest.mark.slow
@@ -25,6 +26,12 @@ def test_systems_that_are_no_robots_are_as_predicted(name, tmp_path):
     for _, file in card.files:
         assert (folder / file).is_file()
     assert f'<img src="{name}/outputs.png"' in card.to_html(name)
+
+
+def test_no_task_has_the_name_of_a_shipped_scenario():
+    tasks = {path.stem for path in gallery.__main__.TASKS.glob("*.yaml")}
+    assert len(tasks) > 5
+    assert not tasks & set(shipped_scenarios())
 
 
 @pytest.mark.slow
