@@ -30,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures docs gallery sheet benches referee clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns estimated friction peers house equations pictures docs gallery sheet benches referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
