@@ -1,25 +1,16 @@
 """The insertions of `examples/insertions`, and holes into which the peg does not go."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-FOLDER = Path(__file__).parents[2] / "examples" / "insertions"
+from programs import loaded
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 
 @pytest.fixture(scope="module")
 def example():
-    spec = importlib.util.spec_from_file_location("insertions", FOLDER / "__main__.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+    with loaded("insertions") as module:
+        yield module
 
 
 @pytest.fixture(scope="module")

@@ -1,22 +1,13 @@
 """The table of `examples/unknown_friction`, of which a short piece is run here."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
-
-FOLDER = Path(__file__).parents[2] / "examples" / "unknown_friction"
+from programs import loaded
 
 
 @pytest.fixture(scope="module")
 def example():
-    spec = importlib.util.spec_from_file_location("unknown_friction", FOLDER / "__main__.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+    with loaded("unknown_friction") as module:
+        yield module
 
 
 @pytest.mark.slow

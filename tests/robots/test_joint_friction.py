@@ -20,7 +20,7 @@ from drake_dae.errors import ModelError, ScenarioError
 COULOMB, VISCOUS, SLOW = np.array([3.0, 0.5]), np.array([0.2, 0.1]), 0.01
 
 
-def rubbing(**more):
+def with_joint_friction(**more):
     """The two-link arm on its wall, with friction in its joints."""
     known = arm("two_link").model
     joints = JointFriction(["joint1", "joint2"], **more)
@@ -44,7 +44,7 @@ def added(model, velocities):
 @pytest.mark.parametrize("velocities", [(0.3, -0.2), (0.0, 0.0), (-1e-3, 2.0)])
 def test_joints_have_coulomb_and_viscous_friction(velocities):
     """Within round-off of torques of up to 100 N m."""
-    model = rubbing(coulomb=COULOMB, viscous=VISCOUS, stiction_tolerance=SLOW)
+    model = with_joint_friction(coulomb=COULOMB, viscous=VISCOUS, stiction_tolerance=SLOW)
     v = np.array(velocities)
     expected = -COULOMB * v / np.hypot(v, SLOW) - VISCOUS * v
     assert_allclose(added(model, v), expected, atol=1e-12)
@@ -56,7 +56,7 @@ def test_a_discrete_plant_takes_friction_implicitly():
     D is that of the velocities before the step. Within round-off of a 20 kg m^2 arm.
     """
     slow, h, torque = 1e-5, 1e-3, np.array([40.0, -10.0])
-    model = rubbing(coulomb=COULOMB, viscous=VISCOUS, stiction_tolerance=slow)
+    model = with_joint_friction(coulomb=COULOMB, viscous=VISCOUS, stiction_tolerance=slow)
     plant = CompliantPlant(model, PointMaterial(h, stiffness=1e5, radius=1e-5))
     q, v = np.array([1.4, -2.1]), np.array([0.02, -1e-4])  # The tool is 0.25 m from the wall.
     context = plant.CreateDefaultContext()

@@ -33,7 +33,7 @@ integrator: {integration_scheme: runge_kutta3, max_step_size: 0.001, use_error_c
 def test_an_insertion_beside_its_hole_pushes_as_a_spring_and_damper(rolls, tmp_path):
     """F = m (p^2 e + 2 p v) where the tool rests and the reference goes on, m = 1 / (J M^-1 J^T).
 
-    Exact but for the hold of the control over a sample, in which e moves on by 0.04 mm, 0.8 % of
+    Exact except for the hold of the control over a sample, in which e moves on by 0.04 mm, 0.8 % of
     it.
     """
     (tmp_path / "insert.yaml").write_text(TEXT)

@@ -41,7 +41,7 @@ class ObserverMemory:
         has_sample: 0 before the first sample, then 1, shape (1,).
         experience: The samples for which each contact slides, while they are few, shape (c,).
         filter: The state of the `ParameterFilter`.
-        identified: The part of it that are parameters, but for coefficients of friction.
+        identified: The part of it that are parameters, without the coefficients of friction.
     """
 
     disturbance: ca.SX

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.systems.blocks.traced import HELD, Computation, Reaction, Update
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Computation, Reaction, Update
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Outcome
 from drake_dae.systems.task.phases.phase import APPROACH, FAIL, LEAVE
@@ -42,7 +42,7 @@ class SampledTask(TracedTask):
         self._begin_phase(held, ca.SX(0), ca.SX(contact), present, motion)
         held[NAMES.index("felt")] = self._time
         held[self._entered_places.start] = 1
-        sources = ("$time", "estimated_state", "$parameters")
+        sources = (TIME, "estimated_state", PARAMETERS)
         return Computation(
             ca.Function("begun", [self._time, x, parameters], [held]), sources, (HELD,)
         )
