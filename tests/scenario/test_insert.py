@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pydrake.systems.analysis import SimulatorConfig
+from runs import scenario
 
-from drake_dae import load_scenario, simulate
+from drake_dae import build_scenario, load_scenario, simulate
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
@@ -58,3 +60,10 @@ def test_an_insertion_beside_its_hole_pushes_as_a_spring_and_damper(rolls, tmp_p
     assert_allclose(
         record["controlled_output"][-1, 0], record["controlled_output"][0, 0], atol=1e-3
     )
+
+
+def test_an_insertion_refuses_an_observer():
+    """Given, or chosen together with the gains: both would cancel what the hole exerts."""
+    for settings in (["observer={rate: 20}"], ["gains=null", "task.gains=null"]):
+        with pytest.raises(ScenarioError, match="observer: an Insert lets the hole push"):
+            build_scenario(scenario("peg_in_hole", *settings))

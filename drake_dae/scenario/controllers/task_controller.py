@@ -10,6 +10,7 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.controller import TaskController
 from drake_dae.systems.task.open_contact import open_contact
+from drake_dae.systems.task.phases import Insert
 
 
 def check_task(scenario: Scenario) -> None:
@@ -54,6 +55,12 @@ def task_controller(
             "cannot filter, and would take for a touch"
         )
         raise ScenarioError(("sampling", text))
+    if scenario.observer is not None and any(isinstance(p, Insert) for p in task.phases):
+        text = (
+            "an Insert lets the hole push the tool aside, and an observer would cancel that push; "
+            "give gains, and no observer"
+        )
+        raise ScenarioError(("observer", text))
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
