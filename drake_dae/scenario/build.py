@@ -1,50 +1,22 @@
-"""The closed loop of a scenario."""
+"""A scenario, completed and built."""
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-
-import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.references.by_name import assigned, in_order
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.observing import control_lag
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.sources import make_generator
-from drake_dae.diagrams.state_feedback import make_sensor
-from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
-from drake_dae.robots.model import RobotModel
+from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import TimedScenario, timed
-from drake_dae.scenario.controllers.adaptive import adaptive_controller, check_adaptive
-from drake_dae.scenario.controllers.task_controller import (
-    check_task,
-    opening_contact,
-    task_controller,
-)
-from drake_dae.scenario.forms.keys import at, violated
+from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.controllers.task_controller import check_task
+from drake_dae.scenario.feasibility.pace import paced
+from drake_dae.scenario.forms.keys import violated
+from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
-from drake_dae.scenario.observed import law_robot, observed_structure
-from drake_dae.scenario.own_model import check_disturbances, own_model
-from drake_dae.scenario.parts.parts import Adaptive, Tracking
-from drake_dae.scenario.plants import RobotToSimulate
-from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.cascade.cascade import SpringCascade
 from drake_dae.systems.control.command_filter import CommandLimits
-from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.plants.contract import Plant
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -80,8 +52,9 @@ def build_completed(
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    in_time, motion = timed(chosen.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *in_time.notes)
+    slowed = paced(chosen.scenario, model, structure)
+    in_time, motion = timed(slowed.scenario, model, structure)
+    notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(
         completed.scenario,
@@ -92,243 +65,3 @@ def build_completed(
         motion=motion,
         commands=commands,
     )
-
-
-def build_loop(
-    scenario: Scenario,
-    model: RobotModel,
-    structure: Structure,
-    scene_graph: SceneGraph | None = None,
-    meshcat: Meshcat | None = None,
-    plant: Plant | None = None,
-    motion: TimedScenario | None = None,
-    commands: CommandLimits | None = None,
-) -> ClosedLoop:
-    """Builds the closed loop of a scenario's robot.
-
-    Args:
-        scenario: A completed scenario with gains, from `advised`.
-        model: The scenario's robot, by `scenario_model`.
-        structure: The structure of the model's system.
-        scene_graph: The scene graph of the robot's geometry; needed to draw it.
-        meshcat: The Meshcat for a live view; None for no view.
-        plant: A plant in place of the scenario's; None for the scenario's.
-        motion: The time-optimal motion, from `timed`; None for the scenario's references.
-        commands: The limits with which references follow a person's commands; signals for which a
-            task waits are then inputs of the diagram. None for no commands.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
-    # The law, and its exogenous signals.
-    check_adaptive(scenario)
-    task, sampling = scenario.task, scenario.sampling
-    opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
-    law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
-    references: list[Reference] = []
-    if motion is not None:
-        references = [motion.reference]
-    elif task is None:
-        references = _references(scenario.references, law)
-    exogenous = []
-    if scenario.observer is None:
-        exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
-    limits = _limits(scenario, model)
-    if motion is not None and motion.governed is not None and limits is None:
-        # A governed motion keeps the limits of its drives, where all have one.
-        limits = model.control_limits if np.isfinite(model.control_limits).all() else None
-
-    # The plant, which may have further exogenous signals.
-    feedback = task is None and can_be_fed_back(law, sampling, limits)
-    of_plant = own_model(scenario, model.links) if plant is None else None
-    plant_exogenous = None
-    if of_plant is not None:
-        plant = make_plant(scenario, of_plant.model, of_plant.structure, opens=opens)
-        scene_graph = of_plant.scene_graph
-        degrees = plant.exogenous_layout.degrees
-        plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    pushed = commands is not None
-    plant = plant or make_plant(scenario, model, structure, feedback, opens, pushed)
-
-    # The parts between plant and law; errors get the key of the part.
-    with at("force_feedback"):
-        sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
-    settings = LoopSettings(
-        sensor=sensor,
-        encoders=scenario.encoders,
-        sampling=sampling,
-        control_limits=limits,
-        observer=scenario.observer,
-        exogenous=exogenous,
-        plant_exogenous=plant_exogenous,
-        governed=None if motion is None else motion.governed,
-        tolerances=scenario.tolerances,
-        signals={} if task is None or commands is not None else task.signals,
-        commands=commands,
-        start_time=scenario.integrator.start_time,
-    )
-    _check_parts(settings, plant)
-
-    # The connections.
-    with at("law" if task is None else "task"):
-        controller = _controller(scenario, model, structure, law, plant)
-        if controller is not None:
-            generator = None if task is not None else make_generator(references, law, settings)
-            return wire_loop(
-                plant, controller, generator, settings, scene_graph=scene_graph, meshcat=meshcat
-            )
-    keys = ["observer"] if scenario.observer is not None else []
-    keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
-    with at(" or ".join(keys) or "start.positions"):
-        return make_closed_loop(
-            plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
-        )
-
-
-def _controller(
-    scenario: Scenario, model: RobotModel, structure: Structure, law: TrackingLaw, plant: Plant
-) -> Controller | None:
-    """The controller of a task, an adaptive law or a cascade; None for the tracking law."""
-    sampling = scenario.sampling
-    period = plant.time_step if sampling is None else sampling.period
-    if scenario.task is not None:
-        return task_controller(scenario, model, law, period)
-    if isinstance(scenario.law, Adaptive):
-        return adaptive_controller(scenario.law, model, structure, period)
-    if scenario.spring_loop is None:
-        return None
-    assert sampling is not None  # law_robot.
-    lag = control_lag(plant, hold_before(plant, sampling))
-    return SpringCascade(law, model, scenario.spring_loop, period, lag, sampling.mean_delay)
-
-
-def make_plant(
-    scenario: Scenario,
-    model: RobotModel,
-    structure: Structure,
-    feedback: bool = False,
-    opens: Sequence[str] = (),
-    pushed: bool = False,
-) -> Plant:
-    """Makes the plant of a scenario.
-
-    Args:
-        scenario: The scenario.
-        model: The robot, with payloads if the plant does not add them itself.
-        structure: The structure of the model's system.
-        feedback: Whether the plant may evaluate the law itself.
-        opens: The contacts that a task opens and closes; empty without a task.
-        pushed: Whether the links of Drake's own plant can be pushed while it runs.
-
-    Raises:
-        ScenarioError: The robot cannot be simulated so; the message names the key.
-    """
-    check_disturbances(scenario.plant_disturbances, model.links)
-    robot = RobotToSimulate(
-        model,
-        structure,
-        feedback,
-        opens,
-        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
-        scenario.plant_parameters,
-        scenario.plant_disturbances,
-        pushed,
-    )
-    try:
-        return scenario.plant.plant(robot)
-    except InconsistentStateError as error:  # Its default state is projected.
-        raise ScenarioError(("start.positions", str(error))) from error
-
-
-def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
-    """The law of a scenario for a system."""
-    force, damping = scenario.force_feedback, scenario.constraint_damping
-    keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
-    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
-    stiffness = scenario.law.contact_stiffness if isinstance(scenario.law, Tracking) else None
-    if stiffness is not None:
-        keys = ["law", *keys]
-        if scenario.task is not None or scenario.time_optimal is not None:
-            key = "task" if scenario.task is not None else "time_optimal"
-            text = f"is not for scenarios with `{key}`; leave it out"
-            raise ScenarioError(("law.contact_stiffness", text))
-    with at(" or ".join(keys)):
-        assert scenario.gains is not None  # advised.
-        return TrackingLaw(
-            structure.system,
-            scenario.gains.design(),
-            structure=structure,
-            measured_force=force.is_measured,
-            force_gain=force.gain,
-            constraint_damping=None if damping is None else damping.design(),
-            integral=scenario.integral or (),
-            contact_stiffness=stiffness,
-        )
-
-
-def _check_parts(settings: LoopSettings, plant: Plant) -> None:
-    """Checks that the parts of a loop fit the plant; errors get the keys of the parts."""
-    if settings.sampling is not None:
-        with at("sampling"):
-            hold_before(plant, settings.sampling)
-    if settings.encoders is not None:
-        with at("encoders"):
-            make_sensor(plant, settings.encoders, settings.period(plant.time_step))
-    if settings.tolerances is not None:
-        with at("tolerances"):
-            settings.tolerances.places(plant.dae.output_signals)
-
-
-@at("saturation")
-def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
-    """The limits of the controls, if the scenario has saturation."""
-    if not scenario.saturation:
-        return None
-    if not np.any(np.isfinite(model.control_limits)):
-        raise ModelError("the robot's file has no effort limits, or they are not on the control")
-    return model.control_limits
-
-
-def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -> list[Reference]:
-    """References in the order of the outputs, each smooth enough."""
-    outputs = [signal.name for signal in law.system.output_signals]
-    smooth = []
-    for name, reference in references.items():
-        with at(f"references.{name}"):
-            degrees = law.layout.reference_degrees
-            smooth.append(assigned(name, reference, outputs, degrees))
-    with at("references"):
-        return in_order(smooth, outputs)
-
-
-def exogenous_references(
-    scenario: Scenario, system: DaeSystem, needed: Sequence[int]
-) -> list[Reference]:
-    """The references of the exogenous parameters, in the order of the system.
-
-    Args:
-        scenario: The scenario.
-        system: The system of its plant or of its law.
-        needed: The number of derivatives of each entry that are needed.
-
-    Raises:
-        ScenarioError: There are too few or too many, or one is not smooth enough.
-    """
-    moving: list[Reference] = []
-    degrees = list(needed)
-    for parameter in system.exogenous.moving:
-        key = f"exogenous.{parameter.name}"
-        references = [
-            entry if isinstance(entry, Reference) else ConstantReference(entry)
-            for entry in scenario.exogenous[parameter.name]
-        ]
-        size = sum(reference.size for reference in references)
-        if size != parameter.value.size:
-            text = f"{size} values, but the parameter has {parameter.value.size}"
-            raise ScenarioError((key, text))
-        for index, reference in enumerate(references):
-            with at(f"{key}.{index}"):
-                reference.derivatives(degrees[: reference.size])
-            del degrees[: reference.size]
-        moving += references
-    return moving

@@ -26,7 +26,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.build import build_loop, make_plant
+from drake_dae.scenario.loop import build_loop, make_plant
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario

@@ -19,11 +19,12 @@ from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
+from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts.parts import Poles, Tracking
@@ -73,7 +74,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:
-        needs = task_needs(advised(scenario, model, structure).scenario, model, structure)
+        chosen = paced(advised(scenario, model, structure).scenario, model, structure).scenario
+        needs = task_needs(chosen, model, structure)
         behind = _in_the_way(needs, model, scene_graph)
         return Feasibility(
             analyze(model.dae), scenario.duration, *_ranges(needs, model), behind=behind, task=needs

@@ -17,7 +17,7 @@ from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import SimulationError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import reaction_time, touch_peak
-from drake_dae.scenario.build import build_loop
+from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
@@ -245,7 +245,7 @@ def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:
     return bool(places) and any(plan[place].is_relative for place in places)
 
 
-def _rows(record: Record, begin: float, end: float) -> Indices:
+def phase_rows(record: Record, begin: float, end: float) -> Indices:
     """The indices of the rows of a phase; at the time of a change a row has the values before."""
     first = int(np.searchsorted(record.time, begin, side="right")) if begin > record.time[0] else 0
     last = int(np.searchsorted(record.time, end, side="right"))
@@ -261,7 +261,7 @@ def _phases(
     limits, needs, forces = Limits.of(model), [], list(controller.contact.forces)
     ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
     for change, end in zip(changes, ends, strict=True):
-        rows = _rows(record, change.time, end)
+        rows = phase_rows(record, change.time, end)
         if not rows.size or (change.place >= len(controller.task.plan.phases)):
             continue
         law = controller.law if change.in_contact else controller.free_law

@@ -4,13 +4,39 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import positive, unknown_name
 from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
-from drake_dae.scenario.forms.forms import Choice
+from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.task.phases.plan import named
 from drake_dae.systems.task.task import Task
+
+
+@dataclass(frozen=True)
+class WithinLimits:
+    """Phases are slowed down until the law's model of the task keeps the limits of the robot.
+
+    Before the run the task is run by the law's model, as `drake-dae analyze` does, and each phase
+    that exceeds a limit gets a `pace` below 1; one that keeps them all keeps its pace.
+
+    Attributes:
+        efforts: The fraction of the drives' effort limits that phases may use; the rest is left for
+            feedback.
+        joint_speeds: The fraction of the joints' velocity limits that phases may use.
+    """
+
+    efforts: float = 0.95
+    joint_speeds: float = 0.95
+
+    def __post_init__(self) -> None:
+        for name in ("efforts", "joint_speeds"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ModelError(
+                    f"{name} is a fraction of the robot's own limits, above 0 and at most 1, got "
+                    f"{getattr(self, name):g}"
+                )
 
 
 @dataclass(frozen=True)
@@ -36,6 +62,12 @@ class ScenarioTask:
         retries: How many times phases may return to the approach; then the run ends with an error.
         signals: Name -> reference of a signal for which a phase waits. The signal is set where the
             reference is above 1/2.
+        pace: Name of a phase -> the multiple of its speed at which it moves: it passes through the
+            same values, with a longer `over`, a lower `speed`, and slower references. 1 if left
+            out.
+        within_limits: Slows phases down until they keep the limits of drives and joints; the
+            scenario in the folder of the run has the result as `pace`. No phase is slowed down if
+            left out.
         gains: The gains of the law without contact, with the distance among its outputs; those of
             `gains` if left out.
     """
@@ -47,6 +79,8 @@ class ScenarioTask:
     tare_time: float = 0.0
     retries: int = 10
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
+    pace: Mapping[str, float] = field(default_factory=dict)
+    within_limits: Annotated[WithinLimits, Form()] | None = None
     gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
@@ -65,5 +99,10 @@ class ScenarioTask:
         Raises:
             ModelError: The phases are not consistent.
         """
+        phases = {phase.name: phase for phase in named(self.phases)}
+        for name, pace in self.pace.items():
+            if name not in phases:
+                raise ModelError(f"pace: {unknown_name('phase', name, phases)}")
+            phases[name] = phases[name].at_pace(positive(f"pace: {name}", pace))
         limits = self.contact_force, self.patience, force_noise, self.tare_time, self.retries
-        return Task(self.phases, *limits)
+        return Task(tuple(phases.values()), *limits)

@@ -168,3 +168,15 @@ def test_phase_takes_time(name):
     phase = MEMBERS[name][0]
     with pytest.raises(ModelError, match=rf"{phase.name}: over must be positive, got 0\.0"):
         replace(phase, over=0.0)
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_a_pace_changes_times_and_speeds_and_nothing_else(name):
+    """Twice the pace, then half of it, is the same phase."""
+    phase = MEMBERS[name][0]
+    fast = phase.at_pace(2.0)
+    assert fast.over == phase.over / 2.0
+    assert fast.awaited(CONTACT_FORCE).split()[0] == phase.awaited(CONTACT_FORCE).split()[0]
+    assert fast.speed_of_approach == 2.0 * phase.speed_of_approach
+    if not isinstance(phase, Move):  # Its references are wrapped.
+        assert fast.at_pace(0.5) == phase

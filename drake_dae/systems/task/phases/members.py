@@ -1,13 +1,15 @@
 """The phases of a task: touch, press, move, wait, let go."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.references import Reference
+from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
@@ -170,6 +172,13 @@ class Move(_Lasting):
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return self.references
+
+    def at_pace(self, pace: float) -> Self:
+        paced = {
+            name: PacedReference(goal, pace) if isinstance(goal, Reference) else goal
+            for name, goal in self.references.items()
+        }
+        return replace(super().at_pace(pace), duration=self.duration / pace, references=paced)
 
 
 @checked(ModelError)

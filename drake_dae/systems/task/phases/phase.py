@@ -2,9 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from math import inf
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
@@ -27,6 +27,9 @@ NEXT, DONE, APPROACH, HOLD, LEAVE, STOP, FAIL = ENDS = (
 """The successors besides the name of a phase."""
 
 _NOTHING: str | None = None
+
+_BY_PACE = {"over": -1, "speed": 1, "acceleration": 2}
+"""Attribute of a phase -> the power of the pace by which it is multiplied."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,18 @@ class Phase(ABC):
                 positive(f"{self.name}: {name}", value)
         if self.retries is not None and self.retries < 0:
             raise ModelError(f"{self.name}: retries must be 0 or more, got {self.retries}")
+
+    def at_pace(self, pace: float) -> Self:
+        """Returns the phase with its motion at a multiple of its speed.
+
+        It passes through the same values: `over` is divided by the pace, a `speed` is multiplied by
+        it, and an `acceleration` by its square. `within` does not change.
+
+        Args:
+            pace: The multiple, positive.
+        """
+        changed = [field.name for field in fields(self) if field.name in _BY_PACE]
+        return replace(self, **{n: getattr(self, n) * pace ** _BY_PACE[n] for n in changed})
 
     @property
     def speed_of_approach(self) -> float:
