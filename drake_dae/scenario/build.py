@@ -233,6 +233,7 @@ def make_plant(
         scenario.plant_parameters,
         scenario.plant_disturbances,
         pushed,
+        () if scenario.task is None else scenario.task.make().plan.latches,
     )
     try:
         return scenario.plant.plant(robot)

@@ -36,6 +36,7 @@ class RobotToSimulate:
         model, structure: The robot, and the structure of its system.
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
+        latches: The latches that a task opens and closes.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -50,6 +51,7 @@ class RobotToSimulate:
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
     pushed: bool = False
+    latches: Sequence[str] = ()
 
 
 class ScenarioPlant(ABC):
@@ -101,6 +103,8 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
+        if robot.latches:
+            return UnilateralRobotPlant(robot.model, {}, latches=robot.latches)
         if robot.opens:  # In a task its contacts open, without bouncing.
             return Unilateral(dict.fromkeys(robot.opens, 0.0)).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)

@@ -258,13 +258,16 @@ def _phases(
     controller: TaskController,
     model: RobotModel,
 ) -> tuple[PhaseNeeds, ...]:
-    limits, needs, forces = Limits.of(model), [], list(controller.contact.forces)
+    limits, needs = Limits.of(model), []
     ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
     for change, end in zip(changes, ends, strict=True):
         rows = _rows(record, change.time, end)
         if not rows.size or (change.place >= len(controller.task.plan.phases)):
             continue
-        law = controller.law if change.in_contact else controller.free_law
+        pair = controller.pairs[change.law // 2]
+        law, contact = pair.laws[change.law % 2], pair.contact
+        forces = record["constraint_force"][rows][:, list(contact.forces)]
+        total = np.abs(forces).max(1) if contact.is_latch else forces.sum(1)
         margin = _margin(law.structure, record["state"][rows])
         needs.append(
             PhaseNeeds(
@@ -273,7 +276,7 @@ def _phases(
                 end,
                 *_nearest_drive(record, rows, limits),
                 *_nearest_joint(record, rows, limits),
-                float(np.max(record["constraint_force"][rows][:, forces].sum(1), initial=0.0)),
+                float(np.max(total, initial=0.0)),
                 margin.relative,
                 margin.is_singular,
             )
@@ -316,6 +319,8 @@ def _touches(
     """The touches, and the guards of the force that they may trip."""
     touches, problems, material = list[Touch](), list[str](), scenario.plant.material
     task, forces = controller.task, list(controller.contact.forces)
+    if task.plan.latches:  # They close at rest.
+        return [], []
     for before, after in pairwise(changes):
         if not after.in_contact > before.in_contact or before.place >= task.plan.last:
             continue

@@ -1,6 +1,7 @@
 """A task as a controller: the law in contact, the law of the free robot, and a supervisor."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
@@ -22,8 +24,8 @@ from drake_dae.systems.control.contract import Compared, Controller, Derived, ch
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.task.laws import CONTACT, FREE, ContactLaws, OutputColumns, law_name
 from drake_dae.systems.task.open_contact import opened_contact
-from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
@@ -31,6 +33,7 @@ from drake_dae.systems.task.task import Task, check_sampled
 from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
+_LATCHED = {"observer": "it observes one contact, and this task has latches; leave it out"}
 
 
 @checked(ModelError)
@@ -54,6 +57,11 @@ class TaskController(Diagram, Controller):
     J^T = 0. At a release lambda is at most the task's `contact_force`, and the jump is J^T lambda.
     A slow touch, and small gains of the free law for the distance, keep the first jump small.
 
+    A task with latches has two laws for each latch with other latches closed: one leads its
+    distances while it is open, and one leads its forces while it is closed. So the load of an
+    object passes from one hand to another if the forces of the first one go to zero by a Release;
+    then it opens.
+
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
     force and so holds for closed and open contacts. Drake's Simulator finds the guards as zeros of
@@ -75,7 +83,10 @@ class TaskController(Diagram, Controller):
         phase: The index of the phase in the task, shape (1,); after the last one their number.
         ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces.
+            of k points. In contact the distances are zero, otherwise the forces. Forces and
+            distances of further latches follow; they are zero while the law does not lead them.
+        latch: 1 for each latch that is commanded to be closed, else 0, in the order in which the
+            phases name them; only with latches.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
@@ -88,15 +99,21 @@ class TaskController(Diagram, Controller):
             contact may be a face of several points, whose force and moments are outputs; see
             `FaceForces`.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
+        further: With latches, law and free_law for each further entry of `task.plan.pairs`, for
+            systems by `with_latch`.
+        whole: The system with the constraints of all latches, if `law.system` has fewer.
         sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
         supervisor, controller, free_controller: The blocks in it.
-        contact: The contact that opens and closes.
+        contact: The contact that opens and closes, or the first latch.
+        pairs: The laws of each contact with other closed ones.
+        columns: The places of their outputs in a record.
+        whole: The system with all constraints.
         output_signals: Names and units of `desired_output`.
         outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
-            derivatives of the distances, shape (p + 2 k,).
+            derivatives of the distances, shape (p + 2 k,) for a contact of k points.
 
     Raises:
         ModelError: The laws do not belong together, or a phase has a reference that does not fit.
@@ -106,7 +123,14 @@ class TaskController(Diagram, Controller):
     takes_over, shown, refused = True, ("desired_output", "ending"), _REFUSED
 
     def __init__(
-        self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 0.0
+        self,
+        task: Task,
+        law: TrackingLaw,
+        free_law: TrackingLaw,
+        *,
+        further: Sequence[tuple[TrackingLaw, TrackingLaw]] = (),
+        whole: DaeSystem | None = None,
+        sample_period: float = 0.0,
     ) -> None:
         super().__init__()
         check_sampled(task, sample_period)
@@ -114,30 +138,32 @@ class TaskController(Diagram, Controller):
         self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
-        self.contact = contact = opened_contact(law, free_law)
+        self.whole = law.system if whole is None else whole
+        self.pairs = self._paired([(law, free_law), *further])
+        self.columns = OutputColumns(self.pairs)
+        self.contact = contact = self.pairs[0].contact
         if contact.size == 1 and task.watches("eccentricity"):
             raise ModelError("a guard of the eccentricity needs a contact of several points")
-        self.outputs = self._trace_outputs()
-        distances = [law.system.constraint_output_signals[i] for i in contact.forces]
-        self.output_signals = (*law.system.output_signals, *distances)
+        self.outputs, self.output_signals = self._trace_outputs()
         builder = DiagramBuilder()
-        size = law.system.num_constraints
+        size = self.whole.num_constraints
         self.supervisor = builder.AddSystem(
-            TaskSupervisor(task, (free_law, law), contact, size, sample_period)
+            TaskSupervisor(task, self.pairs, self.columns, size, sample_period)
         )
         for name in ("estimated_state", "measured_force", "hold"):
             builder.ExportInput(self.supervisor.GetInputPort(name), name)
         for port in self.supervisor.signal_ports.values():
             builder.ExportInput(port, port.get_name())
-        switch = builder.AddSystem(LawSwitch(law.system.num_controls))
-        in_contact = self.supervisor.GetOutputPort("in_contact")
-        builder.Connect(in_contact, switch.GetInputPort("in_contact"))
-        controllers = []
-        for which, name, its_law in ((FREE, "free", free_law), (CONTACT, "contact", law)):
+        laws = [each for pair in self.pairs for each in pair.laws]
+        names = [law_name(which, "law") for which in range(len(laws))]
+        switch = builder.AddSystem(LawSwitch(law.system.num_controls, names))
+        builder.Connect(self.supervisor.GetOutputPort("law"), switch.GetInputPort("law"))
+        self.controllers = []
+        for which, its_law in enumerate(laws):
             controller = builder.AddSystem(TrackingController(its_law, sample_period=sample_period))
-            controller.set_name(f"{name}_controller")
+            controller.set_name(law_name(which, "controller"))
             builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
-            reference = self.supervisor.GetOutputPort(f"{name}_reference")
+            reference = self.supervisor.GetOutputPort(law_name(which, "reference"))
             builder.Connect(reference, controller.GetInputPort("reference"))
             if its_law.measured_force:
                 measured = controller.GetInputPort("measured_force")
@@ -155,34 +181,71 @@ class TaskController(Diagram, Controller):
                     builder.ConnectInput("exogenous", port)
             if count := len(its_law.integral.outputs):
                 hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-                hold.set_name(f"{name}_hold")
+                hold.set_name(law_name(which, "hold"))
                 builder.Connect(
-                    self.supervisor.GetOutputPort(f"{name}_hold"), hold.get_input_port()
+                    self.supervisor.GetOutputPort(law_name(which, "hold")), hold.get_input_port()
                 )
                 builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
                 shown = "integral" if which == CONTACT else "free_integral"
                 builder.ExportOutput(controller.GetOutputPort("integral"), shown)
-            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(name))
-            controllers.append(controller)
-        self.free_controller, self.controller = controllers
+            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(names[which]))
+            self.controllers.append(controller)
+        self.controller = self.controllers[CONTACT]
         self.exogenous_layout = self.controller.exogenous_layout
         self.exogenous_places = self.controller.exogenous_places
         control = switch.GetOutputPort("control")
         builder.ExportOutput(control, "control")
         if task.watches("control"):
             builder.Connect(control, self.supervisor.GetInputPort("control"))
-        names = ["phase", "ending", "desired_output", "contact_reference"]
+        names = ["phase", "ending", "desired_output"]
+        names += ["latch"] if task.plan.latches else ["contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
         self.set_name("task_controller")
 
-    def _trace_outputs(self) -> TracedFunction:
-        system, chains = self.law.system, self.free_law.structure.output_chains
-        force = ca.SX.sym("force", system.num_constraints)
-        distances = [chains[place][order] for order in (0, 1) for place in self.contact.places]
-        outputs = ca.vertcat(system.outputs(force), *distances)
-        return system.trace("task outputs", {"value": ca.densify(outputs)}, {"force": force})
+    def _paired(self, laws: Sequence[tuple[TrackingLaw, TrackingLaw]]) -> tuple[ContactLaws, ...]:
+        """The laws of each contact.
+
+        Raises:
+            ModelError: There are too few or too many, or they do not fit together.
+        """
+        wanted, latches = self.task.plan.pairs, self.task.plan.latches
+        if len(laws) != len(wanted):
+            texts = [f"{name} beside {', '.join(sorted(closed))}" for name, closed in wanted]
+            raise ModelError(
+                f"the task needs the laws of {len(wanted)} contacts ({', '.join(texts)}), got "
+                f"{len(laws)}"
+            )
+        if latches and (self.task.tare_time or any(law.integral.outputs for law, _ in laws)):
+            raise ModelError("a task with latches has no tare_time, and laws without integrals")
+        pairs, forces = [], [signal.name for signal in self.whole.force_signals]
+        for closed_law, free_law in laws:
+            contact = opened_contact(closed_law, free_law, bool(latches))
+            own = closed_law.system.force_signals
+            rows = tuple(forces.index(own[i].name) for i in contact.forces)
+            pairs.append(ContactLaws(replace(contact, forces=rows), (free_law, closed_law)))
+        return tuple(pairs)
+
+    def _trace_outputs(self) -> tuple[TracedFunction, tuple[Signal, ...]]:
+        """The function of all outputs in the order of the columns, and their names and units."""
+        whole, columns = self.whole, self.columns
+        force = ca.SX.sym("force", whole.num_constraints)
+        values, rates = ca.SX.zeros(columns.size), dict[int, ca.SX]()
+        signals = [Signal("")] * columns.size
+        values[: whole.num_outputs] = whole.outputs(force)
+        signals[: whole.num_outputs] = whole.output_signals
+        for i, pair in enumerate(self.pairs):
+            contact, chains = pair.contact, pair.laws[FREE].structure.output_chains
+            own = zip(contact.places, contact.forces, columns.distances[i], strict=True)
+            for number, (place, row, column) in enumerate(own):
+                values[column], rates[column] = chains[place][0], chains[place][1]
+                signals[column] = whole.constraint_output_signals[row]
+                if i and (of_force := columns.forces[i][number]) >= whole.num_outputs:
+                    values[of_force], signals[of_force] = force[row], whole.force_signals[row]
+        every = ca.vertcat(values, *(rates[column] for column in sorted(rates)))
+        traced = whole.trace("task outputs", {"value": ca.densify(every)}, {"force": force})
+        return traced, tuple(signals)
 
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -234,7 +297,7 @@ class TaskController(Diagram, Controller):
             raise ModelError(f"{self.get_name()}: the task has not begun in this context")
         return np.array(
             [
-                segments[i].desired(self.contact, time)
+                segments[i].desired(self.columns, time)
                 for i, time in zip(places_at(segments, moments), moments, strict=True)
             ]
         ).reshape(moments.size, -1)
@@ -255,15 +318,23 @@ class TaskController(Diagram, Controller):
 
     @property
     def start_structure(self) -> ConstraintStructure:
-        law = self.law if self.task.contacts[0] else self.free_law
-        return law.structure
+        first = self.task.plan.law_of(0)
+        return self.pairs[first // 2].laws[first % 2].structure
 
     def all_parameters(self, context: Context) -> FloatArray:
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        system = self.law.system
+        system = self.whole
         check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
+        if plant.latches != self.task.plan.latches:
+            has, needs = (
+                ", ".join(names) or "none" for names in (plant.latches, self.task.plan.latches)
+            )
+            raise WiringError(
+                f"the task opens and closes the latches {needs}, and the plant has {has}: make it "
+                "with the same latches, in this order"
+            )
         if plant.time_step and not self.sample_period:
             raise WiringError(
                 f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
@@ -292,30 +363,49 @@ class TaskController(Diagram, Controller):
         their derivatives, "phase" is 1 for the current phase and 0 for all others,
         "predicted_error" is that of `predicted_errors`.
         """
-        signals = self.output_signals
-        values_with_distance = function_along(
-            self.outputs, {**values, "force": values["constraint_force"]}
-        )
-        size = self.contact.size
-        outputs, distances = values_with_distance[:, :-size], values_with_distance[:, -2 * size :]
-        rates = (signal.derivative(1) for signal in signals[-size:])
+        signals, columns = self.output_signals, self.columns
+        every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
+        outputs, rates = every[:, : columns.size], every[:, columns.size :]
+        distances = sorted({column for own in columns.distances for column in own})
+        rate_signals = (signals[column].derivative(1) for column in distances)
         desired = np.zeros_like(outputs)
         segments = () if context is None else self.segments(context)
         if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
+        self._not_led(segments, times, outputs, desired)
         places = values["phase"].astype(int)
         predicted = predicted_errors(
-            (self.free_law, self.law), self.contact, segments, times, {**values, "outputs": outputs}
+            self.pairs, columns, segments, times, {**values, "outputs": outputs}
         )
         names = self.phase_signals
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
-            "distance": (distances, (*signals[-size:], *rates)),
+            "distance": (
+                np.hstack([outputs[:, distances], rates]),
+                (*(signals[column] for column in distances), *rate_signals),
+            ),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
             "predicted_error": (predicted, signals),
         }
+
+    def _not_led(
+        self,
+        segments: Sequence[ReferenceSegment],
+        times: FloatArray,
+        outputs: FloatArray,
+        desired: FloatArray,
+    ) -> None:
+        """Sets desired outputs of latches that the active law does not lead to the actual ones."""
+        if not self.task.plan.latches:
+            return
+        places = places_at(segments, times)
+        for which, segment in enumerate(segments):
+            led = self.columns.of_law(segment.law)
+            others = [column for column in range(self.columns.size) if column not in led]
+            rows = np.ix_(places == which, others)
+            desired[rows] = outputs[rows]
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
         parameters = self.controller.current_parameters(
@@ -323,7 +413,7 @@ class TaskController(Diagram, Controller):
         )
         (outputs,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
         desired = self.GetOutputPort("desired_output").Eval(context)
-        return outputs[: -self.contact.size], desired, self.output_signals
+        return outputs[: self.columns.size], desired, self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -341,7 +431,7 @@ class TaskController(Diagram, Controller):
         Raises:
             ModelError: No parameter has that name, or the value does not fit.
         """
-        for controller in (self.controller, self.free_controller):
+        for controller in self.controllers:
             controller.set_parameter(
                 self.GetMutableSubsystemContext(controller, context), name, value
             )

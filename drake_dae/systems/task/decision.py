@@ -58,6 +58,8 @@ class PhaseDecision:
         if holds and change.in_contact and not progress.is_felt:
             lost = task.patience - (time - progress.felt)
         felt = excess if progress.is_felt else -excess
+        if task.plan.latches:  # A latch without force is not lost.
+            lost = felt = np.inf
         nearest = np.min(guards, initial=np.inf)
         return cls(moment, guards, np.array([nearest, end, lost, late, felt]))
 

@@ -20,7 +20,7 @@ class Mode:
     """The motion of the robot while some contacts are closed.
 
     Attributes:
-        closed: The closed contacts, one flag for each.
+        closed: The closed contacts and latches, one flag for each.
         structure: The structure of the system with their constraints alone.
         rows: The indices of its constraints among all; of sticking contacts, the independent ones.
         dynamics: x', a function of state, control if there is one, and parameters.
@@ -68,11 +68,12 @@ class Modes:
 
     def _traced(self, closed: Closed, state: FloatArray) -> Mode:
         contacts = self._contacts
-        names = [n for n, shut in zip(contacts.names, closed, strict=True) if shut]
+        names = [n for n, shut in zip(contacts.every, closed, strict=True) if shut]
         dae = contacts.dae
         terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
-        pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
-        independent = rows_of(terms.impulse_matrix, contacts.bilateral, pushing)
+        pushing = [t for t, shut in zip(contacts.touches, closed, strict=False) if shut]
+        bilateral = contacts.bilateral_in(closed)
+        independent = rows_of(terms.impulse_matrix, bilateral, pushing)
         if independent is None:
             raise ModelError(
                 f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "

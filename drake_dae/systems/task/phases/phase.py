@@ -80,6 +80,9 @@ class Phase(ABC):
        most `retries` of the task times; "hold", the robot rests in its present state with contact
        and force; "leave", the force goes to zero, and the run ends; "stop", the robot rests, and
        the run ends; "fail", the run ends with an error.
+    6. `for_contact` and `for_latch` say whether it is for a contact that pushes, and for a latch: a
+       constraint that commands open and close, with forces of any sign. Of a latch, `Moment` has
+       the largest force, distance and rate of its directions.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -92,6 +95,8 @@ class Phase(ABC):
         retries: The number of times that it may be entered again; needed for a phase to which
             others lead back.
         if_spent: The successor in its place once these are used up.
+        contact: The name of the latch that it opens, closes or leads; that of the phase before in
+            the list if empty. Empty in all phases of a task with one contact.
     """
 
     over: float = 0.5
@@ -101,11 +106,14 @@ class Phase(ABC):
     on_failure: str | None = None
     retries: int | None = None
     if_spent: str = FAIL
+    contact: str = ""
     begins_in_contact: ClassVar[bool | None] = None
     ends_in_contact: ClassVar[bool | None] = None
     holds_contact: ClassVar[bool] = False
     ends_by_loss: ClassVar[bool] = False
     is_relative: ClassVar[bool] = False
+    for_contact: ClassVar[bool] = True
+    for_latch: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING

@@ -64,16 +64,52 @@ def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
     return tuple(renamed)
 
 
-def contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
-    """Whether each phase begins in contact; last whether the last one ends in contact."""
-    begins, in_contact = [], False
+@dataclass(frozen=True)
+class ContactMode:
+    """The closed contacts of a task, and the one that it leads.
+
+    Attributes:
+        contact: The name of the contact that opens and closes; empty in a task with one contact.
+        is_closed: Whether this contact is closed.
+        others: The names of the other latches that are closed.
+    """
+
+    contact: str
+    is_closed: bool
+    others: frozenset[str] = frozenset()
+
+    @property
+    def closed(self) -> frozenset[str]:
+        """The names of all closed contacts."""
+        return self.others | {self.contact} if self.is_closed else self.others
+
+
+def modes_of(phases: Sequence[Phase]) -> tuple[ContactMode, ...]:
+    """The mode in which each phase begins; last the mode in which the last one ends.
+
+    A contact is closed at the start if the first phase that opens, closes or needs it says so.
+    """
+    names, name = list[str](), ""
     for phase in phases:
-        if phase.begins_in_contact is not None:
-            in_contact = phase.begins_in_contact
-        begins.append(in_contact)
-        if phase.ends_in_contact is not None:
-            in_contact = phase.ends_in_contact
-    return (*begins, in_contact)
+        name = phase.contact or name
+        names.append(name)
+    closed, known = set[str](), set[str]()
+    for name, phase in zip(names, phases, strict=True):
+        if phase.begins_in_contact is not None and name not in known:
+            known.add(name)
+            closed |= {name} if phase.begins_in_contact else set()
+    modes = []
+
+    def add(name: str, says: bool | None) -> None:
+        if says is not None:
+            (closed.add if says else closed.discard)(name)
+
+    for name, phase in zip(names, phases, strict=True):
+        add(name, phase.begins_in_contact)
+        modes.append(ContactMode(name, name in closed, frozenset(closed - {name})))
+        add(name, phase.ends_in_contact)
+    modes.append(ContactMode(names[-1], names[-1] in closed, frozenset(closed - {names[-1]})))
+    return tuple(modes)
 
 
 class PhasePlan:
@@ -85,7 +121,11 @@ class PhasePlan:
 
     Attributes:
         phases: The same, followed by the Release for "leave" if it may be needed.
+        modes: The mode in which each phase begins; last the mode in which the last one ends.
         contacts: Whether each phase begins in contact; last whether the last one ends in contact.
+        pairs: For each contact with other closed ones, in the order of the phases, its name and the
+            names of the others.
+        latches: The names of the latches; empty in a task with one contact.
         last: The number of phases that were given.
         retries: The argument.
 
@@ -99,12 +139,18 @@ class PhasePlan:
         self._names = [phase.name for phase in phases]
         self.retries, self.last = retries, len(phases)
         self.phases: tuple[Phase, ...] = tuple(phases)
-        self.contacts = contacts_of(phases)
+        self.modes = modes_of(phases)
+        self.contacts = tuple(mode.is_closed for mode in self.modes)
+        every = dict.fromkeys((mode.contact, mode.others) for mode in self.modes[:-1])
+        self.pairs = tuple(every)
+        self.latches = tuple(dict.fromkeys(name for name, _ in self.pairs if name))
+        self._check_latches()
         if self._leaves():
             # A model error may be larger than the task's contact_force, and holds the tool.
             leave = Release(name=LEAVE, within=5.0, on_success=STOP, on_failure=STOP)
             self.phases = (*phases, leave)
             self.contacts = (*self.contacts[:-1], True, False)
+            self.modes = tuple(ContactMode("", is_closed) for is_closed in self.contacts)
         self._edges = {place: self._all_from(place) for place in range(self.last)}
         self._check_reached()
         self._check_ends()
@@ -157,6 +203,16 @@ class PhasePlan:
             place, word = to, FAIL if word == APPROACH and phase.retries is None else phase.if_spent
         return Successor(FAIL, None, "; ".join(remarks))
 
+    def law_of(self, place: int) -> int:
+        """The number of the law of a phase: twice that of its pair, and 1 more if it is closed."""
+        mode = self.modes[place]
+        return 2 * self.pairs.index((mode.contact, mode.others)) + int(mode.is_closed)
+
+    def closed_by(self, law: int) -> frozenset[str]:
+        """The names of the latches that are closed while a law acts."""
+        contact, others = self.pairs[law // 2]
+        return ContactMode(contact, bool(law % 2), others).closed
+
     def ends_in_contact(self, place: int) -> bool:
         """Whether a phase that succeeds ends in contact."""
         ends = self.phases[place].ends_in_contact
@@ -183,6 +239,28 @@ class PhasePlan:
         return self._names.index(word) if word in self._names else None
 
     # The checks.
+
+    def _check_latches(self) -> None:
+        """Refuses phases that do not fit their contact."""
+        for place, phase in enumerate(self.phases):
+            name = self.modes[place].contact
+            if self.latches and not name:
+                raise ModelError(
+                    f"{self.where(place)}: contact: needed, since later phases name theirs, "
+                    f"{', '.join(self.latches)}"
+                )
+            if name and not phase.for_latch:
+                raise ModelError(
+                    f"{self.where(place)}: it is for a contact that pushes, and not for the latch "
+                    f"'{name}'; use Close, Release, Move, Dwell or Wait"
+                )
+            if not name and not phase.for_contact:
+                raise ModelError(f"{self.where(place)}: contact: needed, the name of a latch")
+            words = {phase.chosen(outcome) for outcome in OUTCOMES} | {phase.if_spent}
+            if name and LEAVE in words:
+                raise ModelError(
+                    f"{self.where(place)}: leave does not say which latch to open; name a Release"
+                )
 
     def _all_from(self, place: int) -> list[tuple[str, int]]:
         """The key words and phases that may follow a phase, each checked."""
@@ -229,8 +307,18 @@ class PhasePlan:
             text = "it begins in contact, but the robot is free; an Approach must lead there"
         elif outcome == "success" and not begins and self.ends_in_contact(place):
             text = "it begins with a free robot, but it is in contact; a Release must lead there"
+        closed, needs = self._closed_after(place, outcome), self.modes[to].closed
+        if not text and self.latches and closed != needs:
+            has, wants = (", ".join(sorted(names)) or "no latch" for names in (closed, needs))
+            text = f"it begins with {wants} closed, but {has} closed then"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
+
+    def _closed_after(self, place: int, outcome: Outcome) -> frozenset[str]:
+        """The names of the closed contacts after a phase with its outcome."""
+        mode = self.modes[place]
+        is_closed = self.ends_in_contact(place) if outcome == "success" else mode.is_closed
+        return replace(mode, is_closed=is_closed).closed
 
     def _check_reached(self) -> None:
         reached, unexplored = {0}, [0]
