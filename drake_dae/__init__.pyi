@@ -190,6 +190,7 @@ from .systems.sensing.tolerances import Tolerances as Tolerances
 from .systems.task.controller import TaskController as TaskController
 from .systems.task.open_contact import open_contact as open_contact
 from .systems.task.phases import Approach as Approach
+from .systems.task.phases import Close as Close
 from .systems.task.phases import Dwell as Dwell
 from .systems.task.phases import GuardedMove as GuardedMove
 from .systems.task.phases import Insert as Insert

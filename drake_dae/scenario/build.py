@@ -76,7 +76,7 @@ def build_completed(
     scene_graph = SceneGraph()
     completed, model = completed_model(scenario, scene_graph)
     try:
-        structure = scenario_structure(model)
+        structure = scenario_structure(model, scenario.task)
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
@@ -224,6 +224,7 @@ def make_plant(
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
     check_disturbances(scenario.plant_disturbances, model.links)
+    plan = None if scenario.task is None else scenario.task.make().plan
     robot = RobotToSimulate(
         model,
         structure,
@@ -233,7 +234,8 @@ def make_plant(
         scenario.plant_parameters,
         scenario.plant_disturbances,
         pushed,
-        () if scenario.task is None else scenario.task.make().plan.latches,
+        () if plan is None else plan.latches,
+        () if plan is None else plan.latch_sets,
     )
     try:
         return scenario.plant.plant(robot)

@@ -1,7 +1,7 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any, ClassVar, cast
@@ -37,6 +37,7 @@ class RobotToSimulate:
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
         latches: The latches that a task opens and closes.
+        latch_sets: Those that it closes together.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -52,6 +53,7 @@ class RobotToSimulate:
     disturbances: Sequence[DisturbanceForce]
     pushed: bool = False
     latches: Sequence[str] = ()
+    latch_sets: Collection[Collection[str]] = ()
 
 
 class ScenarioPlant(ABC):
@@ -104,7 +106,9 @@ class IdealConstraints(ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         if robot.latches:
-            return UnilateralRobotPlant(robot.model, {}, latches=robot.latches)
+            return UnilateralRobotPlant(
+                robot.model, {}, latches=robot.latches, latch_sets=robot.latch_sets
+            )
         if robot.opens:  # In a task its contacts open, without bouncing.
             return Unilateral(dict.fromkeys(robot.opens, 0.0)).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)

@@ -10,6 +10,7 @@ from drake_dae.dae.tracking.gains import GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.open_contact import OpeningContact, open_contact, with_latch
+from drake_dae.systems.task.phases.plan import PhasePlan
 from drake_dae.systems.task.task import Task
 
 FREE, CONTACT = 0, 1
@@ -92,17 +93,37 @@ def laws_of_latches(
         ModelError: There is no such latch, or it does not have as many forces.
         AssumptionError: A law is not defined while these latches are closed.
     """
+    pairs = list[tuple[TrackingLaw, TrackingLaw]]()
+    for number, (name, _) in enumerate(task.plan.pairs):
+        led = latched_system(task.plan, system, number)
+        free = open_contact(led, _forces_of(system)[name], is_latch=True)
+        pairs.append((TrackingLaw(led, gains), TrackingLaw(free, free_gains or gains)))
+    return tuple(pairs)
+
+
+def latched_system(plan: PhasePlan, system: DaeSystem, number: int) -> DaeSystem:
+    """The system in which the forces of a latch are outputs, by the number of its pair.
+
+    Args:
+        plan: The order of the phases.
+        system: As of `laws_of_latches`.
+        number: The index in `plan.pairs`.
+
+    Raises:
+        ModelError: There is no such latch, or it does not have as many forces.
+    """
+    forces, (name, others) = _forces_of(system), plan.pairs[number]
+    for latch in plan.latches:
+        if latch not in forces:
+            raise ModelError(f"{system.name}: {unknown_name('latch', latch, forces)}")
+    is_open = set(plan.latches) - others - {name}
+    closed = [force for owner, own in forces.items() if owner not in is_open for force in own]
+    return with_latch(system, forces[name], closed)
+
+
+def _forces_of(system: DaeSystem) -> dict[str, list[str]]:
+    """Name of a constraint -> the names of its forces."""
     forces = dict[str, list[str]]()
     for signal in system.force_signals:
         forces.setdefault(signal.name.split(".")[0], []).append(signal.name)
-    latches, pairs = task.plan.latches, list[tuple[TrackingLaw, TrackingLaw]]()
-    for name in latches:
-        if name not in forces:
-            raise ModelError(f"{system.name}: {unknown_name('latch', name, forces)}")
-    for name, others in task.plan.pairs:
-        is_open = set(latches) - others - {name}
-        closed = [force for owner, own in forces.items() if owner not in is_open for force in own]
-        led = with_latch(system, forces[name], closed)
-        free = open_contact(led, forces[name], is_latch=True)
-        pairs.append((TrackingLaw(led, gains), TrackingLaw(free, free_gains or gains)))
-    return tuple(pairs)
+    return forces

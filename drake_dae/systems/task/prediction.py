@@ -37,14 +37,17 @@ def predicted_errors(
         rows = np.flatnonzero(places == which)
         if not rows.size:
             continue
-        start = max(rows[0] - 1, 0)  # The record has the state at the change in the row before.
+        # The record of a simulation has the state at the change in the row before; a rollout not.
+        start = max(rows[0] - 1, 0)
+        if times[start] < segment.change.time:
+            start = rows[0]
         is_closed, pair = segment.law % 2 == CONTACT, segment.law // 2
         law = pairs[pair].laws[segment.law % 2]
         name = "integral" if is_closed else "free_integral"
         errors = law.predicted_error(
             times[rows] - times[start],
             values["state"][start],
-            segment.reference(max(segment.change.time, times[start])),
+            segment.reference(times[start]),
             values["parameters"][start] if "parameters" in values else None,
             integral=values[name][start] if law.integral.outputs else None,
         )

@@ -1,6 +1,7 @@
 """A RobotModel with opening contacts, as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -85,6 +86,8 @@ class UnilateralRobotPlant(ModalPorts):
         structure: The structure of `model.dae`, with all contacts closed; found if None.
         latches: The names of bilateral constraints that open and close by commands.
         capture: The largest distance in m, or angle in rad, at which a latch closes.
+        latch_sets: The sets of latches that a run closes together, for rollouts and exports; all
+            sets if empty.
 
     Attributes:
         model: The robot.
@@ -118,10 +121,14 @@ class UnilateralRobotPlant(ModalPorts):
         structure: ConstraintStructure | None = None,
         latches: Sequence[str] = (),
         capture: float = 1e-3,
+        latch_sets: Collection[Collection[str]] = (),
     ) -> None:
         settling = positive(f"{model.name}: settling_time", settling_time)
         super().__init__(model, contacts, structure, latches)
         captured = positive(f"{model.name}: capture", capture)
+        self._latch_sets = [
+            tuple(name in closed for name in self.latches) for closed in latch_sets
+        ] or list(product((False, True), repeat=len(self.latches)))
         self._resets = Resets(self._contacts, self.modes, settling, captured)
         self._log_index = self.DeclareCacheEntry(
             "events",
@@ -302,7 +309,10 @@ class UnilateralRobotPlant(ModalPorts):
         return self._reset(context, state)
 
     def traced(self) -> Block:
-        traced, dae = TracedContacts(self._contacts, self.modes, self._residual), self.dae
+        traced, dae = (
+            TracedContacts(self._contacts, self.modes, self._residual, self._latch_sets),
+            self.dae,
+        )
         return Block(
             self,
             traced.computations(self._ports),

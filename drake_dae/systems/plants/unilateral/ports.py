@@ -12,7 +12,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, SimulationError, SingularityError
+from drake_dae.errors import AssumptionError, ModelError, SimulationError, SingularityError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
@@ -160,12 +160,27 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     @cached_property
     def structure(self) -> ConstraintStructure:  # type: ignore[override]
-        """The structure of the system with all contacts closed.
+        """The structure with all contacts closed, and all latches if that is possible, else none.
 
         Raises:
-            ModelError: They cannot be closed together, likewise as an AssumptionError.
+            ModelError: The contacts cannot be closed together, likewise as an AssumptionError.
         """
-        return self.modes((True,) * len(self.contacts), self.dae.nominal_state).structure
+        touching, nominal = (True,) * len(self._contacts.names), self.dae.nominal_state
+        try:
+            return self.modes((True,) * len(self.contacts), nominal).structure
+        except (ModelError, AssumptionError):
+            if not self.latches:
+                raise
+            return self.modes((*touching, *(False for _ in self.latches)), nominal).structure
+
+    @property
+    def port_signals(self) -> dict[str, tuple[Signal, ...]]:
+        residual = list[Signal]()
+        for signal, size in zip(
+            self.dae.constraint_output_signals, self._contacts.sizes, strict=True
+        ):
+            residual += [signal, signal.derivative(1)][:size]
+        return {**super().port_signals, "constraint_residual": tuple(residual)}
 
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""

@@ -27,8 +27,8 @@ from drake_dae.systems.plants.unilateral.log import MARGIN
 from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of
 from drake_dae.trace.functions import TracedFunction
 
-MOST = 3
-"""The largest number of contacts and latches: each function contains all of their eight modes."""
+MOST = 8
+"""The largest number of modes, as of three contacts: each function contains all of them."""
 
 
 class TracedContacts:
@@ -38,17 +38,24 @@ class TracedContacts:
         contacts: The contacts.
         modes: Their modes.
         residual: The function of the constraint residual.
+        latch_sets: The latches that are closed together, one flag for each.
 
     Raises:
         ModelError: There are too many contacts.
     """
 
     def __init__(
-        self, contacts: UnilateralContacts, modes: Modes, residual: TracedFunction
+        self,
+        contacts: UnilateralContacts,
+        modes: Modes,
+        residual: TracedFunction,
+        latch_sets: Sequence[Closed],
     ) -> None:
         count = len(contacts.every)
-        if count > MOST:
-            raise not_traced(f"a plant with more than {MOST} contacts that open and close")
+        touching = product((False, True), repeat=len(contacts.names))
+        every = [(*closed, *latched) for closed, latched in product(touching, latch_sets)]
+        if len(every) > MOST:
+            raise not_traced(f"a plant with {len(every)} modes of its contacts, more than {MOST},")
         dae = self._dae = contacts.dae
         self._contacts, self._modes, self._residual = contacts, modes, residual
         self._state, self._held = ca.SX.sym("state", dae.num_states), ca.SX.sym("mode", count)
@@ -57,9 +64,7 @@ class TracedContacts:
         # The coefficients of restitution come last; no motion depends on them.
         self._all = ca.SX.sym("parameters", size + len(contacts.names))
         self._parameters = self._all[:size]
-        self._all_modes = [
-            (closed, self._mode(closed)) for closed in product((False, True), repeat=count)
-        ]
+        self._all_modes = [(closed, self._mode(closed)) for closed in every]
 
     def _mode(self, closed: Closed) -> Mode | None:
         """A mode; None if its contacts cannot be closed together."""

@@ -213,6 +213,12 @@ class PhasePlan:
         contact, others = self.pairs[law // 2]
         return ContactMode(contact, bool(law % 2), others).closed
 
+    @property
+    def latch_sets(self) -> set[frozenset[str]]:
+        """The sets of latches that are closed together; empty without latches."""
+        laws = range(2 * len(self.pairs)) if self.latches else ()
+        return {self.closed_by(law) for law in laws}
+
     def ends_in_contact(self, place: int) -> bool:
         """Whether a phase that succeeds ends in contact."""
         ends = self.phases[place].ends_in_contact
