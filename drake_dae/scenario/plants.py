@@ -23,6 +23,7 @@ from drake_dae.systems.plants.contact.contact_material import ContactMaterial, P
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.latched_plant import LatchedPlant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
 from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
@@ -187,6 +188,19 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters"):
+            if robot.latches:
+                if robot.parameters or robot.disturbances:
+                    raise ModelError(
+                        "Drake's plant with latches takes no plant_parameters and no "
+                        "plant_disturbances; leave them out"
+                    )
+                return LatchedPlant(
+                    robot.model,
+                    robot.add_robot,
+                    robot.latches,
+                    structure=robot.structure,
+                    time_step=self.time_step,
+                )
             return ContactPlant(
                 robot.model,
                 robot.add_robot,

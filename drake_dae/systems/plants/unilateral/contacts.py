@@ -10,8 +10,9 @@ import numpy as np
 from drake_dae.arrays import FloatArray, number, show, unknown_name
 from drake_dae.dae.system.contacts import PainleveOutcome, painleve_outcome
 from drake_dae.dae.system.layout import Indices
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import ModelError, PainleveError
+from drake_dae.errors import ModelError, PainleveError, SimulationError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
@@ -234,11 +235,33 @@ class UnilateralContacts:
         shut = zip(self.latch_rows, closed[len(self.names) :], strict=True)
         return np.concatenate([self.bilateral, *(rows for rows, is_shut in shut if is_shut)])
 
-    def distance_of_latch(self, place: int, state: FloatArray, parameters: FloatArray) -> float:
-        """The largest distance or angle of a latch from its place, in m or rad."""
+    def check_capture(
+        self, place: int, time: float, state: FloatArray, parameters: FloatArray, capture: float
+    ) -> None:
+        """Refuses a latch that closes too far from its place.
+
+        Raises:
+            SimulationError: A distance or angle of the latch is larger than `capture`.
+        """
         assert self.off is not None
         values = self.off.evaluate(state, parameters)[0]
-        return float(np.max(np.abs(values[self.latch_rows[place]])))
+        off = float(np.max(np.abs(values[self.latch_rows[place]])))
+        if not off <= capture:
+            raise SimulationError(
+                f"{self.dae.name}: the latch '{self.latches[place]}' is commanded to close at t = "
+                f"{time:.6g} s, and is {off:.3g} m or rad off its place, more than its capture of "
+                f"{capture:g}. Lead it nearer before it closes",
+                time,
+                state.copy(),
+            )
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        """Names and units of `residual`."""
+        signals = list[Signal]()
+        for signal, size in zip(self.dae.constraint_output_signals, self.sizes, strict=True):
+            signals += [signal, signal.derivative(1)][:size]
+        return tuple(signals)
 
     def holds(self, closed: Sequence[bool]) -> FloatArray:
         """For each entry of the residual 1, or 0 if its contact is open."""

@@ -175,12 +175,8 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:
-        residual = list[Signal]()
-        for signal, size in zip(
-            self.dae.constraint_output_signals, self._contacts.sizes, strict=True
-        ):
-            residual += [signal, signal.derivative(1)][:size]
-        return {**super().port_signals, "constraint_residual": tuple(residual)}
+        residual = self._contacts.residual_signals
+        return {**super().port_signals, "constraint_residual": residual}
 
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""

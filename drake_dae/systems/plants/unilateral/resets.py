@@ -115,7 +115,8 @@ class Resets:
         joining = [
             i for i, (now, was) in enumerate(zip(latched, closed[count:], strict=True)) if now > was
         ]
-        self._check_capture(time, x, joining, parameters)
+        for i in joining:
+            contacts.check_capture(i, time, x, parameters, self._capture)
         bilateral = contacts.bilateral_in((*closed[:count], *latched))
         for _ in range(REPEATED):
             terms = contacts.terms(x, control, parameters)
@@ -162,22 +163,6 @@ class Resets:
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
         return ResetResult(x, closed, tuple(self._completed(events, closed)))
-
-    def _check_capture(
-        self, time: float, state: FloatArray, joining: Sequence[int], parameters: FloatArray
-    ) -> None:
-        """Refuses a latch that closes too far from its place."""
-        contacts = self._contacts
-        for i in joining:
-            off = contacts.distance_of_latch(i, state, parameters)
-            if not off <= self._capture:
-                raise SimulationError(
-                    f"{contacts.dae.name}: the latch '{contacts.latches[i]}' is commanded to close "
-                    f"at t = {time:.6g} s, and is {off:.3g} m or rad off its place, more than its "
-                    f"capture of {self._capture:g}. Lead it nearer before it closes",
-                    time,
-                    state,
-                )
 
     def resting(self, state: FloatArray, parameters: FloatArray, latched: Closed) -> Closed:
         """The contacts that touch at rest, as many as can be closed together, and the latches."""
