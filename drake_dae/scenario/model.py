@@ -34,7 +34,7 @@ from drake_dae.scenario.parts.written import WrittenForm, make
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.task.laws import latched_system
+from drake_dae.systems.task.contacts.laws import latched_system
 
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""

@@ -8,9 +8,9 @@ from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.task.contacts.laws import laws_of_latches
+from drake_dae.systems.task.contacts.open_contact import open_contact
 from drake_dae.systems.task.controller import TaskController
-from drake_dae.systems.task.laws import laws_of_latches
-from drake_dae.systems.task.open_contact import open_contact
 from drake_dae.systems.task.phases import Insert
 
 

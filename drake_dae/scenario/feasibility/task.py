@@ -265,10 +265,8 @@ def _phases(
         if not rows.size or (change.place >= len(controller.task.plan.phases)):
             continue
         pair = controller.pairs[change.law // 2]
-        law, contact = pair.laws[change.law % 2], pair.contact
-        forces = record["constraint_force"][rows][:, list(contact.forces)]
-        total = np.abs(forces).max(1) if contact.is_latch else forces.sum(1)
-        margin = _margin(law.structure, record["state"][rows])
+        forces = record["constraint_force"][rows][:, list(pair.contact.forces)]
+        margin = _margin(pair.laws[change.law % 2].structure, record["state"][rows])
         needs.append(
             PhaseNeeds(
                 change.phase,
@@ -276,7 +274,7 @@ def _phases(
                 end,
                 *_nearest_drive(record, rows, limits),
                 *_nearest_joint(record, rows, limits),
-                float(np.max(total, initial=0.0)),
+                float(np.max(pair.contact.total(forces), initial=0.0)),
                 margin.relative,
                 margin.is_singular,
             )
@@ -319,9 +317,7 @@ def _touches(
     """The touches, and the guards of the force that they may trip."""
     touches, problems, material = list[Touch](), list[str](), scenario.plant.material
     task, forces = controller.task, list(controller.contact.forces)
-    if task.plan.latches:  # They close at rest.
-        return [], []
-    for before, after in pairwise(changes):
+    for before, after in () if task.plan.latches else pairwise(changes):  # Latches close at rest.
         if not after.in_contact > before.in_contact or before.place >= task.plan.last:
             continue
         phase = task.plan.phases[before.place]

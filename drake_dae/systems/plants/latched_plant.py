@@ -141,7 +141,7 @@ class LatchedPlant(LeafSystem, Plant):
             ("state", dae.num_states, self._state_of),
             ("link_state", dae.num_states, self._state_of),
             ("mode", len(latches), self._mode),
-            ("gap", 0, lambda context: np.zeros(0)),
+            ("gap", 0, self._no_gap),
             ("constraint_force", dae.num_constraints, self._force),
             ("constraint_residual", self._contacts.residual.numel(), self._held_residual),
             ("controlled_output", dae.num_outputs, self._output),
@@ -180,9 +180,12 @@ class LatchedPlant(LeafSystem, Plant):
     def _mode(self, context: Context) -> FloatArray:
         return context.get_discrete_state_vector().value()[self._size :]
 
+    def _no_gap(self, context: Context) -> FloatArray:
+        return np.zeros(0)
+
     def _held_residual(self, context: Context) -> FloatArray:
-        values = self._residual.evaluate(self._state_of(context), self.dae.parameter_values)[0]
-        return values * self._contacts.holds(self._mode(context) > 0.5)
+        (values,) = self._residual(self._state_of(context), self.dae.parameter_values)
+        return values * self._contacts.holds((self._mode(context) > 0.5).tolist())
 
     def _output(self, context: Context) -> FloatArray:
         values = self.dae.parameter_values

@@ -1,9 +1,7 @@
 """A task as a controller: the law in contact, the law of the free robot, and a supervisor."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -16,21 +14,21 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.switch import LawSwitch
-from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
+from drake_dae.systems.control.contract import Compared, Controller, Derived
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.laws import CONTACT, FREE, ContactLaws, OutputColumns, law_name
-from drake_dae.systems.task.open_contact import opened_contact
+from drake_dae.systems.task.contacts.fit import check_plant_of_task
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, law_name, paired_laws
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task, check_sampled
-from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
 _LATCHED = {"observer": "it observes one contact, and this task has latches; leave it out"}
@@ -58,9 +56,8 @@ class TaskController(Diagram, Controller):
     A slow touch, and small gains of the free law for the distance, keep the first jump small.
 
     A task with latches has two laws for each latch with other latches closed: one leads its
-    distances while it is open, and one leads its forces while it is closed. So the load of an
-    object passes from one hand to another if the forces of the first one go to zero by a Release;
-    then it opens.
+    distances while it is open, the other its forces while it is closed. The load of an object
+    passes from one hand to another by a Release of the first hand, whose forces go to zero.
 
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
@@ -83,10 +80,10 @@ class TaskController(Diagram, Controller):
         phase: The index of the phase in the task, shape (1,); after the last one their number.
         ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces. Forces and
-            distances of further latches follow; they are zero while the law does not lead them.
-        latch: 1 for each latch that is commanded to be closed, else 0, in the order in which the
-            phases name them; only with latches.
+            of k points. In contact the distances are zero, otherwise the forces. Those of further
+            latches follow.
+        latch: 1 for each latch that is commanded to be closed, else 0, in the order of
+            `task.plan.latches`; only with latches.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
@@ -99,14 +96,14 @@ class TaskController(Diagram, Controller):
             contact may be a face of several points, whose force and moments are outputs; see
             `FaceForces`.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
-        further: With latches, law and free_law for each further entry of `task.plan.pairs`, for
-            systems by `with_latch`.
+        further: With latches, law and free_law for each further entry of `task.plan.pairs`, by
+            `laws_of_latches`.
         whole: The system with the constraints of all latches, if `law.system` has fewer.
         sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
-        supervisor, controller, free_controller: The blocks in it.
+        supervisor, controller: Blocks in it: the latter has the first law in contact.
         contact: The contact that opens and closes, or the first latch.
         pairs: The laws of each contact with other closed ones.
         columns: The places of their outputs in a record.
@@ -139,17 +136,16 @@ class TaskController(Diagram, Controller):
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
         self.whole = law.system if whole is None else whole
-        self.pairs = self._paired([(law, free_law), *further])
-        self.columns = OutputColumns(self.pairs)
+        self.pairs = paired_laws(task, self.whole, [(law, free_law), *further])
+        self.columns = TaskOutputs(self.pairs, self.whole)
         self.contact = contact = self.pairs[0].contact
         if contact.size == 1 and task.watches("eccentricity"):
             raise ModelError("a guard of the eccentricity needs a contact of several points")
-        self.outputs, self.output_signals = self._trace_outputs()
+        self.outputs, self.output_signals = self.columns.function, self.columns.signals
         builder = DiagramBuilder()
-        size = self.whole.num_constraints
-        self.supervisor = builder.AddSystem(
-            TaskSupervisor(task, self.pairs, self.columns, size, sample_period)
-        )
+        measured = self.whole.num_constraints
+        supervisor = TaskSupervisor(task, self.pairs, self.columns, measured, sample_period)
+        self.supervisor = builder.AddSystem(supervisor)
         for name in ("estimated_state", "measured_force", "hold"):
             builder.ExportInput(self.supervisor.GetInputPort(name), name)
         for port in self.supervisor.signal_ports.values():
@@ -203,49 +199,6 @@ class TaskController(Diagram, Controller):
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
         self.set_name("task_controller")
-
-    def _paired(self, laws: Sequence[tuple[TrackingLaw, TrackingLaw]]) -> tuple[ContactLaws, ...]:
-        """The laws of each contact.
-
-        Raises:
-            ModelError: There are too few or too many, or they do not fit together.
-        """
-        wanted, latches = self.task.plan.pairs, self.task.plan.latches
-        if len(laws) != len(wanted):
-            texts = [f"{name} beside {', '.join(sorted(closed))}" for name, closed in wanted]
-            raise ModelError(
-                f"the task needs the laws of {len(wanted)} contacts ({', '.join(texts)}), got "
-                f"{len(laws)}"
-            )
-        if latches and (self.task.tare_time or any(law.integral.outputs for law, _ in laws)):
-            raise ModelError("a task with latches has no tare_time, and laws without integrals")
-        pairs, forces = [], [signal.name for signal in self.whole.force_signals]
-        for closed_law, free_law in laws:
-            contact = opened_contact(closed_law, free_law, bool(latches))
-            own = closed_law.system.force_signals
-            rows = tuple(forces.index(own[i].name) for i in contact.forces)
-            pairs.append(ContactLaws(replace(contact, forces=rows), (free_law, closed_law)))
-        return tuple(pairs)
-
-    def _trace_outputs(self) -> tuple[TracedFunction, tuple[Signal, ...]]:
-        """The function of all outputs in the order of the columns, and their names and units."""
-        whole, columns = self.whole, self.columns
-        force = ca.SX.sym("force", whole.num_constraints)
-        values, rates = ca.SX.zeros(columns.size), dict[int, ca.SX]()
-        signals = [Signal("")] * columns.size
-        values[: whole.num_outputs] = whole.outputs(force)
-        signals[: whole.num_outputs] = whole.output_signals
-        for i, pair in enumerate(self.pairs):
-            contact, chains = pair.contact, pair.laws[FREE].structure.output_chains
-            own = zip(contact.places, contact.forces, columns.distances[i], strict=True)
-            for number, (place, row, column) in enumerate(own):
-                values[column], rates[column] = chains[place][0], chains[place][1]
-                signals[column] = whole.constraint_output_signals[row]
-                if i and (of_force := columns.forces[i][number]) >= whole.num_outputs:
-                    values[of_force], signals[of_force] = force[row], whole.force_signals[row]
-        every = ca.vertcat(values, *(rates[column] for column in sorted(rates)))
-        traced = whole.trace("task outputs", {"value": ca.densify(every)}, {"force": force})
-        return traced, tuple(signals)
 
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -325,33 +278,7 @@ class TaskController(Diagram, Controller):
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        system = self.whole
-        check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
-        if plant.latches != self.task.plan.latches:
-            has, needs = (
-                ", ".join(names) or "none" for names in (plant.latches, self.task.plan.latches)
-            )
-            raise WiringError(
-                f"the task opens and closes the latches {needs}, and the plant has {has}: make it "
-                "with the same latches, in this order"
-            )
-        if plant.time_step and not self.sample_period:
-            raise WiringError(
-                f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
-                f"controller with sample_period={plant.time_step:g} or a multiple of it"
-            )
-        if not (plant.time_step or plant.is_ideal or self.sample_period):
-            raise WiringError(
-                "a compliant contact may be lost and regained at any time, and a task that reacts "
-                "at once may switch without end: make the controller with a sample_period (in a "
-                "scenario: sampling)"
-            )
-        for name in (system.force_signals[i].name for i in self.contact.forces):
-            if plant.contacts and name.split(".")[0] not in plant.contacts:
-                raise WiringError(
-                    f"the contact with the force '{name}' does not open in this plant; contacts "
-                    f"that open: {', '.join(plant.contacts)}"
-                )
+        check_plant_of_task(self.task, self.whole, self.contact, self.sample_period, plant)
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
@@ -366,13 +293,13 @@ class TaskController(Diagram, Controller):
         signals, columns = self.output_signals, self.columns
         every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
         outputs, rates = every[:, : columns.size], every[:, columns.size :]
-        distances = sorted({column for own in columns.distances for column in own})
-        rate_signals = (signals[column].derivative(1) for column in distances)
+        own = [signals[column] for column in columns.of_distances]
         desired = np.zeros_like(outputs)
         segments = () if context is None else self.segments(context)
         if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
-        self._not_led(segments, times, outputs, desired)
+            laws = np.array([segments[i].law for i in places_at(segments, times)])
+            desired = columns.led(desired, outputs, laws)
         places = values["phase"].astype(int)
         predicted = predicted_errors(
             self.pairs, columns, segments, times, {**values, "outputs": outputs}
@@ -381,31 +308,14 @@ class TaskController(Diagram, Controller):
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
             "distance": (
-                np.hstack([outputs[:, distances], rates]),
-                (*(signals[column] for column in distances), *rate_signals),
+                np.hstack([outputs[:, columns.of_distances], rates]),
+                (*own, *(signal.derivative(1) for signal in own)),
             ),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
             "predicted_error": (predicted, signals),
         }
-
-    def _not_led(
-        self,
-        segments: Sequence[ReferenceSegment],
-        times: FloatArray,
-        outputs: FloatArray,
-        desired: FloatArray,
-    ) -> None:
-        """Sets desired outputs of latches that the active law does not lead to the actual ones."""
-        if not self.task.plan.latches:
-            return
-        places = places_at(segments, times)
-        for which, segment in enumerate(segments):
-            led = self.columns.of_law(segment.law)
-            others = [column for column in range(self.columns.size) if column not in led]
-            rows = np.ix_(places == which, others)
-            desired[rows] = outputs[rows]
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
         parameters = self.controller.current_parameters(

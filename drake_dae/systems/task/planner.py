@@ -12,8 +12,8 @@ from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.phase_change import PhaseChange
-from drake_dae.systems.task.laws import CONTACT, FREE, ContactLaws
-from drake_dae.systems.task.open_contact import OpeningContact
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws
+from drake_dae.systems.task.contacts.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task

@@ -5,13 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.task.laws import CONTACT, ContactLaws, OutputColumns
+from drake_dae.systems.task.contacts.laws import CONTACT, ContactLaws
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 
 
 def predicted_errors(
     pairs: Sequence[ContactLaws],
-    columns: OutputColumns,
+    columns: TaskOutputs,
     segments: tuple[ReferenceSegment, ...],
     times: FloatArray,
     values: Mapping[str, FloatArray],

@@ -10,8 +10,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.fade import fade
-from drake_dae.systems.task.laws import OutputColumns
 
 DONE, HELD = "done", "held"
 """Names in a record for the time after the last phase, and after a task that ended otherwise."""
@@ -88,7 +88,7 @@ class ReferenceSegment:
             reference += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
         return reference
 
-    def desired(self, columns: OutputColumns, time: float) -> FloatArray:
+    def desired(self, columns: TaskOutputs, time: float) -> FloatArray:
         """The desired positions, forces and distances at a time in s, shape (columns.size,).
 
         Args:

@@ -23,10 +23,10 @@ from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, Update, zero
 from drake_dae.systems.control.contract import SIGNAL
-from drake_dae.systems.task.decision import PhaseDecision
-from drake_dae.systems.task.laws import CONTACT, FREE, ContactLaws, OutputColumns, law_name
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
+from drake_dae.systems.task.decision import PhaseDecision, moment_of
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
@@ -46,11 +46,11 @@ class TaskSupervisor(LeafSystem):
 
     Output ports:
         phase, desired_output, tared_force: As of `TaskController`.
-        contact_reference, free_reference: R of the active law; zero for the others. The names of
-            those of further contacts end in their numbers: contact_reference_2.
-        law: The number of the active law, shape (1,): 1 in contact, 0 without it; 3 and 2 for the
-            second contact, and so on.
-        latch: 1 for each latch that is commanded to be closed, else 0; only with latches.
+        contact_reference, free_reference, contact_reference_2, ...: R of the active law; zero for
+            the others.
+        law: The number of the active law, shape (1,): 0 without contact, 1 in contact; 2 and 3 for
+            the next contact, and so on.
+        latch: As of `TaskController`.
         ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
             rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
@@ -74,7 +74,7 @@ class TaskSupervisor(LeafSystem):
         self,
         task: Task,
         pairs: Sequence[ContactLaws],
-        columns: OutputColumns,
+        columns: TaskOutputs,
         num_forces: int,
         sample_period: float,
     ) -> None:
@@ -174,32 +174,18 @@ class TaskSupervisor(LeafSystem):
     # The end of a phase.
 
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
-        time, change = context.get_time(), segment.change
-        distance, rate, moved, rates = self._plan.motion(self._now(context), segment.law)
-        contact = self._pairs[segment.law // 2].contact
-        forces = self._traced.forces(self._filtered(context), segment.law)
-        wanted = [contact.main] if change.in_contact else list(contact.places)
-        desired = np.mean(segment.reference(time)[segment.layout.lowest[wanted]])
-        port, signal = self._control_port, 0.0
-        control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
+        port, control, signal = self._control_port, 0.0, 0.0
+        if port is not None:
+            control = float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
-            name = self._phases[change.place].signal
+            name = self._phases[segment.change.place].signal
             if name and self.signal_ports[name].HasValue(context):
                 signal = float(self.signal_ports[name].Eval(context)[0])
-        return Moment(
-            time=time - change.time,
-            force=max(map(abs, forces)) if contact.is_latch else sum(forces),
-            distance=distance,
-            rate=rate,
-            wanted=float(desired),
-            away=distance - change.distance,
-            speed=float(np.linalg.norm(rates)),
-            travel=float(np.linalg.norm(moved - segment.origin)),
-            work=self._traced.work_of(context.get_discrete_state(self._held).value()),
-            control=control,
-            eccentricity=float(eccentricity(forces, self.task.contact_force)),
-            signal=signal,
-        )
+        work = self._traced.work_of(context.get_discrete_state(self._held).value())
+        forces = self._traced.filter.forces(self._filtered(context), segment.law)
+        contact, least = self._pairs[segment.law // 2].contact, self.task.contact_force
+        motion, time = self._plan.motion(self._now(context), segment.law), context.get_time()
+        return moment_of(segment, contact, time, motion, forces, least, work, control, signal)
 
     def _filtered(self, context: Context) -> FloatArray:
         """The state of the force filter after the present sample; see `TracedTask`."""
@@ -238,7 +224,7 @@ class TaskSupervisor(LeafSystem):
                 self._state_port.Eval(context).copy(),
             )
         progress = TaskProgress((self._segment(context),), time - self._sample_period, time)
-        zeros = np.zeros(self._traced.filter_size), np.zeros(self._traced.tally.size)
+        zeros = np.zeros(self._traced.filter.size), np.zeros(self._traced.tally.size)
         self._put(state, progress, *zeros)
         return EventStatus.Succeeded()
 
@@ -277,7 +263,7 @@ class TaskSupervisor(LeafSystem):
     ) -> tuple[ReferenceSegment, EventStatus]:
         """The references after a phase, and the status of the event."""
         segment, now, moment = progress.segments[-1], self._now(context), decision.moment
-        forces = partial(self._traced.forces, self._filtered(context))
+        forces = partial(self._traced.filter.forces, self._filtered(context))
         if self._is_over(segment):
             cause = PhaseCause("the contact is lost at rest", segment.change.chosen, True)
             following = self._plan.following(now, segment, moment, None, cause, forces)
@@ -324,7 +310,7 @@ class TaskSupervisor(LeafSystem):
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
-        force[list(self._contact.forces)] -= self._traced.bias(self._filtered(context))
+        force[list(self._contact.forces)] -= self._traced.filter.bias(self._filtered(context))
         output.SetFromVector(force)
 
     def _holds(self, context: Context) -> bool:
@@ -339,7 +325,9 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        least = self._contact.size * min(self._traced.forces(self._filtered(context), CONTACT))
+        least = self._contact.size * min(
+            self._traced.filter.forces(self._filtered(context), CONTACT)
+        )
         is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         end = begin.time + segments[-1].over

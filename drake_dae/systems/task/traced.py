@@ -20,7 +20,9 @@ from drake_dae.systems.blocks.traced import (
 )
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
-from drake_dae.systems.task.laws import CONTACT, FREE, ContactLaws, OutputColumns, law_name
+from drake_dae.systems.task.contacts.force_filter import ForceFilter
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.phases import Moment, Phase
 from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import APPROACH, DONE, FAIL, HOLD, LEAVE, NEXT, STOP
@@ -65,9 +67,7 @@ class TracedTask:
     Attributes:
         task: The argument.
         size: The number of these numbers.
-        filter_size: The number of those of the force filter: for each force of a contact the force
-            after the low-pass, then the mean of the samples before the first touch; then the number
-            of these samples.
+        filter: The filter of the measured forces.
         tally: The counts for the guards.
     """
 
@@ -75,21 +75,20 @@ class TracedTask:
         self,
         task: Task,
         pairs: Sequence[ContactLaws],
-        columns: OutputColumns,
+        columns: TaskOutputs,
         plan: TaskPlanner,
         num_forces: int,
         sample_period: float,
     ) -> None:
         self.task, self._pairs, self._columns, self._plan = task, pairs, columns, plan
         self._laws = laws = [law for pair in pairs for law in pair.laws]
-        self._rows = sorted({row for pair in pairs for row in pair.contact.forces})
-        self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
+        self.filter = ForceFilter(task, [pair.contact for pair in pairs], sample_period)
+        self._phases = task.plan.phases
         self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
-        self.filter_size = 2 * len(self._rows) + 1
-        sizes = [len(NAMES), self.filter_size, count, count, rows * self._shape[1], plan.moved]
+        sizes = [len(NAMES), self.filter.size, count, count, rows * self._shape[1], plan.moved]
         sizes += [len(self._phases), self.tally.size]
         ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
@@ -103,51 +102,24 @@ class TracedTask:
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
         self._filter_places = slice(ends[0], ends[1])
-        self._filtered = self._filter(before, self._forces[self._rows])
-        self._count = before[-1]
+        self._filtered = self.filter.after(before, self._forces)
         self._filter_function = ca.Function("filter", [before, self._forces], [self._filtered])
         self._is_latched = bool(task.plan.latches)
-        each = [self._filtered[self._filter_rows(law)] for law in range(len(laws))]
-        self._each = each[CONTACT]
-        totals = [ca.norm_inf(part) if self._is_latched else ca.sum1(part) for part in each]
-        self._force = self._by_law(totals)
-
-    def _filter_rows(self, law: int) -> list[int]:
-        """The places of the forces of the contact of a law in the force filter."""
-        return [self._rows.index(row) for row in self._pairs[law // 2].contact.forces]
+        each = [self._filtered[self.filter.of_law(law)] for law in range(len(laws))]
+        self._each, total = each[CONTACT], ca.norm_inf if self._is_latched else ca.sum1
+        self._force = self._by_law([total(part) for part in each])
 
     def _by_law(self, values: Sequence[ca.SX]) -> ca.SX:
         """The value for the active law, one for each law."""
-        if len(values) == 2 and values[0] is values[1]:
-            return values[0]
-        return sum(
-            (ca.if_else(self._acts(law), value, 0) for law, value in enumerate(values)), ca.SX(0)
-        )
+        each = [ca.if_else(self._acts(law), value, 0) for law, value in enumerate(values)]
+        return sum(each[1:], each[0])
 
     def _acts(self, law: int) -> ca.SX:
         """Whether a law is active."""
         return ca.fabs(self._named["law"] - law) < 0.5
 
-    @property
-    def _is_closed(self) -> ca.SX:
-        """Whether the contact is closed."""
-        return self._by_law([ca.SX(law % 2) for law in range(len(self._laws))])
-
-    def _filter(self, before: ca.SX, measured: ca.SX) -> ca.SX:
-        """The state of the force filter after one more sample."""
-        size = len(self._rows)
-        force, bias, count = before[:size], before[size : 2 * size], before[-1]
-        if self._tares:
-            waits = count < self._tares - 0.5
-            count = ca.if_else(waits, count + 1, count)
-            bias = ca.if_else(waits, bias + (measured - bias) / count, bias)
-            unbiased = ca.if_else(waits, ca.SX.zeros(size), measured - bias)
-        else:
-            unbiased = measured
-        return ca.vertcat(force + self.task.force_gain * (unbiased - force), bias, count)
-
     def filtered(self, held: FloatArray, measured: FloatArray) -> FloatArray:
-        """The state of the force filter after a sample, shape (filter_size,).
+        """The state of the force filter after a sample, shape (filter.size,).
 
         Args:
             held: The numbers before it, shape (size,).
@@ -155,18 +127,9 @@ class TracedTask:
         """
         return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
 
-    def forces(self, filtered: FloatArray, law: int) -> list[float]:
-        """The forces of the contact of a law after the filter, in N, one for each of its points."""
-        forces: list[float] = filtered[self._filter_rows(law)].tolist()
-        return forces
-
-    def bias(self, filtered: FloatArray) -> FloatArray:
-        """The bias of the forces of the contact, in N, from the state of the force filter."""
-        return filtered[len(self._rows) : -1]
-
     def tares(self, held: FloatArray) -> bool:
         """Whether the bias of the force is still being estimated."""
-        return bool(held[self._filter_places][-1] < self._tares - 0.5)
+        return bool(held[self._filter_places][-1] < self.filter.tares - 0.5)
 
     def tally_of(self, held: FloatArray) -> FloatArray:
         """The counts for the guards; see `GuardMemory`."""
@@ -250,8 +213,8 @@ class TracedTask:
         least = size * ca.mmin(self._each)
         is_open = ca.logic_or(ca.logic_not(is_closed), least < self.task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
-        values = [desired, self._named["place"], self._named["law"], self._named["ending"]]
         outputs = ["desired_output", "phase", "law", "ending"]
+        values = [desired, *(self._named[name] for name in ("place", "law", "ending"))]
         if latches := self.task.plan.latches:
             closed = [self.task.plan.closed_by(law) for law in range(len(self._laws))]
             shut = [ca.DM([float(name in names) for name in latches]) for names in closed]
@@ -264,7 +227,7 @@ class TracedTask:
         holds = ca.Function("hold", [*inputs, self._forces, hold], [stands])
         sources = (TIME, HELD, "measured_force", "hold")
         computations.append(Computation(holds, sources, ("contact_hold",)))
-        if self._tares:
+        if self.filter.tares:
             tared = ca.SX(self._forces)
             tared[list(contact.forces)] -= self._filtered[size : 2 * size]
             function = ca.Function("tared", [self._held, self._forces], [tared])
@@ -300,8 +263,8 @@ class TracedTask:
         for which, each in enumerate(self._laws):
             contact = self._pairs[which // 2].contact
             places = [contact.main] if which % 2 else list(contact.places)
-            rows = self._reference(which)[each.layout.lowest[places].tolist()]
-            wanted += ca.sum1(rows) / len(places)
+            rows = each.layout.lowest[places].tolist()
+            wanted += ca.sum1(self._reference(which)[rows]) / len(places)
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
         if self.task.watches("control"):
@@ -346,10 +309,13 @@ class TracedTask:
         named, task = self._named, self.task
         moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
-        counts, tares = self._counted(), self._count < self._tares - 0.5
+        counts, tares = (
+            self._counted(),
+            self._held[self._filter_places][-1] < self.filter.tares - 0.5,
+        )
         excess = self._force - task.contact_force
 
-        waits = ca.logic_and(self._is_closed, named["is_felt"] < 0.5)
+        waits = ca.logic_and(ca.fmod(named["law"], 2), named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
         felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
         if self._is_latched:  # A latch without force is not lost.
@@ -360,7 +326,7 @@ class TracedTask:
             now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
             end, late = self._ends(phase, now)
             guards = [ca.fmin(margin, 1e9) for margin in self.tally.margins(phase, counts, now)]
-            if self._tares:
+            if self.filter.tares:
                 end = ca.if_else(tares, 1, end)
             trips = ca.mmin(ca.vertcat(1e9, *guards))
             return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)

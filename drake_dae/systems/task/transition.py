@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Computation, Reaction, Update
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE
 from drake_dae.systems.task.fade import fade
-from drake_dae.systems.task.laws import CONTACT, FREE
 from drake_dae.systems.task.phases import Outcome
 from drake_dae.systems.task.phases.phase import APPROACH, FAIL, LEAVE
 from drake_dae.systems.task.traced import EARLY, ENDINGS, NAMES, TracedTask
@@ -66,10 +66,10 @@ class SampledTask(TracedTask):
             ends = ca.logic_or(ends, each)
         to, approaches, ending = self._successors(ended)
 
-        was = self._is_closed
+        was = ca.fmod(self._named["law"], 2)
         before, present = [self._reference(which) for which in range(len(self._laws))], []
         for which, law_after in enumerate(self._laws):
-            met = self._met(which, self._force, self._filtered[self._filter_rows(which)])
+            met = self._met(which, self._force, self._filtered[self.filter.of_law(which)])
             places = self._pairs[which // 2].contact.places
             for i, first in enumerate(law_after.layout.lowest.tolist()):
                 if i not in places:
@@ -174,7 +174,7 @@ class SampledTask(TracedTask):
         end, plan = len(self._phases), self.task.plan
         numbers = [float(plan.law_of(place)) for place in range(end)]
         next_law = ca.mtimes(ca.DM([[*numbers, 0.0]]), _at(to, end + 1))
-        was = self._is_closed
+        was = ca.fmod(self._named["law"], 2)
 
         def after(place: int) -> ca.SX:
             lost = ended[2] if self._phases[place].ends_by_loss else ca.SX(0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,6 @@ from drake_dae.arrays import FloatArray, number, show, unknown_name
 from drake_dae.dae.system.contacts import PainleveOutcome, painleve_outcome
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError, PainleveError, SimulationError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
@@ -327,35 +326,6 @@ def _latch_rows(
             "velocities; use a bilateral constraint such as WeldedFrames or CoincidentPoints"
         )
     return rows
-
-
-def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
-    """The system with some of the constraints only.
-
-    Args:
-        contacts: The contacts.
-        rows: The constraints that hold.
-        state: A state near which it is examined, shape (n,).
-    """
-    dae, rows = contacts.dae, list(rows)
-    embed = ca.SX.eye(dae.num_constraints)[:, rows]
-    whole = dae.implicit
-
-    def implicit(rate: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert whole is not None
-        balance, constraint_rate = whole(rate, ca.mtimes(embed, force))
-        return balance, constraint_rate[rows]
-
-    return replace(
-        dae,
-        g=dae.g[:, rows],
-        k=dae.k[rows],
-        m=dae.m[:, rows],
-        constraint_input_signals=tuple(dae.constraint_input_signals[i] for i in rows),
-        constraint_output_signals=tuple(dae.constraint_output_signals[i] for i in rows),
-        implicit=None if whole is None or not rows else implicit,
-        nominal_state=state,
-    )
 
 
 def coefficient(name: str, value: float) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
+from drake_dae.systems.task.contacts.modes import ContactMode, modes_of
 from drake_dae.systems.task.phases.members import Release
 from drake_dae.systems.task.phases.phase import (
     APPROACH,
@@ -64,54 +65,6 @@ def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
     return tuple(renamed)
 
 
-@dataclass(frozen=True)
-class ContactMode:
-    """The closed contacts of a task, and the one that it leads.
-
-    Attributes:
-        contact: The name of the contact that opens and closes; empty in a task with one contact.
-        is_closed: Whether this contact is closed.
-        others: The names of the other latches that are closed.
-    """
-
-    contact: str
-    is_closed: bool
-    others: frozenset[str] = frozenset()
-
-    @property
-    def closed(self) -> frozenset[str]:
-        """The names of all closed contacts."""
-        return self.others | {self.contact} if self.is_closed else self.others
-
-
-def modes_of(phases: Sequence[Phase]) -> tuple[ContactMode, ...]:
-    """The mode in which each phase begins; last the mode in which the last one ends.
-
-    A contact is closed at the start if the first phase that opens, closes or needs it says so.
-    """
-    names, name = list[str](), ""
-    for phase in phases:
-        name = phase.contact or name
-        names.append(name)
-    closed, known = set[str](), set[str]()
-    for name, phase in zip(names, phases, strict=True):
-        if phase.begins_in_contact is not None and name not in known:
-            known.add(name)
-            closed |= {name} if phase.begins_in_contact else set()
-    modes = []
-
-    def add(name: str, says: bool | None) -> None:
-        if says is not None:
-            (closed.add if says else closed.discard)(name)
-
-    for name, phase in zip(names, phases, strict=True):
-        add(name, phase.begins_in_contact)
-        modes.append(ContactMode(name, name in closed, frozenset(closed - {name})))
-        add(name, phase.ends_in_contact)
-    modes.append(ContactMode(names[-1], names[-1] in closed, frozenset(closed - {names[-1]})))
-    return tuple(modes)
-
-
 class PhasePlan:
     """The order of the phases of a task.
 
@@ -123,8 +76,7 @@ class PhasePlan:
         phases: The same, followed by the Release for "leave" if it may be needed.
         modes: The mode in which each phase begins; last the mode in which the last one ends.
         contacts: Whether each phase begins in contact; last whether the last one ends in contact.
-        pairs: For each contact with other closed ones, in the order of the phases, its name and the
-            names of the others.
+        pairs: For each contact beside other closed ones its name and their names.
         latches: The names of the latches; empty in a task with one contact.
         last: The number of phases that were given.
         retries: The argument.
@@ -141,8 +93,7 @@ class PhasePlan:
         self.phases: tuple[Phase, ...] = tuple(phases)
         self.modes = modes_of(phases)
         self.contacts = tuple(mode.is_closed for mode in self.modes)
-        every = dict.fromkeys((mode.contact, mode.others) for mode in self.modes[:-1])
-        self.pairs = tuple(every)
+        self.pairs = tuple(dict.fromkeys((each.contact, each.others) for each in self.modes[:-1]))
         self.latches = tuple(dict.fromkeys(name for name, _ in self.pairs if name))
         self._check_latches()
         if self._leaves():
@@ -216,8 +167,7 @@ class PhasePlan:
     @property
     def latch_sets(self) -> set[frozenset[str]]:
         """The sets of latches that are closed together; empty without latches."""
-        laws = range(2 * len(self.pairs)) if self.latches else ()
-        return {self.closed_by(law) for law in laws}
+        return {self.closed_by(law) for law in range(2 * len(self.pairs)) if self.latches}
 
     def ends_in_contact(self, place: int) -> bool:
         """Whether a phase that succeeds ends in contact."""
@@ -250,23 +200,18 @@ class PhasePlan:
         """Refuses phases that do not fit their contact."""
         for place, phase in enumerate(self.phases):
             name = self.modes[place].contact
+            text = ""
             if self.latches and not name:
-                raise ModelError(
-                    f"{self.where(place)}: contact: needed, since later phases name theirs, "
-                    f"{', '.join(self.latches)}"
-                )
-            if name and not phase.for_latch:
-                raise ModelError(
-                    f"{self.where(place)}: it is for a contact that pushes, and not for the latch "
-                    f"'{name}'; use Close, Release, Move, Dwell or Wait"
-                )
-            if not name and not phase.for_contact:
-                raise ModelError(f"{self.where(place)}: contact: needed, the name of a latch")
+                text = f"contact: needed, since later phases name {', '.join(self.latches)}"
+            elif name and not phase.for_latch:
+                text = f"it is not for the latch '{name}', but for a contact that pushes"
+            elif not name and not phase.for_contact:
+                text = "contact: needed, the name of a latch"
             words = {phase.chosen(outcome) for outcome in OUTCOMES} | {phase.if_spent}
             if name and LEAVE in words:
-                raise ModelError(
-                    f"{self.where(place)}: leave does not say which latch to open; name a Release"
-                )
+                text = "leave does not say which latch to open; name a Release"
+            if text:
+                raise ModelError(f"{self.where(place)}: {text}")
 
     def _all_from(self, place: int) -> list[tuple[str, int]]:
         """The key words and phases that may follow a phase, each checked."""
@@ -315,8 +260,8 @@ class PhasePlan:
             text = "it begins with a free robot, but it is in contact; a Release must lead there"
         closed, needs = self._closed_after(place, outcome), self.modes[to].closed
         if not text and self.latches and closed != needs:
-            has, wants = (", ".join(sorted(names)) or "no latch" for names in (closed, needs))
-            text = f"it begins with {wants} closed, but {has} closed then"
+            has, wants = (", ".join(sorted(names)) or "none" for names in (closed, needs))
+            text = f"it begins with these latches closed: {wants}; but then closed: {has}"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
 

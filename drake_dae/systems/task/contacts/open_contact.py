@@ -4,9 +4,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
+import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import listed, unknown_name
+from drake_dae.arrays import FloatArray, listed, unknown_name
 from drake_dae.dae.structure.redundancy import with_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -35,6 +36,11 @@ class OpeningContact:
     def size(self) -> int:
         """The number of its points."""
         return len(self.forces)
+
+    def total(self, forces: FloatArray) -> FloatArray:
+        """The sum of its forces, along the last axis; of a latch the largest force or moment."""
+        total: FloatArray = np.abs(forces).max(-1) if self.is_latch else forces.sum(-1)
+        return total
 
     @property
     def others(self) -> list[int]:

@@ -1,7 +1,7 @@
 """The laws of a task: two for each contact that opens and closes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
@@ -9,7 +9,12 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.task.open_contact import OpeningContact, open_contact, with_latch
+from drake_dae.systems.task.contacts.open_contact import (
+    OpeningContact,
+    open_contact,
+    opened_contact,
+    with_latch,
+)
 from drake_dae.systems.task.phases.plan import PhasePlan
 from drake_dae.systems.task.task import Task
 
@@ -36,43 +41,37 @@ def law_name(which: int, kind: str) -> str:
     return f"{('free', 'contact')[which % 2]}_{kind}{number}"
 
 
-class OutputColumns:
-    """The places of the outputs of all laws of a task in its record.
-
-    First the outputs of the first law in contact, then the distances of its contact; then forces
-    and distances of each further latch.
+def paired_laws(
+    task: Task, whole: DaeSystem, laws: Sequence[tuple[TrackingLaw, TrackingLaw]]
+) -> tuple[ContactLaws, ...]:
+    """The laws of each contact of a task, checked.
 
     Args:
-        pairs: The laws of the task.
+        task: The task.
+        whole: The system with all constraints.
+        laws: For each entry of `task.plan.pairs` the law in contact and the law without it.
 
-    Attributes:
-        size: The number of all outputs.
-        forces, distances: For each pair, the columns with the forces and distances of its contact.
+    Raises:
+        ModelError: There are too few or too many, or they do not fit together.
     """
-
-    def __init__(self, pairs: Sequence[ContactLaws]) -> None:
-        self._pairs, self.size = pairs, pairs[0].laws[0].system.num_outputs
-        known = dict[tuple[int, ...], tuple[list[int], list[int]]]()
-        for pair in pairs:
-            contact = pair.contact
-            if contact.forces in known:
-                continue
-            forces = list(contact.places)
-            if known:
-                forces = [self.size + i for i in range(contact.size)]
-                self.size += contact.size
-            known[contact.forces] = forces, [self.size + i for i in range(contact.size)]
-            self.size += contact.size
-        self.forces, self.distances = zip(*(known[p.contact.forces] for p in pairs), strict=True)
-
-    def of_law(self, law: int) -> list[int]:
-        """The columns of the outputs of a law, by its number."""
-        pair = law // 2
-        columns = list(range(self._pairs[0].laws[0].system.num_outputs))
-        own = self.forces[pair] if law % 2 else self.distances[pair]
-        for place, column in zip(self._pairs[pair].contact.places, own, strict=True):
-            columns[place] = column
-        return columns
+    wanted, latches = task.plan.pairs, task.plan.latches
+    if len(laws) != len(wanted):
+        texts = [f"{name} beside {', '.join(sorted(closed))}" for name, closed in wanted]
+        raise ModelError(
+            f"the task needs the laws of {len(wanted)} contacts ({', '.join(texts)}), got "
+            f"{len(laws)}"
+        )
+    if latches and (task.tare_time or any(law.integral.outputs for law, _ in laws)):
+        raise ModelError(
+            "a task with latches has no tare_time and no integrals of errors; leave them out"
+        )
+    pairs, forces = [], [signal.name for signal in whole.force_signals]
+    for closed_law, free_law in laws:
+        contact = opened_contact(closed_law, free_law, bool(latches))
+        own = closed_law.system.force_signals
+        rows = tuple(forces.index(own[i].name) for i in contact.forces)
+        pairs.append(ContactLaws(replace(contact, forces=rows), (free_law, closed_law)))
+    return tuple(pairs)
 
 
 @checked(ModelError)
