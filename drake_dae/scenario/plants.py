@@ -23,7 +23,7 @@ from drake_dae.systems.plants.contact.contact_material import ContactMaterial, P
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.latched_plant import LatchedPlant
+from drake_dae.systems.plants.latched.latched_plant import LatchedPlant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
 from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant

@@ -94,7 +94,7 @@ def _latched(scenario: Scenario, model: RobotModel, period: float) -> TaskContro
     with at("task"):
         made = task.make()
         free = None if task.gains is None else task.gains.design()
-        pairs = laws_of_latches(made, model.dae, scenario.gains.design(), free)
+        pairs = laws_of_latches(made.plan, model.dae, scenario.gains.design(), free)
         return TaskController(
             made, *pairs[0], further=pairs[1:], whole=model.dae, sample_period=period
         )

@@ -136,7 +136,7 @@ class TaskController(Diagram, Controller):
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
         self.whole = law.system if whole is None else whole
-        self.pairs = paired_laws(task, self.whole, [(law, free_law), *further])
+        self.pairs = paired_laws(task.plan, self.whole, [(law, free_law), *further])
         self.columns = TaskOutputs(self.pairs, self.whole)
         self.contact = contact = self.pairs[0].contact
         if contact.size == 1 and task.watches("eccentricity"):
@@ -278,7 +278,7 @@ class TaskController(Diagram, Controller):
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        check_plant_of_task(self.task, self.whole, self.contact, self.sample_period, plant)
+        check_plant_of_task(self.task.plan, self.whole, self.contact, self.sample_period, plant)
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]

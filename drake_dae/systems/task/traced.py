@@ -82,7 +82,8 @@ class TracedTask:
     ) -> None:
         self.task, self._pairs, self._columns, self._plan = task, pairs, columns, plan
         self._laws = laws = [law for pair in pairs for law in pair.laws]
-        self.filter = ForceFilter(task, [pair.contact for pair in pairs], sample_period)
+        tares = task.tare_samples(sample_period)
+        self.filter = ForceFilter([pair.contact for pair in pairs], task.force_gain, tares)
         self._phases = task.plan.phases
         self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)

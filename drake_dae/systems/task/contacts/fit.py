@@ -5,16 +5,16 @@ from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import check_same_sizes
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.contacts.open_contact import OpeningContact
-from drake_dae.systems.task.task import Task
+from drake_dae.systems.task.phases.plan import PhasePlan
 
 
 def check_plant_of_task(
-    task: Task, system: DaeSystem, contact: OpeningContact, sample_period: float, plant: Plant
+    plan: PhasePlan, system: DaeSystem, contact: OpeningContact, sample_period: float, plant: Plant
 ) -> None:
     """Refuses a plant that does not fit a task.
 
     Args:
-        task: The task.
+        plan: The order of the phases.
         system: The system of the laws' model with all constraints.
         contact: The contact that opens and closes, or the first latch.
         sample_period: The sample period of the task, in s; 0 for none.
@@ -24,8 +24,8 @@ def check_plant_of_task(
         WiringError: The plant does not fit; the message has the reason.
     """
     check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
-    if plant.latches != task.plan.latches:
-        has, needs = (", ".join(names) or "none" for names in (plant.latches, task.plan.latches))
+    if plant.latches != plan.latches:
+        has, needs = (", ".join(names) or "none" for names in (plant.latches, plan.latches))
         raise WiringError(
             f"the task opens and closes the latches {needs}, and the plant has {has}: make it "
             "with the same latches, in this order"

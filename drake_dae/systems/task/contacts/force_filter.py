@@ -6,7 +6,6 @@ import casadi as ca
 
 from drake_dae.arrays import FloatArray
 from drake_dae.systems.task.contacts.open_contact import OpeningContact
-from drake_dae.systems.task.task import Task
 
 
 class ForceFilter:
@@ -16,23 +15,20 @@ class ForceFilter:
     the first touch, then the number of these samples.
 
     Args:
-        task: The task.
         contacts: The contact of each pair of laws.
-        sample_period: The sample period, in s; 0 for none.
+        gain: The gain of the low-pass; see `Task.force_gain`.
+        tares: The number of samples in the mean; 0 if no bias is found.
 
     Attributes:
         rows: The indices of the filtered forces among all measured ones.
         size: The number of entries of the state.
-        tares: The number of samples in the mean; 0 if no bias is found.
+        tares: The argument.
     """
 
-    def __init__(
-        self, task: Task, contacts: Sequence[OpeningContact], sample_period: float
-    ) -> None:
+    def __init__(self, contacts: Sequence[OpeningContact], gain: float, tares: int) -> None:
         self.rows = sorted({row for contact in contacts for row in contact.forces})
         self._places = [[self.rows.index(row) for row in each.forces] for each in contacts]
-        self.size, self.tares = 2 * len(self.rows) + 1, task.tare_samples(sample_period)
-        self._gain = task.force_gain
+        self.size, self.tares, self._gain = 2 * len(self.rows) + 1, tares, gain
 
     def after(self, before: ca.SX, measured: ca.SX) -> ca.SX:
         """The state after a sample.

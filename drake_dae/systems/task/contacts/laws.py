@@ -16,7 +16,6 @@ from drake_dae.systems.task.contacts.open_contact import (
     with_latch,
 )
 from drake_dae.systems.task.phases.plan import PhasePlan
-from drake_dae.systems.task.task import Task
 
 FREE, CONTACT = 0, 1
 """The indices of the two laws of a contact. The laws of all contacts are numbered in this order."""
@@ -42,29 +41,27 @@ def law_name(which: int, kind: str) -> str:
 
 
 def paired_laws(
-    task: Task, whole: DaeSystem, laws: Sequence[tuple[TrackingLaw, TrackingLaw]]
+    plan: PhasePlan, whole: DaeSystem, laws: Sequence[tuple[TrackingLaw, TrackingLaw]]
 ) -> tuple[ContactLaws, ...]:
     """The laws of each contact of a task, checked.
 
     Args:
-        task: The task.
+        plan: The order of the phases.
         whole: The system with all constraints.
-        laws: For each entry of `task.plan.pairs` the law in contact and the law without it.
+        laws: For each entry of `plan.pairs` the law in contact and the law without it.
 
     Raises:
         ModelError: There are too few or too many, or they do not fit together.
     """
-    wanted, latches = task.plan.pairs, task.plan.latches
+    wanted, latches = plan.pairs, plan.latches
     if len(laws) != len(wanted):
         texts = [f"{name} beside {', '.join(sorted(closed))}" for name, closed in wanted]
         raise ModelError(
             f"the task needs the laws of {len(wanted)} contacts ({', '.join(texts)}), got "
             f"{len(laws)}"
         )
-    if latches and (task.tare_time or any(law.integral.outputs for law, _ in laws)):
-        raise ModelError(
-            "a task with latches has no tare_time and no integrals of errors; leave them out"
-        )
+    if latches and any(law.integral.outputs for law, _ in laws):
+        raise ModelError("a task with latches has laws without integrals of errors; leave them out")
     pairs, forces = [], [signal.name for signal in whole.force_signals]
     for closed_law, free_law in laws:
         contact = opened_contact(closed_law, free_law, bool(latches))
@@ -76,12 +73,12 @@ def paired_laws(
 
 @checked(ModelError)
 def laws_of_latches(
-    task: Task, system: DaeSystem, gains: GainDesign, free_gains: GainDesign | None = None
+    plan: PhasePlan, system: DaeSystem, gains: GainDesign, free_gains: GainDesign | None = None
 ) -> tuple[tuple[TrackingLaw, TrackingLaw], ...]:
-    """The laws of a task with latches: for each entry of `task.plan.pairs` (law, free_law).
+    """The laws of a task with latches: for each entry of `plan.pairs` (law, free_law).
 
     Args:
-        task: The task.
+        plan: The order of its phases, `task.plan`.
         system: The system with the constraints of all latches, `RobotModel.dae` for example. Its
             outputs are positions, and as many constraint forces as each latch has. The forces of
             the latch "left" are "left.fx" and so on.
@@ -93,8 +90,8 @@ def laws_of_latches(
         AssumptionError: A law is not defined while these latches are closed.
     """
     pairs = list[tuple[TrackingLaw, TrackingLaw]]()
-    for number, (name, _) in enumerate(task.plan.pairs):
-        led = latched_system(task.plan, system, number)
+    for number, (name, _) in enumerate(plan.pairs):
+        led = latched_system(plan, system, number)
         free = open_contact(led, _forces_of(system)[name], is_latch=True)
         pairs.append((TrackingLaw(led, gains), TrackingLaw(free, free_gains or gains)))
     return tuple(pairs)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.systems.task.contacts.modes import ContactMode, modes_of
 from drake_dae.systems.task.phases.members import Release
 from drake_dae.systems.task.phases.phase import (
     APPROACH,
@@ -16,8 +15,10 @@ from drake_dae.systems.task.phases.phase import (
     LEAVE,
     NEXT,
     STOP,
+    ContactMode,
     Outcome,
     Phase,
+    modes_of,
 )
 
 OUTCOMES: tuple[Outcome, ...] = ("success", "guard", "late", "lost")
@@ -250,26 +251,21 @@ class PhasePlan:
         is_next = to == place + 1 and outcome == "success" and key == "on_success"
         way = "" if is_next else f", after {self.phases[place].name} by {key}"
         begins, ends = self.contacts[to], self.ends_in_contact(to)
-        if outcome == "lost" and begins and ends:
-            text = "it begins in contact, but the contact is lost; choose another one by if_lost"
-        elif begins and not (
-            self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
-        ):
-            text = "it begins in contact, but the robot is free; an Approach must lead there"
-        elif outcome == "success" and not begins and self.ends_in_contact(place):
-            text = "it begins with a free robot, but it is in contact; a Release must lead there"
-        closed, needs = self._closed_after(place, outcome), self.modes[to].closed
-        if not text and self.latches and closed != needs:
+        in_contact = self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
+        closed = replace(self.modes[place], is_closed=in_contact).closed
+        if self.latches and closed != (needs := self.modes[to].closed):
             has, wants = (", ".join(sorted(names)) or "none" for names in (closed, needs))
             text = f"it begins with these latches closed: {wants}; but then closed: {has}"
+        elif self.latches:
+            text = ""
+        elif outcome == "lost" and begins and ends:
+            text = "it begins in contact, but the contact is lost; choose another one by if_lost"
+        elif begins and not in_contact:
+            text = "it begins in contact, but the robot is free; an Approach must lead there"
+        elif outcome == "success" and not begins and in_contact:
+            text = "it begins with a free robot, but it is in contact; a Release must lead there"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
-
-    def _closed_after(self, place: int, outcome: Outcome) -> frozenset[str]:
-        """The names of the closed contacts after a phase with its outcome."""
-        mode = self.modes[place]
-        is_closed = self.ends_in_contact(place) if outcome == "success" else mode.is_closed
-        return replace(mode, is_closed=is_closed).closed
 
     def _check_reached(self) -> None:
         reached, unexplored = {0}, [0]
