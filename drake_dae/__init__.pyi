@@ -180,6 +180,7 @@ from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
+from .systems.plants.latched.latched_plant import LatchedPlant as LatchedPlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
@@ -187,9 +188,11 @@ from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor
 from .systems.sensing.tolerances import Tolerances as Tolerances
+from .systems.task.contacts.laws import laws_of_latches as laws_of_latches
+from .systems.task.contacts.open_contact import open_contact as open_contact
 from .systems.task.controller import TaskController as TaskController
-from .systems.task.open_contact import open_contact as open_contact
 from .systems.task.phases import Approach as Approach
+from .systems.task.phases import Close as Close
 from .systems.task.phases import Dwell as Dwell
 from .systems.task.phases import GuardedMove as GuardedMove
 from .systems.task.phases import Insert as Insert

@@ -169,9 +169,10 @@ class Expressions:
         dependencies = tuple(self._dependencies.pop().values())
         gate = ca.SX(0)
         if computation.choice is not None:
-            flag, first, second = computation.choice
-            is_first = arguments[computation.sources.index(flag)] > 0.5
-            gate = ca.if_else(is_first, validity[first], validity[second])
+            number, *options = computation.choice
+            chosen = arguments[computation.sources.index(number)]
+            for i, option in enumerate(options):
+                gate += ca.if_else(ca.fabs(chosen - i) < 0.5, validity[option], 0)
         results = computation.function.call(arguments)
         is_passed_on = [result.is_valid_input() for result in results]
         is_precomputable = (

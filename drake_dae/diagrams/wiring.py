@@ -177,6 +177,8 @@ def wire_loop(
         builder.Connect(control, plant.GetInputPort("control"))
         if goal is not None and controller.HasInputPort("reference"):
             builder.Connect(goal, controller.GetInputPort("reference"))
+    if plant.latches:
+        builder.Connect(controller.GetOutputPort("latch"), plant.GetInputPort("latch"))
     if controller.HasInputPort("acting_control"):
         builder.Connect(control, controller.GetInputPort("acting_control"))
 
@@ -304,12 +306,7 @@ def _of_plant(
     if moving is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         named["exogenous"] = (moving.get_output_port(), signals)
-    for name, signals in {
-        "state": dae.state_signals,
-        "constraint_force": dae.force_signals,
-        "constraint_residual": plant.structure.manifold.residual_signals,
-        "controlled_output": dae.output_signals,
-    }.items():
+    for name, signals in plant.port_signals.items():
         named[name] = (plant.GetOutputPort(name), signals)
     if reference is not None:
         named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)

@@ -48,7 +48,7 @@ def build_completed(
     scene_graph = SceneGraph()
     completed, model = completed_model(scenario, scene_graph)
     try:
-        structure = scenario_structure(model)
+        structure = scenario_structure(model, scenario.task)
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)

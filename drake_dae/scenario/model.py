@@ -29,10 +29,12 @@ from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
+from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.parts.written import WrittenForm, make
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.task.contacts.laws import latched_system
 
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
@@ -157,8 +159,8 @@ def _read(
     return _BuiltRobot(name, links, constraints, stages, known_forces, completed)
 
 
-def scenario_structure(model: RobotModel) -> Structure:
-    """The structure of a scenario's robot.
+def scenario_structure(model: RobotModel, task: ScenarioTask | None = None) -> Structure:
+    """The structure of a scenario's robot, of a task with latches in its first closed mode.
 
     Raises:
         AssumptionError: The robot violates an assumption of the theory.
@@ -171,8 +173,12 @@ def scenario_structure(model: RobotModel) -> Structure:
             f"name {actuators}, one for each actuator, or give references of some of them"
         )
         raise ScenarioError(("outputs", text))
+    with at("task"):
+        plan = None if task is None else task.make().plan
+        latched = plan is not None and bool(plan.latches)
+        system = latched_system(plan, model.dae, 0) if plan is not None and latched else model.dae
     try:
-        return find_structure(model.dae)
+        return find_structure(system)
     except InconsistentStateError as error:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
 

@@ -1,7 +1,7 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any, ClassVar, cast
@@ -23,6 +23,7 @@ from drake_dae.systems.plants.contact.contact_material import ContactMaterial, P
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.latched.latched_plant import LatchedPlant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
 from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
@@ -36,6 +37,8 @@ class RobotToSimulate:
         model, structure: The robot, and the structure of its system.
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
+        latches: The latches that a task opens and closes.
+        latch_sets: Those that it closes together.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -50,6 +53,8 @@ class RobotToSimulate:
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
     pushed: bool = False
+    latches: Sequence[str] = ()
+    latch_sets: Collection[Collection[str]] = ()
 
 
 class ScenarioPlant(ABC):
@@ -101,6 +106,10 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
+        if robot.latches:
+            return UnilateralRobotPlant(
+                robot.model, {}, latches=robot.latches, latch_sets=robot.latch_sets
+            )
         if robot.opens:  # In a task its contacts open, without bouncing.
             return Unilateral(dict.fromkeys(robot.opens, 0.0)).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
@@ -179,6 +188,19 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters"):
+            if robot.latches:
+                if robot.parameters or robot.disturbances:
+                    raise ModelError(
+                        "Drake's plant with latches takes no plant_parameters and no "
+                        "plant_disturbances; leave them out"
+                    )
+                return LatchedPlant(
+                    robot.model,
+                    robot.add_robot,
+                    robot.latches,
+                    structure=robot.structure,
+                    time_step=self.time_step,
+                )
             return ContactPlant(
                 robot.model,
                 robot.add_robot,

@@ -9,6 +9,8 @@ from typing import Self
 import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -130,6 +132,7 @@ class Constraint(ABC):
         of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
         clearance of that point, except beyond the ends of a body that the law does not know.
+    16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
 
     Attributes:
         name: The prefix of the names of its forces, residuals and parameters.
@@ -252,6 +255,17 @@ class Constraint(ABC):
             values: The values of its parameters in one vector.
         """
         return ()
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        """Adds it to a plant that is not finalized, and returns Drake's id.
+
+        Raises:
+            ModelError: Drake has no such constraint.
+        """
+        raise ModelError(
+            f"'{self.name}': Drake has no constraint for a {type(self).__name__}; use a "
+            "WeldedFrames, a CoincidentPoints with three axes, or ideal constraints"
+        )
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         """The visible object in contact, or None.

@@ -6,6 +6,8 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_axes
@@ -13,6 +15,7 @@ from drake_dae.dae.system.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
 from drake_dae.robots.constraints.friction import Friction, friction_parameters
+from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
@@ -250,6 +253,16 @@ class CoincidentPoints(Constraint):
         point = kinematics.position(self.frame_b, self.point_b)
         axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
         return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        if len(self.axes) < 3:
+            return super().add_to(plant)
+        a, b = (frame_named(plant, name) for name in (self.frame_a, self.frame_b))
+        points = [
+            frame.GetFixedPoseInBodyFrame() @ np.array(point)
+            for frame, point in ((a, self.point_a), (b, self.point_b))
+        ]
+        return plant.AddBallConstraint(a.body(), points[0], b.body(), points[1])
 
     @property
     def _rows(self) -> list[int]:

@@ -4,11 +4,14 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
 from drake_dae.dae.system.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
@@ -73,3 +76,8 @@ class WeldedFrames(Constraint):
         point = kinematics.position(self.frame_b)
         axes = ca.horzcat(R_WA, none), ca.horzcat(none, R_WA)
         return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        a, b = (frame_named(plant, name) for name in (self.frame_a, self.frame_b))
+        pose = a.GetFixedPoseInBodyFrame() @ self.pose
+        return plant.AddWeldConstraint(a.body(), pose, b.body(), b.GetFixedPoseInBodyFrame())

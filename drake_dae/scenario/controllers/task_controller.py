@@ -8,8 +8,9 @@ from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.task.contacts.laws import laws_of_latches
+from drake_dae.systems.task.contacts.open_contact import open_contact
 from drake_dae.systems.task.controller import TaskController
-from drake_dae.systems.task.open_contact import open_contact
 from drake_dae.systems.task.phases import Insert
 
 
@@ -61,6 +62,8 @@ def task_controller(
             "give gains, and no observer"
         )
         raise ScenarioError(("observer", text))
+    if task.make().plan.latches:
+        return _latched(scenario, model, period)
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
@@ -74,9 +77,34 @@ def task_controller(
         )
 
 
+def _latched(scenario: Scenario, model: RobotModel, period: float) -> TaskController:
+    """The controller of a scenario whose task opens and closes latches."""
+    task = scenario.task
+    assert task is not None
+    assert scenario.gains is not None
+    if task.contact:
+        text = "its phases name the latches that they open and close; leave it out"
+        raise ScenarioError(("task.contact", text))
+    for key in ("observer", "integral"):
+        if getattr(scenario, key):
+            raise ScenarioError((key, "not for a task with latches; leave it out"))
+    if scenario.force_feedback.is_measured:
+        text = "a law of a task with latches takes no measured force; leave it out"
+        raise ScenarioError(("force_feedback", text))
+    with at("task"):
+        made = task.make()
+        free = None if task.gains is None else task.gains.design()
+        pairs = laws_of_latches(made.plan, model.dae, scenario.gains.design(), free)
+        return TaskController(
+            made, *pairs[0], further=pairs[1:], whole=model.dae, sample_period=period
+        )
+
+
 def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
-    """The constraint that opens and closes, or those of the points of a face."""
+    """The constraint that opens and closes, or those of the points of a face; none with latches."""
     assert scenario.task is not None
+    if scenario.task.make().plan.latches:
+        return ()
     fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
     given = scenario.task.contact
     names = [given] if isinstance(given, str) and given else list(given)

@@ -70,7 +70,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     completed, model = completed_model(scenario, scene_graph)
     scenario = completed.scenario
     try:
-        structure = scenario_structure(model)
+        structure = scenario_structure(model, scenario.task)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:

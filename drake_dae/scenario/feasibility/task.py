@@ -258,14 +258,15 @@ def _phases(
     controller: TaskController,
     model: RobotModel,
 ) -> tuple[PhaseNeeds, ...]:
-    limits, needs, forces = Limits.of(model), [], list(controller.contact.forces)
+    limits, needs = Limits.of(model), []
     ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
     for change, end in zip(changes, ends, strict=True):
         rows = phase_rows(record, change.time, end)
         if not rows.size or (change.place >= len(controller.task.plan.phases)):
             continue
-        law = controller.law if change.in_contact else controller.free_law
-        margin = _margin(law.structure, record["state"][rows])
+        pair = controller.pairs[change.law // 2]
+        forces = record["constraint_force"][rows][:, list(pair.contact.forces)]
+        margin = _margin(pair.laws[change.law % 2].structure, record["state"][rows])
         needs.append(
             PhaseNeeds(
                 change.phase,
@@ -273,7 +274,7 @@ def _phases(
                 end,
                 *_nearest_drive(record, rows, limits),
                 *_nearest_joint(record, rows, limits),
-                float(np.max(record["constraint_force"][rows][:, forces].sum(1), initial=0.0)),
+                float(np.max(pair.contact.total(forces), initial=0.0)),
                 margin.relative,
                 margin.is_singular,
             )
@@ -316,7 +317,7 @@ def _touches(
     """The touches, and the guards of the force that they may trip."""
     touches, problems, material = list[Touch](), list[str](), scenario.plant.material
     task, forces = controller.task, list(controller.contact.forces)
-    for before, after in pairwise(changes):
+    for before, after in () if task.plan.latches else pairwise(changes):  # Latches close at rest.
         if not after.in_contact > before.in_contact or before.place >= task.plan.last:
             continue
         phase = task.plan.phases[before.place]

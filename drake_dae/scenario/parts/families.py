@@ -132,7 +132,8 @@ Phase = Annotated[
     | phases.Search
     | phases.Insert
     | phases.Release
-    | phases.Retreat,
+    | phases.Retreat
+    | phases.Close,
     Choice(_PHASE_DATA),
 ]
 Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]

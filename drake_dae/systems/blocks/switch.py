@@ -1,4 +1,6 @@
-"""The switch between the controls of two laws."""
+"""The switch between the controls of several laws."""
+
+from collections.abc import Sequence
 
 import casadi as ca
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -8,38 +10,40 @@ from drake_dae.systems.blocks.traced import Block, Computation
 
 
 class LawSwitch(LeafSystem):
-    """Passes the control of one of two laws; the other one is not evaluated.
+    """Passes the control of one of several laws; the others are not evaluated.
 
     Input ports:
-        in_contact: 1 while the law in contact is active, otherwise 0, shape (1,).
-        free, contact: The controls of both laws, shape (p,).
+        law: The number of the active law, from 0, shape (1,).
+        <name>: The control of each law, shape (p,).
 
     Output port:
         control: The control of the active law, shape (p,).
 
     Args:
         size: p.
+        names: The names of the laws.
     """
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, names: Sequence[str]) -> None:
         super().__init__()
         self.set_name("law_switch")
-        self._size = size
-        self._chosen = self.DeclareVectorInputPort("in_contact", 1)
-        self._ports = [self.DeclareVectorInputPort(name, size) for name in ("free", "contact")]
+        self._size, self._names = size, tuple(names)
+        self._chosen = self.DeclareVectorInputPort("law", 1)
+        self._ports = [self.DeclareVectorInputPort(name, size) for name in names]
         self.DeclareVectorOutputPort("control", size, weakly(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        which = int(self._chosen.Eval(context)[0] > 0.5)
+        which = round(self._chosen.Eval(context)[0])
         output.SetFromVector(self._ports[which].Eval(context))
 
     def traced(self) -> Block:
-        chosen = ca.SX.sym("in_contact")
-        free, contact = (ca.SX.sym(name, self._size) for name in ("free", "contact"))
-        inputs = [chosen, free, contact]
-        function = ca.Function("switch", inputs, [ca.if_else(chosen > 0.5, contact, free)])
-        sources = ("in_contact", "free", "contact")
-        choice = ("in_contact", "contact", "free")
-        return Block(self, (Computation(function, sources, ("control",), choice=choice),))
+        chosen = ca.SX.sym("law")
+        controls = [ca.SX.sym(name, self._size) for name in self._names]
+        control = controls[0]
+        for i, other in enumerate(controls[1:], 1):
+            control = ca.if_else(chosen > i - 0.5, other, control)
+        function = ca.Function("switch", [chosen, *controls], [control])
+        sources = ("law", *self._names)
+        return Block(self, (Computation(function, sources, ("control",), choice=sources),))

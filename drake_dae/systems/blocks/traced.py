@@ -37,15 +37,15 @@ class Computation:
             computations of the block. Results named "" are not used.
         traced: The same function, whose last result is finite if its values are valid, and which
             has the reason if they are not; None if valid arguments always give valid values.
-        choice: (flag, first, second), three of the sources: if the flag is above 1 / 2, only the
-            first must be valid, otherwise only the second. None if all must be valid.
+        choice: A source that is a number from 0, and other sources, of which only the one with this
+            number must be valid. None if all must be valid.
     """
 
     function: ca.Function
     sources: tuple[str, ...]
     outputs: tuple[str, ...]
     traced: TracedFunction | None = None
-    choice: tuple[str, str, str] | None = None
+    choice: tuple[str, ...] | None = None
 
     @classmethod
     def of(
@@ -58,6 +58,11 @@ class Computation:
 def zero(name: str, size: int = 1) -> Computation:
     """Zeros for an input port without a wire, shape (size,)."""
     return Computation(ca.Function("zero", [], [ca.SX.zeros(size)]), (), (name,))
+
+
+def ones(name: str, size: int) -> Computation:
+    """Ones for an input port without a wire, shape (size,)."""
+    return Computation(ca.Function("ones", [], [ca.SX.ones(size)]), (), (name,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ class PhaseChange:
         chosen: The key word that led here from the phase before: the name of a phase, "next",
             "approach", "hold", "leave" or "stop"; empty at the start.
         failed: Whether the phase before failed.
+        law: The number of the law that is active from then on; see `TaskSupervisor`.
     """
 
     time: float
@@ -36,6 +37,7 @@ class PhaseChange:
     distance_rate: float
     chosen: str = ""
     failed: bool = False
+    law: int = 0
 
     def __str__(self) -> str:
         return (

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -12,25 +11,27 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.switch import LawSwitch
-from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
+from drake_dae.systems.control.contract import Compared, Controller, Derived
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.open_contact import opened_contact
-from drake_dae.systems.task.planner import CONTACT, FREE
+from drake_dae.systems.task.contacts.fit import check_plant_of_task
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, law_name, paired_laws
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task, check_sampled
-from drake_dae.trace.functions import TracedFunction
 
 _REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
+_LATCHED = {"observer": "it observes one contact, and this task has latches; leave it out"}
 
 
 @checked(ModelError)
@@ -54,6 +55,10 @@ class TaskController(Diagram, Controller):
     J^T = 0. At a release lambda is at most the task's `contact_force`, and the jump is J^T lambda.
     A slow touch, and small gains of the free law for the distance, keep the first jump small.
 
+    A task with latches has two laws for each latch with other latches closed: one leads its
+    distances while it is open, the other its forces while it is closed. The load of an object
+    passes from one hand to another by a Release of the first hand, whose forces go to zero.
+
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
     force and so holds for closed and open contacts. Drake's Simulator finds the guards as zeros of
@@ -75,7 +80,10 @@ class TaskController(Diagram, Controller):
         phase: The index of the phase in the task, shape (1,); after the last one their number.
         ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces.
+            of k points. In contact the distances are zero, otherwise the forces. Those of further
+            latches follow.
+        latch: 1 for each latch that is commanded to be closed, else 0, in the order of
+            `task.plan.latches`; only with latches.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
@@ -88,15 +96,21 @@ class TaskController(Diagram, Controller):
             contact may be a face of several points, whose force and moments are outputs; see
             `FaceForces`.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
+        further: With latches, law and free_law for each further entry of `task.plan.pairs`, by
+            `laws_of_latches`.
+        whole: The system with the constraints of all latches, if `law.system` has fewer.
         sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
-        supervisor, controller, free_controller: The blocks in it.
-        contact: The contact that opens and closes.
+        supervisor, controller: Blocks in it: the latter has the first law in contact.
+        contact: The contact that opens and closes, or the first latch.
+        pairs: The laws of each contact with other closed ones.
+        columns: The places of their outputs in a record.
+        whole: The system with all constraints.
         output_signals: Names and units of `desired_output`.
         outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
-            derivatives of the distances, shape (p + 2 k,).
+            derivatives of the distances, shape (p + 2 k,) for a contact of k points.
 
     Raises:
         ModelError: The laws do not belong together, or a phase has a reference that does not fit.
@@ -106,7 +120,14 @@ class TaskController(Diagram, Controller):
     takes_over, shown, refused = True, ("desired_output", "ending"), _REFUSED
 
     def __init__(
-        self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 0.0
+        self,
+        task: Task,
+        law: TrackingLaw,
+        free_law: TrackingLaw,
+        *,
+        further: Sequence[tuple[TrackingLaw, TrackingLaw]] = (),
+        whole: DaeSystem | None = None,
+        sample_period: float = 0.0,
     ) -> None:
         super().__init__()
         check_sampled(task, sample_period)
@@ -114,30 +135,31 @@ class TaskController(Diagram, Controller):
         self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
-        self.contact = contact = opened_contact(law, free_law)
+        self.whole = law.system if whole is None else whole
+        self.pairs = paired_laws(task.plan, self.whole, [(law, free_law), *further])
+        self.columns = TaskOutputs(self.pairs, self.whole)
+        self.contact = contact = self.pairs[0].contact
         if contact.size == 1 and task.watches("eccentricity"):
             raise ModelError("a guard of the eccentricity needs a contact of several points")
-        self.outputs = self._trace_outputs()
-        distances = [law.system.constraint_output_signals[i] for i in contact.forces]
-        self.output_signals = (*law.system.output_signals, *distances)
+        self.outputs, self.output_signals = self.columns.function, self.columns.signals
         builder = DiagramBuilder()
-        size = law.system.num_constraints
-        self.supervisor = builder.AddSystem(
-            TaskSupervisor(task, (free_law, law), contact, size, sample_period)
-        )
+        measured = self.whole.num_constraints
+        supervisor = TaskSupervisor(task, self.pairs, self.columns, measured, sample_period)
+        self.supervisor = builder.AddSystem(supervisor)
         for name in ("estimated_state", "measured_force", "hold"):
             builder.ExportInput(self.supervisor.GetInputPort(name), name)
         for port in self.supervisor.signal_ports.values():
             builder.ExportInput(port, port.get_name())
-        switch = builder.AddSystem(LawSwitch(law.system.num_controls))
-        in_contact = self.supervisor.GetOutputPort("in_contact")
-        builder.Connect(in_contact, switch.GetInputPort("in_contact"))
-        controllers = []
-        for which, name, its_law in ((FREE, "free", free_law), (CONTACT, "contact", law)):
+        laws = [each for pair in self.pairs for each in pair.laws]
+        names = [law_name(which, "law") for which in range(len(laws))]
+        switch = builder.AddSystem(LawSwitch(law.system.num_controls, names))
+        builder.Connect(self.supervisor.GetOutputPort("law"), switch.GetInputPort("law"))
+        self.controllers = []
+        for which, its_law in enumerate(laws):
             controller = builder.AddSystem(TrackingController(its_law, sample_period=sample_period))
-            controller.set_name(f"{name}_controller")
+            controller.set_name(law_name(which, "controller"))
             builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
-            reference = self.supervisor.GetOutputPort(f"{name}_reference")
+            reference = self.supervisor.GetOutputPort(law_name(which, "reference"))
             builder.Connect(reference, controller.GetInputPort("reference"))
             if its_law.measured_force:
                 measured = controller.GetInputPort("measured_force")
@@ -155,34 +177,28 @@ class TaskController(Diagram, Controller):
                     builder.ConnectInput("exogenous", port)
             if count := len(its_law.integral.outputs):
                 hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-                hold.set_name(f"{name}_hold")
+                hold.set_name(law_name(which, "hold"))
                 builder.Connect(
-                    self.supervisor.GetOutputPort(f"{name}_hold"), hold.get_input_port()
+                    self.supervisor.GetOutputPort(law_name(which, "hold")), hold.get_input_port()
                 )
                 builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
                 shown = "integral" if which == CONTACT else "free_integral"
                 builder.ExportOutput(controller.GetOutputPort("integral"), shown)
-            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(name))
-            controllers.append(controller)
-        self.free_controller, self.controller = controllers
+            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(names[which]))
+            self.controllers.append(controller)
+        self.controller = self.controllers[CONTACT]
         self.exogenous_layout = self.controller.exogenous_layout
         self.exogenous_places = self.controller.exogenous_places
         control = switch.GetOutputPort("control")
         builder.ExportOutput(control, "control")
         if task.watches("control"):
             builder.Connect(control, self.supervisor.GetInputPort("control"))
-        names = ["phase", "ending", "desired_output", "contact_reference"]
+        names = ["phase", "ending", "desired_output"]
+        names += ["latch"] if task.plan.latches else ["contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
         self.set_name("task_controller")
-
-    def _trace_outputs(self) -> TracedFunction:
-        system, chains = self.law.system, self.free_law.structure.output_chains
-        force = ca.SX.sym("force", system.num_constraints)
-        distances = [chains[place][order] for order in (0, 1) for place in self.contact.places]
-        outputs = ca.vertcat(system.outputs(force), *distances)
-        return system.trace("task outputs", {"value": ca.densify(outputs)}, {"force": force})
 
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -234,7 +250,7 @@ class TaskController(Diagram, Controller):
             raise ModelError(f"{self.get_name()}: the task has not begun in this context")
         return np.array(
             [
-                segments[i].desired(self.contact, time)
+                segments[i].desired(self.columns, time)
                 for i, time in zip(places_at(segments, moments), moments, strict=True)
             ]
         ).reshape(moments.size, -1)
@@ -255,32 +271,14 @@ class TaskController(Diagram, Controller):
 
     @property
     def start_structure(self) -> ConstraintStructure:
-        law = self.law if self.task.contacts[0] else self.free_law
-        return law.structure
+        first = self.task.plan.law_of(0)
+        return self.pairs[first // 2].laws[first % 2].structure
 
     def all_parameters(self, context: Context) -> FloatArray:
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        system = self.law.system
-        check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
-        if plant.time_step and not self.sample_period:
-            raise WiringError(
-                f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
-                f"controller with sample_period={plant.time_step:g} or a multiple of it"
-            )
-        if not (plant.time_step or plant.is_ideal or self.sample_period):
-            raise WiringError(
-                "a compliant contact may be lost and regained at any time, and a task that reacts "
-                "at once may switch without end: make the controller with a sample_period (in a "
-                "scenario: sampling)"
-            )
-        for name in (system.force_signals[i].name for i in self.contact.forces):
-            if plant.contacts and name.split(".")[0] not in plant.contacts:
-                raise WiringError(
-                    f"the contact with the force '{name}' does not open in this plant; contacts "
-                    f"that open: {', '.join(plant.contacts)}"
-                )
+        check_plant_of_task(self.task.plan, self.whole, self.contact, self.sample_period, plant)
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
@@ -292,25 +290,27 @@ class TaskController(Diagram, Controller):
         their derivatives, "phase" is 1 for the current phase and 0 for all others,
         "predicted_error" is that of `predicted_errors`.
         """
-        signals = self.output_signals
-        values_with_distance = function_along(
-            self.outputs, {**values, "force": values["constraint_force"]}
-        )
-        size = self.contact.size
-        outputs, distances = values_with_distance[:, :-size], values_with_distance[:, -2 * size :]
-        rates = (signal.derivative(1) for signal in signals[-size:])
+        signals, columns = self.output_signals, self.columns
+        every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
+        outputs, rates = every[:, : columns.size], every[:, columns.size :]
+        own = [signals[column] for column in columns.of_distances]
         desired = np.zeros_like(outputs)
         segments = () if context is None else self.segments(context)
         if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
+            laws = np.array([segments[i].law for i in places_at(segments, times)])
+            desired = columns.led(desired, outputs, laws)
         places = values["phase"].astype(int)
         predicted = predicted_errors(
-            (self.free_law, self.law), self.contact, segments, times, {**values, "outputs": outputs}
+            self.pairs, columns, segments, times, {**values, "outputs": outputs}
         )
         names = self.phase_signals
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
-            "distance": (distances, (*signals[-size:], *rates)),
+            "distance": (
+                np.hstack([outputs[:, columns.of_distances], rates]),
+                (*own, *(signal.derivative(1) for signal in own)),
+            ),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
@@ -323,7 +323,7 @@ class TaskController(Diagram, Controller):
         )
         (outputs,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
         desired = self.GetOutputPort("desired_output").Eval(context)
-        return outputs[: -self.contact.size], desired, self.output_signals
+        return outputs[: self.columns.size], desired, self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -341,7 +341,7 @@ class TaskController(Diagram, Controller):
         Raises:
             ModelError: No parameter has that name, or the value does not fit.
         """
-        for controller in (self.controller, self.free_controller):
+        for controller in self.controllers:
             controller.set_parameter(
                 self.GetMutableSubsystemContext(controller, context), name, value
             )

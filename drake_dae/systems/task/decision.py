@@ -1,5 +1,6 @@
 """The decision whether a phase goes on, and how it has ended."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -7,8 +8,10 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.errors import SimulationError
+from drake_dae.systems.task.contacts.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment, Outcome, Phase
-from drake_dae.systems.task.progress import TaskProgress
+from drake_dae.systems.task.phases.guards import eccentricity
+from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.traced import EARLY, TracedTask
 
 
@@ -58,6 +61,8 @@ class PhaseDecision:
         if holds and change.in_contact and not progress.is_felt:
             lost = task.patience - (time - progress.felt)
         felt = excess if progress.is_felt else -excess
+        if task.plan.latches:  # A latch without force is not lost.
+            lost = felt = np.inf
         nearest = np.min(guards, initial=np.inf)
         return cls(moment, guards, np.array([nearest, end, lost, late, felt]))
 
@@ -108,3 +113,43 @@ class PhaseDecision:
             time,
             state.copy(),
         )
+
+
+def moment_of(
+    segment: ReferenceSegment,
+    contact: OpeningContact,
+    time: float,
+    motion: tuple[float, float, FloatArray, FloatArray],
+    forces: Sequence[float],
+    contact_force: float,
+    work: float,
+    control: float,
+    signal: float,
+) -> Moment:
+    """The measurements that decide when the phase of a segment ends.
+
+    Args:
+        segment: The current references.
+        contact: The contact that they lead.
+        time: The time, in s.
+        motion: As of `TaskPlanner.motion`.
+        forces: The measured forces of the contact.
+        contact_force: Forces below this, in N, count as zero.
+        work, control, signal: As of `Moment`.
+    """
+    (distance, rate, moved, rates), change = motion, segment.change
+    wanted = [contact.main] if change.in_contact else list(contact.places)
+    return Moment(
+        time=time - change.time,
+        force=float(contact.total(np.array(forces))),
+        distance=distance,
+        rate=rate,
+        wanted=float(np.mean(segment.reference(time)[segment.layout.lowest[wanted]])),
+        away=distance - change.distance,
+        speed=float(np.linalg.norm(rates)),
+        travel=float(np.linalg.norm(moved - segment.origin)),
+        work=work,
+        control=control,
+        eccentricity=float(eccentricity(forces, contact_force)),
+        signal=signal,
+    )

@@ -1,6 +1,6 @@
 """The references of each phase, which continue those of the phase before."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -12,13 +12,11 @@ from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.phase_change import PhaseChange
-from drake_dae.systems.task.open_contact import OpeningContact
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws
+from drake_dae.systems.task.contacts.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task
-
-FREE, CONTACT = 0, 1
-"""The indices of the two laws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,58 +74,73 @@ class TaskPlanner:
 
     Args:
         task: The phases.
-        laws: The law of the free robot and the law in contact.
-        contact: The contact that opens and closes.
+        pairs: The laws of each contact with other closed ones; see `PhasePlan.pairs`.
 
     Attributes:
         goals: The references of each phase.
         rates: The final rates of all outputs in each phase, shape (p,).
-        motion_function: (x, parameters) -> the distance and its derivative by the model, then all
-            outputs in m including the distance, then their derivatives. Of several distances it has
-            the mean.
+        motion_functions: For each pair: (x, parameters) -> the distance and its derivative by the
+            model, then all outputs in m including the distance, then their derivatives. Of several
+            distances it has the mean, and of a latch the largest one.
         moved: The number of these outputs.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
     """
 
-    def __init__(
-        self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], contact: OpeningContact
-    ) -> None:
-        self._task, self._laws, self._contact = task, laws, contact
+    def __init__(self, task: Task, pairs: Sequence[ContactLaws]) -> None:
+        self._task, self._pairs = task, pairs
+        self._laws = [law for pair in pairs for law in pair.laws]
         self._phases = task.plan.phases
-        pairs = list(enumerate(task.contacts[:-1]))
-        self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
-        self.rates = [_rates(task, index, laws[closed], contact, closed) for index, closed in pairs]
-        self._nothing = [_no_goals(law) for law in laws]
-        free = laws[FREE]
-        chains = free.structure.output_chains
-        distance = [
-            ca.sum1(ca.vertcat(*(chains[place][order] for place in contact.places))) / contact.size
-            for order in (0, 1)
-        ]
-        moved = [
-            distance if place == contact.main else chains[place]
-            for place, signal in enumerate(free.system.output_signals)
-            if signal.unit == "m" and place not in contact.others
-        ]
-        rows = [*distance, *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
-        self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
-        self.moved = len(moved)
+        self.goals, self.rates = [], []
+        for index in range(len(self._phases)):
+            number = task.plan.law_of(index)
+            contact, closed = pairs[number // 2].contact, number % 2 == CONTACT
+            self.goals.append(_goals(task, index, self._laws[number], contact, closed))
+            self.rates.append(_rates(task, index, self._laws[number], contact, closed))
+        self._nothing = [_no_goals(law) for law in self._laws]
+        self.motion_functions, self.moved = [], 0
+        for pair in pairs:
+            free, contact = pair.laws[FREE], pair.contact
+            chains = free.structure.output_chains
+            own = [
+                ca.vertcat(*(chains[place][order] for place in contact.places)) for order in (0, 1)
+            ]
+            distance = [
+                ca.norm_inf(part) if contact.is_latch else ca.sum1(part) / contact.size
+                for part in own
+            ]
+            moved = [
+                distance if place == contact.main else chains[place]
+                for place, signal in enumerate(free.system.output_signals)
+                if place == contact.main or (signal.unit == "m" and place not in contact.places)
+            ]
+            rows = [*distance, *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
+            function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
+            self.motion_functions.append(function)
+            self.moved = len(moved)
 
-    def motion(self, now: ModelMoment) -> tuple[float, float, FloatArray, FloatArray]:
-        """The distance and its derivative, then all outputs in m and their derivatives."""
-        values = self.motion_function.evaluate(now.state, now.parameters)[0].copy()
+    def motion(self, now: ModelMoment, law: int) -> tuple[float, float, FloatArray, FloatArray]:
+        """The distance and its derivative, then all outputs in m and their derivatives.
+
+        Args:
+            now: The moment.
+            law: The number of the law that acts.
+        """
+        function = self.motion_functions[law // 2]
+        values = function.evaluate(now.state, now.parameters)[0].copy()
         first, rates = values[2 : 2 + self.moved], values[2 + self.moved :]
         return float(values[0]), float(values[1]), first, rates
 
     def first(self, now: ModelMoment) -> ReferenceSegment:
         """The references of the first phase, which start at the current outputs."""
-        contact = self._task.contacts[0]
-        force = self._task.contact_force if contact else 0.0
-        moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
-        present = self._met(now, contact, moment)
-        return self._started(now, 0, self._name(0), contact, BEGIN, moment, present)
+        law, force = self._task.plan.law_of(0), 0.0
+        contact = self._pairs[law // 2].contact
+        if law % 2 == CONTACT and not contact.is_latch:
+            force = self._task.contact_force
+        moment = Moment(0.0, force, *self.motion(now, law)[:2], 0.0)
+        present = self._met(now, law, moment, [0.0] * contact.size)
+        return self._started(now, 0, self._name(0), law, BEGIN, moment, present)
 
     def following(
         self,
@@ -136,6 +149,7 @@ class TaskPlanner:
         moment: Moment,
         place: int | None,
         cause: PhaseCause,
+        forces: Callable[[int], Sequence[float]],
     ) -> ReferenceSegment:
         """The references of the next phase, which continue those before.
 
@@ -146,66 +160,78 @@ class TaskPlanner:
             place: The index of the next phase, the number of phases when the task is done; None if
                 the robot rests for another reason.
             cause: The reason.
+            forces: The number of a law -> the measured forces of its contact.
         """
-        was, present = before.change.in_contact, before.reference(now.time)
+        was, present = before.law, before.reference(now.time)
         end = len(self._phases)
         name = HELD if place is None else self._name(place)
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
-            contact = was if cause.ends_in_contact is None else cause.ends_in_contact
-            contact, place = contact and moment.force >= self._task.contact_force, end
+            ends = cause.ends_in_contact
+            is_closed = before.change.in_contact if ends is None else ends
+            if not self._pairs[was // 2].contact.is_latch:
+                is_closed = is_closed and moment.force >= self._task.contact_force
+            law, place = was - was % 2 + int(is_closed), end
         else:
-            contact = self._task.contacts[place]
-        if contact != was:
-            old, present = present, self._met(now, contact, moment)
-            for i, first in enumerate(self._laws[contact].layout.lowest):
-                if i not in self._contact.places:
-                    size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
+            law = self._task.plan.law_of(place)
+        if law != was:
+            old, present = present, self._met(now, law, moment, forces(law))
+            places = {*self._pairs[law // 2].contact.places, *self._pairs[was // 2].contact.places}
+            for i, first in enumerate(self._laws[law].layout.lowest):
+                if i not in places:
+                    size, start = self._laws[law].degrees[i] + 1, before.layout.lowest[i]
                     present[first : first + size] = old[start : start + size]
-        return self._started(now, place, name, contact, cause, moment, present)
+        return self._started(now, place, name, law, cause, moment, present)
 
     def _started(
         self,
         now: ModelMoment,
         place: int,
         name: str,
-        contact: bool,
+        number: int,
         cause: PhaseCause,
         moment: Moment,
         present: FloatArray,
     ) -> ReferenceSegment:
-        law, phases = self._laws[contact], self._phases
-        rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
+        law, phases = self._laws[number], self._phases
+        rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[number]
         if place < len(phases):
             over, goals, rate = phases[place].over, self.goals[place], self.rates[place]
         change = PhaseChange(
             time=float(now.time),
             phase=name,
             place=place,
-            in_contact=bool(contact),
+            in_contact=number % 2 == CONTACT,
             reason=cause.reason,
             force=float(moment.force),
             distance=float(moment.distance),
             distance_rate=float(moment.rate),
             chosen=cause.chosen,
             failed=cause.failed,
+            law=number,
         )
-        origin = self.motion(now)[2]
+        origin = self.motion(now, number)[2]
         return ReferenceSegment.begin(
             change, law.layout, goals.function, goals.named, rate, present, over, origin
         )
 
-    def _met(self, now: ModelMoment, contact: bool, moment: Moment) -> FloatArray:
+    def _met(
+        self, now: ModelMoment, number: int, moment: Moment, forces: Sequence[float]
+    ) -> FloatArray:
         """R of a law from the current outputs, z_i, z_i', ...; zero for the highest derivatives.
 
         A force of degree 0 is the measured one, and moments of degree 0 are zero: from an even
-        pressure on, all points of a face are pressed to the surface.
+        pressure on, all points of a face are pressed to the surface. All forces and moments of a
+        latch are the measured ones.
         """
-        law = self._laws[contact]
+        law, contact = self._laws[number], self._pairs[number // 2].contact
         reference = np.zeros(law.layout.reference_size)
         coordinates = law.error_coordinates(now.state, reference, now.parameters)
         reference[law.layout.chained] = np.delete(coordinates, _integral_places(law))
-        if contact and law.degrees[self._contact.main] == 0:
-            reference[law.layout.lowest[self._contact.main]] = moment.force
+        if number % 2 == CONTACT and law.degrees[contact.main] == 0:
+            if contact.is_latch:
+                reference[law.layout.lowest[list(contact.places)]] = forces
+            else:
+                reference[law.layout.lowest[contact.main]] = moment.force
         return reference
 
     def _name(self, place: int) -> str:
@@ -229,7 +255,8 @@ def _goals(
     """The references of a phase.
 
     With a goal for the force of a face, its moments without goals go to zero; with one for the
-    first of its distances, the others go to the same.
+    first of its distances, the others go to the same. So it is for a latch in phases that open or
+    close it.
     """
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
@@ -240,7 +267,8 @@ def _goals(
         except ReferenceSignalError as error:
             raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
     named = tuple(i for assignment in assignments for i in assignment.places)
-    for assignment in [a for a in assignments if list(a.places) == [contact.main]]:
+    leads_all = not contact.is_latch or phase.ends_in_contact is not None
+    for assignment in [a for a in assignments if leads_all and list(a.places) == [contact.main]]:
         for place in contact.others:
             if place not in named:
                 reference = ConstantReference(0.0) if closed else assignment.reference

@@ -1,24 +1,23 @@
 """The error that theory predicts for a task, phase by phase."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.systems.task.open_contact import OpeningContact
-from drake_dae.systems.task.planner import CONTACT, FREE
+from drake_dae.systems.task.contacts.laws import CONTACT, ContactLaws
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 
 
 def predicted_errors(
-    laws: tuple[TrackingLaw, TrackingLaw],
-    contact: OpeningContact,
+    pairs: Sequence[ContactLaws],
+    columns: TaskOutputs,
     segments: tuple[ReferenceSegment, ...],
     times: FloatArray,
     values: Mapping[str, FloatArray],
 ) -> FloatArray:
-    """The error that theory predicts for a run, shape (k, p + c) with a contact of c points.
+    """The error that theory predicts for a run, shape (k, columns.size).
 
     After each change of phases the error decays from its current value by the gains of the active
     law (30). An impact causes a new error; the change that follows a touch is after the impact.
@@ -26,33 +25,35 @@ def predicted_errors(
     forces themselves. There is no prediction for a contact that is open although it should hold.
 
     Args:
-        laws: The law of the free robot and the law in contact.
-        contact: The contact that opens and closes.
+        pairs: The laws of the task.
+        columns: The places of their outputs.
         segments: The references of the run.
         times: The times of the run, in s, shape (k,).
-        values: "state", "outputs", those of the law in contact, "parameters" of the laws' system,
+        values: "state", "outputs", in the order of the columns, "parameters" of the laws' system,
             and "integral" and "free_integral" if the laws have any, one row for each time.
     """
-    places, own = places_at(segments, times), np.array(contact.places)
-    predicted = np.zeros((times.size, len(laws[CONTACT].degrees) + contact.size))
+    places, outputs = places_at(segments, times), values["outputs"]
+    predicted = np.zeros((times.size, columns.size))
     for which, segment in enumerate(segments):
         rows = np.flatnonzero(places == which)
         if not rows.size:
             continue
-        start = max(rows[0] - 1, 0)  # The record has the state at the change in the row before.
-        is_free = not segment.change.in_contact
-        law = laws[FREE if is_free else CONTACT]
-        name = "free_integral" if is_free else "integral"
+        # The record of a simulation has the state at the change in the row before; a rollout not.
+        start = max(rows[0] - 1, 0)
+        if times[start] < segment.change.time:
+            start = rows[0]
+        is_closed, pair = segment.law % 2 == CONTACT, segment.law // 2
+        law = pairs[pair].laws[segment.law % 2]
+        name = "integral" if is_closed else "free_integral"
         errors = law.predicted_error(
             times[rows] - times[start],
             values["state"][start],
-            segment.reference(max(segment.change.time, times[start])),
+            segment.reference(times[start]),
             values["parameters"][start] if "parameters" in values else None,
             integral=values[name][start] if law.integral.outputs else None,
         )
-        columns = np.arange(errors.shape[1])
-        if is_free:
-            columns[own] = np.arange(errors.shape[1], predicted.shape[1])
-            predicted[np.ix_(rows, own)] = values["outputs"][np.ix_(rows, own)]
-        predicted[rows[:, None], columns] = errors
+        if not is_closed:
+            forces = rows[:, None], columns.forces[pair]
+            predicted[forces] = outputs[forces]
+        predicted[rows[:, None], columns.of_law(segment.law)] = errors
     return predicted

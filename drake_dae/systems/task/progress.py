@@ -10,8 +10,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.fade import fade
-from drake_dae.systems.task.open_contact import OpeningContact
 
 DONE, HELD = "done", "held"
 """Names in a record for the time after the last phase, and after a task that ended otherwise."""
@@ -70,9 +70,15 @@ class ReferenceSegment:
         base[list(named)] = 0.0
         rate = rate.copy()
         rate[list(named)] = 0.0
-        segment = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over, origin)
+        none = np.zeros((present.size, 1))
+        segment = cls(change, layout, goal, base, rate, none, over, origin)
         offset = present - segment._goal(0.0)
         return replace(segment, faded=np.array(fade(offset, layout.degrees, over)))
+
+    @property
+    def law(self) -> int:
+        """The number of the active law."""
+        return self.change.law
 
     def reference(self, time: float) -> FloatArray:
         """R at a time in s, shape (sum (mu_i + 1),)."""
@@ -82,18 +88,16 @@ class ReferenceSegment:
             reference += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
         return reference
 
-    def desired(self, contact: OpeningContact, time: float) -> FloatArray:
-        """The desired positions, forces and distances at a time in s, shape (p + k,).
+    def desired(self, columns: TaskOutputs, time: float) -> FloatArray:
+        """The desired positions, forces and distances at a time in s, shape (columns.size,).
 
         Args:
-            contact: The contact, of k points.
+            columns: The places of the outputs of each law among them.
             time: The time, in s.
         """
-        outputs, places = self.reference(time)[self.layout.lowest], list(contact.places)
-        distances = np.zeros(contact.size)
-        if not self.change.in_contact:
-            distances, outputs[places] = outputs[places], 0.0
-        return np.append(outputs, distances)
+        desired = np.zeros(columns.size)
+        desired[columns.of_law(self.law)] = self.reference(time)[self.layout.lowest]
+        return desired
 
     def _goal(self, passed: float) -> FloatArray:
         reference = self.goal(passed).copy()

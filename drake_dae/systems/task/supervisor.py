@@ -1,5 +1,6 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -18,17 +19,16 @@ from pydrake.systems.framework import (
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, Update, zero
 from drake_dae.systems.control.contract import SIGNAL
-from drake_dae.systems.task.decision import PhaseDecision
-from drake_dae.systems.task.open_contact import OpeningContact
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
+from drake_dae.systems.task.decision import PhaseDecision, moment_of
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
-from drake_dae.systems.task.planner import CONTACT, FREE, ModelMoment, PhaseCause, TaskPlanner
+from drake_dae.systems.task.planner import ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.systems.task.traced import EARLY, NAMES
@@ -46,8 +46,11 @@ class TaskSupervisor(LeafSystem):
 
     Output ports:
         phase, desired_output, tared_force: As of `TaskController`.
-        contact_reference, free_reference: R of the active law; zero for the other one.
-        in_contact: 1 while the law in contact is active, shape (1,).
+        contact_reference, free_reference, contact_reference_2, ...: R of the active law; zero for
+            the others.
+        law: The number of the active law, shape (1,): 0 without contact, 1 in contact; 2 and 3 for
+            the next contact, and so on.
+        latch: As of `TaskController`.
         ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
             rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
@@ -56,8 +59,8 @@ class TaskSupervisor(LeafSystem):
 
     Args:
         task: The phases.
-        laws: The law of the free robot and the law in contact.
-        contact: The contact that opens and closes.
+        pairs: The laws of each contact with other closed ones; see `PhasePlan.pairs`.
+        columns: The places of their outputs in a record.
         num_forces: The number of all measured forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
 
@@ -70,17 +73,19 @@ class TaskSupervisor(LeafSystem):
     def __init__(
         self,
         task: Task,
-        laws: tuple[TrackingLaw, TrackingLaw],
-        contact: OpeningContact,
+        pairs: Sequence[ContactLaws],
+        columns: TaskOutputs,
         num_forces: int,
         sample_period: float,
     ) -> None:
         super().__init__()
         self.set_name("task")
         self._sample_period = sample_period
-        self.task, self._laws, self._contact = task, laws, contact
-        self._phases, self._plan = task.plan.phases, TaskPlanner(task, laws, contact)
-        self._traced = SampledTask(task, laws, contact, self._plan, num_forces, sample_period)
+        self.task, self._pairs, self._columns = task, pairs, columns
+        self._laws = laws = [law for pair in pairs for law in pair.laws]
+        self._contact = pairs[0].contact
+        self._phases, self._plan = task.plan.phases, TaskPlanner(task, pairs)
+        self._traced = SampledTask(task, pairs, columns, self._plan, num_forces, sample_period)
         system = laws[FREE].system
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
@@ -127,14 +132,16 @@ class TaskSupervisor(LeafSystem):
             self.input_port_ticket(self._force_port.get_index()),
             self.discrete_state_ticket(self._held),
         }
-        for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
-            size = self._laws[which].layout.reference_size
+        for which, law in enumerate(self._laws):
+            size, name = law.layout.reference_size, law_name(which, "reference")
             self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
-        size = self._laws[FREE].system.num_outputs + self._contact.size
+        size = self._columns.size
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
         progress = {self.abstract_state_ticket(self._index), self.discrete_state_ticket(self._held)}
-        for name, number in (("phase", "place"), ("in_contact", "contact"), ("ending", "ending")):
+        for name, number in (("phase", "place"), ("law", "law"), ("ending", "ending")):
             self.DeclareVectorOutputPort(name, 1, weakly(self._calc_number, number), progress)
+        if count := len(self.task.plan.latches):
+            self.DeclareVectorOutputPort("latch", count, weakly(self._calc_latch), progress)
         hold = self.input_port_ticket(self._hold_port.get_index())
         for name, calc, tickets in (
             ("free_hold", weakly(self._calc_free_hold), by_state),
@@ -167,37 +174,23 @@ class TaskSupervisor(LeafSystem):
     # The end of a phase.
 
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
-        time, change = context.get_time(), segment.change
-        distance, rate, moved, rates = self._plan.motion(self._now(context))
-        contact, forces = self._contact, self._traced.forces(self._filtered(context))
-        wanted = [contact.main] if change.in_contact else list(contact.places)
-        desired = np.mean(segment.reference(time)[segment.layout.lowest[wanted]])
-        port, signal = self._control_port, 0.0
-        control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
+        port, control, signal = self._control_port, 0.0, 0.0
+        if port is not None:
+            control = float(np.abs(port.Eval(context)).max())
         if not self._is_over(segment):
-            name = self._phases[change.place].signal
+            name = self._phases[segment.change.place].signal
             if name and self.signal_ports[name].HasValue(context):
                 signal = float(self.signal_ports[name].Eval(context)[0])
-        return Moment(
-            time=time - change.time,
-            force=sum(forces),
-            distance=distance,
-            rate=rate,
-            wanted=float(desired),
-            away=distance - change.distance,
-            speed=float(np.linalg.norm(rates)),
-            travel=float(np.linalg.norm(moved - segment.origin)),
-            work=self._traced.work_of(context.get_discrete_state(self._held).value()),
-            control=control,
-            eccentricity=float(eccentricity(forces, self.task.contact_force)),
-            signal=signal,
-        )
+        work = self._traced.work_of(context.get_discrete_state(self._held).value())
+        forces = self._traced.filter.forces(self._filtered(context), segment.law)
+        contact, least = self._pairs[segment.law // 2].contact, self.task.contact_force
+        motion, time = self._plan.motion(self._now(context), segment.law), context.get_time()
+        return moment_of(segment, contact, time, motion, forces, least, work, control, signal)
 
     def _filtered(self, context: Context) -> FloatArray:
         """The state of the force filter after the present sample; see `TracedTask`."""
         held = context.get_discrete_state(self._held).value()
-        measured = self._force_port.Eval(context)[list(self._contact.forces)]
-        return self._traced.filtered(held, measured)
+        return self._traced.filtered(held, self._force_port.Eval(context))
 
     def _decision(self, context: Context, progress: TaskProgress) -> PhaseDecision:
         moment = self._moment(context, progress.segments[-1])
@@ -231,7 +224,7 @@ class TaskSupervisor(LeafSystem):
                 self._state_port.Eval(context).copy(),
             )
         progress = TaskProgress((self._segment(context),), time - self._sample_period, time)
-        zeros = np.zeros(self._traced.filter_size), np.zeros(self._traced.tally.size)
+        zeros = np.zeros(self._traced.filter.size), np.zeros(self._traced.tally.size)
         self._put(state, progress, *zeros)
         return EventStatus.Succeeded()
 
@@ -270,9 +263,10 @@ class TaskSupervisor(LeafSystem):
     ) -> tuple[ReferenceSegment, EventStatus]:
         """The references after a phase, and the status of the event."""
         segment, now, moment = progress.segments[-1], self._now(context), decision.moment
+        forces = partial(self._traced.filter.forces, self._filtered(context))
         if self._is_over(segment):
             cause = PhaseCause("the contact is lost at rest", segment.change.chosen, True)
-            following = self._plan.following(now, segment, moment, None, cause)
+            following = self._plan.following(now, segment, moment, None, cause, forces)
             return following, EventStatus.Succeeded()
         place = segment.change.place
         outcome, reason = decision.outcome(self._phases[place], self.task.contact_force)
@@ -289,30 +283,34 @@ class TaskSupervisor(LeafSystem):
         has_failed = outcome != "success" or (leaves and segment.change.failed)
         ends = self.task.plan.ends_in_contact(place) if outcome == "success" else None
         cause = PhaseCause(reason, after.chosen, has_failed, ends)
-        return self._plan.following(now, segment, moment, after.place, cause), status
+        return self._plan.following(now, segment, moment, after.place, cause, forces), status
 
     # The output ports.
 
     def _calc_reference(self, which: int, context: Context, output: BasicVector) -> None:
         segment = self._segment(context)
-        if segment.change.in_contact == bool(which):
+        if segment.law == which:
             output.SetFromVector(segment.reference(context.get_time()))
         else:
             output.SetFromVector(np.zeros(output.size()))
 
     def _calc_desired(self, context: Context, output: BasicVector) -> None:
         segment = self._segment(context)
-        output.SetFromVector(segment.desired(self._contact, context.get_time()))
+        output.SetFromVector(segment.desired(self._columns, context.get_time()))
 
     def _calc_number(self, name: str, context: Context, output: BasicVector) -> None:
         value = context.get_discrete_state(self._held).value()[NAMES.index(name)]
         if not self.progress(context).segments:
-            value = float(name == "contact" and self.task.contacts[0])
+            value = float(self.task.plan.law_of(0)) if name == "law" else 0.0
         output.SetFromVector([value])
+
+    def _calc_latch(self, context: Context, output: BasicVector) -> None:
+        closed = self.task.plan.closed_by(self._segment(context).law)
+        output.SetFromVector([float(name in closed) for name in self.task.plan.latches])
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
-        force[list(self._contact.forces)] -= self._traced.bias(self._filtered(context))
+        force[list(self._contact.forces)] -= self._traced.filter.bias(self._filtered(context))
         output.SetFromVector(force)
 
     def _holds(self, context: Context) -> bool:
@@ -327,7 +325,9 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        least = self._contact.size * min(self._traced.forces(self._filtered(context)))
+        least = self._contact.size * min(
+            self._traced.filter.forces(self._filtered(context), CONTACT)
+        )
         is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         end = begin.time + segments[-1].over

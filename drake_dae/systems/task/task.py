@@ -76,6 +76,8 @@ class Task:
         if self.tare_time and self.phases[0].begins_in_contact:
             raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
         phases = named(self.phases)
+        if self.tare_time and any(phase.contact for phase in phases):
+            raise ModelError("tare_time: a task with latches finds no bias; leave it out")
         check_guards(phases, self.contact_force)
         plan = PhasePlan(phases, self.retries)
         object.__setattr__(self, "phases", phases)

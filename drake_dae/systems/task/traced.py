@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     GAPS,
@@ -21,19 +20,21 @@ from drake_dae.systems.blocks.traced import (
 )
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
-from drake_dae.systems.task.open_contact import OpeningContact
+from drake_dae.systems.task.contacts.force_filter import ForceFilter
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.phases import Moment, Phase
 from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import APPROACH, DONE, FAIL, HOLD, LEAVE, NEXT, STOP
 from drake_dae.systems.task.phases.tally import GuardMemory
-from drake_dae.systems.task.planner import CONTACT, FREE, TaskPlanner
+from drake_dae.systems.task.planner import TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
 NAMES = (
     "place",
-    "contact",
+    "law",
     "start",
     "over",
     "touched",
@@ -58,7 +59,7 @@ class TracedTask:
     """The functions of a `TaskSupervisor` of the numbers of its current segment.
 
     Args:
-        task, laws, contact: Those of the supervisor.
+        task, pairs, columns: Those of the supervisor.
         plan: The planner of its references.
         num_forces: The number of measured constraint forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
@@ -66,29 +67,29 @@ class TracedTask:
     Attributes:
         task: The argument.
         size: The number of these numbers.
-        filter_size: The number of those of the force filter: for each point of the contact the
-            force after the low-pass, then the mean of the samples before the first touch; then the
-            number of these samples.
+        filter: The filter of the measured forces.
         tally: The counts for the guards.
     """
 
     def __init__(
         self,
         task: Task,
-        laws: tuple[TrackingLaw, TrackingLaw],
-        contact: OpeningContact,
+        pairs: Sequence[ContactLaws],
+        columns: TaskOutputs,
         plan: TaskPlanner,
         num_forces: int,
         sample_period: float,
     ) -> None:
-        self.task, self._laws, self._contact, self._plan = task, laws, contact, plan
-        self._phases, self._tares = task.plan.phases, task.tare_samples(sample_period)
+        self.task, self._pairs, self._columns, self._plan = task, pairs, columns, plan
+        self._laws = laws = [law for pair in pairs for law in pair.laws]
+        tares = task.tare_samples(sample_period)
+        self.filter = ForceFilter([pair.contact for pair in pairs], task.force_gain, tares)
+        self._phases = task.plan.phases
         self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
-        self.filter_size = 2 * contact.size + 1
-        sizes = [len(NAMES), self.filter_size, count, count, rows * self._shape[1], plan.moved]
+        sizes = [len(NAMES), self.filter.size, count, count, rows * self._shape[1], plan.moved]
         sizes += [len(self._phases), self.tally.size]
         ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
@@ -102,46 +103,34 @@ class TracedTask:
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
         self._filter_places = slice(ends[0], ends[1])
-        measured = self._forces[list(contact.forces)]
-        self._filtered = self._filter(before, measured)
-        self._each = self._filtered[: contact.size]
-        self._force, self._count = ca.sum1(self._each), before[-1]
-        self._filter_function = ca.Function("filter", [before, measured], [self._filtered])
+        self._filtered = self.filter.after(before, self._forces)
+        self._filter_function = ca.Function("filter", [before, self._forces], [self._filtered])
+        self._is_latched = bool(task.plan.latches)
+        each = [self._filtered[self.filter.of_law(law)] for law in range(len(laws))]
+        self._each, total = each[CONTACT], ca.norm_inf if self._is_latched else ca.sum1
+        self._force = self._by_law([total(part) for part in each])
 
-    def _filter(self, before: ca.SX, measured: ca.SX) -> ca.SX:
-        """The state of the force filter after one more sample."""
-        size = self._contact.size
-        force, bias, count = before[:size], before[size : 2 * size], before[-1]
-        if self._tares:
-            waits = count < self._tares - 0.5
-            count = ca.if_else(waits, count + 1, count)
-            bias = ca.if_else(waits, bias + (measured - bias) / count, bias)
-            unbiased = ca.if_else(waits, ca.SX.zeros(size), measured - bias)
-        else:
-            unbiased = measured
-        return ca.vertcat(force + self.task.force_gain * (unbiased - force), bias, count)
+    def _by_law(self, values: Sequence[ca.SX]) -> ca.SX:
+        """The value for the active law, one for each law."""
+        each = [ca.if_else(self._acts(law), value, 0) for law, value in enumerate(values)]
+        return sum(each[1:], each[0])
+
+    def _acts(self, law: int) -> ca.SX:
+        """Whether a law is active."""
+        return ca.fabs(self._named["law"] - law) < 0.5
 
     def filtered(self, held: FloatArray, measured: FloatArray) -> FloatArray:
-        """The state of the force filter after a sample, shape (filter_size,).
+        """The state of the force filter after a sample, shape (filter.size,).
 
         Args:
             held: The numbers before it, shape (size,).
-            measured: The forces of the contact, in N, one for each of its points.
+            measured: All measured forces, in N and N m.
         """
         return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
 
-    def forces(self, filtered: FloatArray) -> list[float]:
-        """The forces of the contact after the filter, in N, one for each of its points."""
-        forces: list[float] = filtered[: self._contact.size].tolist()
-        return forces
-
-    def bias(self, filtered: FloatArray) -> FloatArray:
-        """The bias of the forces of the contact, in N, from the state of the force filter."""
-        return filtered[self._contact.size : -1]
-
     def tares(self, held: FloatArray) -> bool:
         """Whether the bias of the force is still being estimated."""
-        return bool(held[self._filter_places][-1] < self._tares - 0.5)
+        return bool(held[self._filter_places][-1] < self.filter.tares - 0.5)
 
     def tally_of(self, held: FloatArray) -> FloatArray:
         """The counts for the guards; see `GuardMemory`."""
@@ -163,7 +152,7 @@ class TracedTask:
         felt = progress.felt if np.isfinite(progress.felt) else change.time
         chosen, places = zip(*((each.chosen, each.place) for each in progress.changes), strict=True)
         ending = ENDINGS[change.chosen] if change.place == len(self._phases) else 0.0
-        flags = [change.place, change.in_contact, change.time, segment.over, touched, felt]
+        flags = [change.place, segment.law, change.time, segment.over, touched, felt]
         flags += [progress.is_felt, change.distance, chosen.count(APPROACH), ending]
         entered = [places.count(place) for place in range(len(self._phases))]
         faded = np.zeros(self._shape)
@@ -191,7 +180,7 @@ class TracedTask:
 
         def goals(index: int) -> ca.SX:
             references = self._plan.goals[index].references
-            if self.task.contacts[index] != bool(which):
+            if self.task.plan.law_of(index) != which:
                 return ca.SX.zeros(size)
             time = ca.SX.sym("time")
             rows = traced_references(references, law.degrees, time)
@@ -207,40 +196,41 @@ class TracedTask:
             powers.append(powers[-1] * share)
         fading = ca.mtimes(self._faded[:size, :], ca.vertcat(*powers))
         reference += ca.if_else(passed < self._named["over"], fading, 0)
-        acts = self._named["contact"] > 0.5
-        return ca.if_else(acts if which else ca.logic_not(acts), reference, 0)
+        return ca.if_else(self._acts(which), reference, 0)
 
     def computations(self) -> tuple[Computation, ...]:
         """The computations of all vector output ports."""
         computations = []
-        own, size = list(self._contact.places), self._contact.size
-        desired = ca.SX.zeros(len(self._laws[FREE].degrees) + size)
-        for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
-            row = self._reference(which)
+        contact = self._pairs[0].contact
+        size = contact.size
+        desired = ca.SX.zeros(self._columns.size)
+        for which, law in enumerate(self._laws):
+            row, name = self._reference(which), law_name(which, "reference")
             function = TracedFunction(name, {"time": self._time, "held": self._held}, {"R": row})
             computations.append(Computation.of(function, (TIME, HELD), (name,)))
-            values = ca.vertcat(row[self._laws[which].layout.lowest.tolist()], ca.SX.zeros(size))
-            if which == FREE:
-                values[-size:], values[own] = values[own], ca.SX.zeros(size)
-            desired += values
-        contact = self._named["contact"]
+            desired[self._columns.of_law(which)] += row[law.layout.lowest.tolist()]
+        is_closed = self._named["law"] == CONTACT
         settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
         least = size * ca.mmin(self._each)
-        is_open = ca.logic_or(contact < 0.5, least < self.task.contact_force)
+        is_open = ca.logic_or(ca.logic_not(is_closed), least < self.task.contact_force)
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
-        values = [desired, self._named["place"], contact, self._named["ending"]]
+        outputs = ["desired_output", "phase", "law", "ending"]
+        values = [desired, *(self._named[name] for name in ("place", "law", "ending"))]
+        if latches := self.task.plan.latches:
+            closed = [self.task.plan.closed_by(law) for law in range(len(self._laws))]
+            shut = [ca.DM([float(name in names) for name in latches]) for names in closed]
+            values, outputs = [*values, self._by_law(shut)], [*outputs, "latch"]
         shown = ca.Function("shown", inputs, values)
-        outputs = ("desired_output", "phase", "in_contact", "ending")
-        computations.append(Computation(shown, (TIME, HELD), outputs))
-        waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(contact > 0.5, hold)])
+        computations.append(Computation(shown, (TIME, HELD), tuple(outputs)))
+        waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(is_closed, hold)])
         computations.append(Computation(waits, (HELD, "hold"), ("free_hold",)))
         stands = ca.logic_or(ca.logic_or(is_open, settles), hold)
         holds = ca.Function("hold", [*inputs, self._forces, hold], [stands])
         sources = (TIME, HELD, "measured_force", "hold")
         computations.append(Computation(holds, sources, ("contact_hold",)))
-        if self._tares:
+        if self.filter.tares:
             tared = ca.SX(self._forces)
-            tared[list(self._contact.forces)] -= self._filtered[size : 2 * size]
+            tared[list(contact.forces)] -= self._filtered[size : 2 * size]
             function = ca.Function("tared", [self._held, self._forces], [tared])
             computations.append(Computation(function, (HELD, "measured_force"), ("tared_force",)))
         return tuple(computations)
@@ -268,11 +258,14 @@ class TracedTask:
         """The measurements without a signal, and the symbols and sources of their inputs."""
         named, law, moved = self._named, self._laws[FREE], self._plan.moved
         x, parameters = law.system.state, law.system.parameter_symbol
-        motion = self._plan.motion_function.function.call([x, parameters])[0]
+        motion = self._motion_of(named["law"], x, parameters)
         first, rates = motion[2 : 2 + moved], motion[2 + moved :]
-        contact = self._contact
-        distances = self._reference(FREE)[law.layout.lowest[list(contact.places)].tolist()]
-        force = self._reference(CONTACT)[int(self._laws[CONTACT].layout.lowest[contact.main])]
+        wanted = ca.SX(0)
+        for which, each in enumerate(self._laws):
+            contact = self._pairs[which // 2].contact
+            places = [contact.main] if which % 2 else list(contact.places)
+            rows = each.layout.lowest[places].tolist()
+            wanted += ca.sum1(self._reference(which)[rows]) / len(places)
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
         if self.task.watches("control"):
@@ -283,7 +276,7 @@ class TracedTask:
             self._force,
             motion[0],
             motion[1],
-            ca.sum1(distances) / contact.size + force,
+            wanted,
             motion[0] - named["distance"],
             speed=ca.norm_2(rates),
             travel=ca.norm_2(first - self._origin),
@@ -292,6 +285,14 @@ class TracedTask:
             eccentricity=eccentricity(ca.vertsplit(self._each), self.task.contact_force),
         )
         return moment, inputs, tuple(sources)
+
+    def _motion_of(self, law: ca.SX, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The values of `TaskPlanner.motion_functions` for a law by its number."""
+        each = [f.function.call([state, parameters])[0] for f in self._plan.motion_functions]
+        value = each[0]
+        for pair, other in enumerate(each[1:], 1):
+            value = ca.if_else(law > 2 * pair - 0.5, other, value)
+        return value
 
     def guard(self) -> Computation:
         """The margins of a phase, the same as those of the supervisor.
@@ -309,19 +310,24 @@ class TracedTask:
         named, task = self._named, self.task
         moment, inputs, sources = self._moment()
         signals = {name: ca.SX.sym(name) for name in task.signals}
-        counts, tares = self._counted(), self._count < self._tares - 0.5
+        counts, tares = (
+            self._counted(),
+            self._held[self._filter_places][-1] < self.filter.tares - 0.5,
+        )
         excess = self._force - task.contact_force
 
-        waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
+        waits = ca.logic_and(ca.fmod(named["law"], 2), named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
         felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
+        if self._is_latched:  # A latch without force is not lost.
+            lost = felt = ca.SX(1)
 
         def margins(index: int) -> ca.SX:
             phase = self._phases[index]
             now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
             end, late = self._ends(phase, now)
             guards = [ca.fmin(margin, 1e9) for margin in self.tally.margins(phase, counts, now)]
-            if self._tares:
+            if self.filter.tares:
                 end = ca.if_else(tares, 1, end)
             trips = ca.mmin(ca.vertcat(1e9, *guards))
             return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)

@@ -4,10 +4,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Computation, Reaction, Update
+from drake_dae.systems.task.contacts.laws import CONTACT, FREE
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Outcome
 from drake_dae.systems.task.phases.phase import APPROACH, FAIL, LEAVE
-from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.traced import EARLY, ENDINGS, NAMES, TracedTask
 
 _OUTCOMES: tuple[Outcome, ...] = ("guard", "success", "lost", "late")
@@ -33,13 +33,16 @@ class SampledTask(TracedTask):
 
     def _begun(self) -> Computation:
         """The numbers at the start of a run, as `TaskPlanner.first`."""
-        law, contact = self._laws[FREE], int(self.task.contacts[0])
+        law, first = self._laws[FREE], self.task.plan.law_of(0)
         x, parameters = law.system.state, law.system.parameter_symbol
-        force = self.task.contact_force if contact else 0.0
-        motion = self._plan.motion_function.function.call([x, parameters])[0]
-        present = [self._met(which, ca.SX(force)) for which in (FREE, CONTACT)]
+        force = self.task.contact_force if first % 2 and not self._is_latched else 0.0
+        motion = self._plan.motion_functions[first // 2].function.call([x, parameters])[0]
+        present = [
+            self._met(which, ca.SX(force), ca.SX.zeros(self._pairs[which // 2].contact.size))
+            for which in range(len(self._laws))
+        ]
         held = ca.SX.zeros(self.size)
-        self._begin_phase(held, ca.SX(0), ca.SX(contact), present, motion)
+        self._begin_phase(held, ca.SX(0), ca.SX(first), present, motion)
         held[NAMES.index("felt")] = self._time
         held[self._entered_places.start] = 1
         sources = (TIME, "estimated_state", PARAMETERS)
@@ -63,23 +66,25 @@ class SampledTask(TracedTask):
             ends = ca.logic_or(ends, each)
         to, approaches, ending = self._successors(ended)
 
-        was = named["contact"]
-        before = [self._reference(which) for which in (FREE, CONTACT)]
-        present = []
-        for which in (FREE, CONTACT):
-            met = self._met(which, self._force)
-            for i, first in enumerate(self._laws[which].layout.lowest.tolist()):
-                if i not in self._contact.places:
-                    size = self._laws[which].degrees[i] + 1
-                    start = int(self._laws[1 - which].layout.lowest[i])
-                    met[first : first + size] = before[1 - which][start : start + size]
-            stays = was > 0.5 if which else was < 0.5
-            present.append(ca.if_else(stays, before[which], met))
-        motion = self._plan.motion_function.function.call([x, parameters])[0]
+        was = ca.fmod(self._named["law"], 2)
+        before, present = [self._reference(which) for which in range(len(self._laws))], []
+        for which, law_after in enumerate(self._laws):
+            met = self._met(which, self._force, self._filtered[self.filter.of_law(which)])
+            places = self._pairs[which // 2].contact.places
+            for i, first in enumerate(law_after.layout.lowest.tolist()):
+                if i not in places:
+                    size = law_after.degrees[i] + 1
+                    # R of a law that is not active is zero.
+                    starts = [int(other.layout.lowest[i]) for other in self._laws]
+                    parts = [r[at : at + size] for r, at in zip(before, starts, strict=True)]
+                    met[first : first + size] = sum(parts[1:], parts[0])
+            present.append(ca.if_else(self._acts(which), before[which], met))
         changed = ca.SX(same)
-        self._begin_phase(changed, to, self._contact_after(to, ended), present, motion)
+        after_law = self._law_after(to, ended)
+        motion = self._motion_of(after_law, x, parameters)
+        self._begin_phase(changed, to, after_law, present, motion)
         values = {
-            "touched": ca.logic_not(was > 0.5),
+            "touched": ca.logic_not(was),
             "approaches": named["approaches"] + approaches,
             "ending": ca.if_else(named["place"] > end - 0.5, named["ending"], ending),
         }
@@ -96,16 +101,16 @@ class SampledTask(TracedTask):
         return Computation(ca.Function("advanced", inputs, [after]), sources, (HELD,))
 
     def _begin_phase(
-        self, held: ca.SX, place: ca.SX, contact: ca.SX, present: list[ca.SX], motion: ca.SX
+        self, held: ca.SX, place: ca.SX, number: ca.SX, present: list[ca.SX], motion: ca.SX
     ) -> None:
         """Writes the segment of a phase that begins now, as `ReferenceSegment.begin`.
 
         Args:
             held: The numbers of the task; changed in place.
             place: The index of the phase.
-            contact: Whether the law in contact becomes active.
-            present: R of both laws at the end of the phase before.
-            motion: The values of `TaskPlanner.motion_function`.
+            number: The number of the law that becomes active.
+            present: R of all laws at the end of the phase before.
+            motion: The values of its function of `TaskPlanner.motion_functions`.
         """
         phases, plan, moved = self._phases, self._plan, self._plan.moved
         chosen, count = _at(place, len(phases) + 1), len(self._laws[FREE].degrees)
@@ -121,7 +126,7 @@ class SampledTask(TracedTask):
             size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
             first_goals = np.zeros((size, len(phases) + 1))
             for index, each in enumerate(plan.goals):
-                if int(self.task.contacts[index]) == which:
+                if self.task.plan.law_of(index) == which:
                     first_goals[:, index] = each.function(0.0)
             goal = ca.mtimes(ca.DM(first_goals), chosen)
             base, rate = ca.SX.zeros(count), ca.SX(goes * free)
@@ -136,17 +141,16 @@ class SampledTask(TracedTask):
             for row, factors in enumerate(rows):
                 faded[row, : len(factors)] = ca.horzcat(*factors)
             sums.append(ca.vertcat(base, rate, ca.vec(faded)))
-        held[self._segment] = ca.vertcat(
-            ca.if_else(contact > 0.5, sums[CONTACT], sums[FREE]), motion[2 : 2 + moved]
-        )
-        values = [place, contact, self._time, over, motion[0]]
-        for name, value in zip(
-            ("place", "contact", "start", "over", "distance"), values, strict=True
-        ):
+        chosen_sums = ca.SX.zeros(sums[0].numel())
+        for which, values_of in enumerate(sums):
+            chosen_sums += ca.if_else(ca.fabs(number - which) < 0.5, values_of, 0)
+        held[self._segment] = ca.vertcat(chosen_sums, motion[2 : 2 + moved])
+        values = [place, number, self._time, over, motion[0]]
+        for name, value in zip(("place", "law", "start", "over", "distance"), values, strict=True):
             held[NAMES.index(name)] = value
 
-    def _met(self, which: int, force: ca.SX) -> ca.SX:
-        """R of a law from the current outputs and the measured force, as `TaskPlanner`."""
+    def _met(self, which: int, force: ca.SX, forces: ca.SX) -> ca.SX:
+        """R of a law from the current outputs and the measured forces, as `TaskPlanner`."""
         law, free = self._laws[which], self._laws[FREE].system
         chains = [
             chain[:degree]
@@ -157,24 +161,30 @@ class SampledTask(TracedTask):
         function = ca.Function("outputs", own, [rows])
         reference = ca.SX.zeros(law.layout.reference_size)
         reference[law.layout.chained.tolist()] = function(free.state, free.parameter_symbol)
-        if which == CONTACT and law.degrees[self._contact.main] == 0:
-            reference[int(law.layout.lowest[self._contact.main])] = force
+        contact = self._pairs[which // 2].contact
+        if which % 2 == CONTACT and law.degrees[contact.main] == 0:
+            if contact.is_latch:
+                reference[law.layout.lowest[list(contact.places)].tolist()] = forces
+            else:
+                reference[int(law.layout.lowest[contact.main])] = force
         return reference
 
-    def _contact_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:
-        """Whether the law in contact is active in the next phase, or while the robot rests."""
+    def _law_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:
+        """The number of the law of the next phase, or of the law while the robot rests."""
         end, plan = len(self._phases), self.task.plan
-        closed = ca.mtimes(ca.DM([[*map(float, self.task.contacts[:end]), 0.0]]), _at(to, end + 1))
-        was = self._named["contact"] > 0.5
+        numbers = [float(plan.law_of(place)) for place in range(end)]
+        next_law = ca.mtimes(ca.DM([[*numbers, 0.0]]), _at(to, end + 1))
+        was = ca.fmod(self._named["law"], 2)
 
         def after(place: int) -> ca.SX:
             lost = ended[2] if self._phases[place].ends_by_loss else ca.SX(0)
             succeeds = ca.logic_and(ca.logic_not(ended[0]), ca.logic_or(ended[1], lost))
             return ca.if_else(succeeds, float(plan.ends_in_contact(place)), was)
 
-        last = self._in_phase(after, was)
-        rests = ca.logic_and(last, self._force >= self.task.contact_force)
-        return ca.if_else(to > end - 0.5, rests, closed)
+        rests = self._in_phase(after, was)
+        if not self._is_latched:
+            rests = ca.logic_and(rests, self._force >= self.task.contact_force)
+        return ca.if_else(to > end - 0.5, self._named["law"] - was + rests, next_law)
 
     def _successors(self, ended: list[ca.SX]) -> _Change:
         """The change after the current phase, by how it has ended."""

@@ -8,6 +8,7 @@ from members import Rise
 
 from drake_dae import (
     Approach,
+    Close,
     ConstantReference,
     Dwell,
     GuardedMove,
@@ -28,6 +29,11 @@ CONTACT_FORCE = 0.5
 # A phase; what is seen while it goes on; what is seen when it is over.
 MEMBERS = {
     "Approach": (Approach(0.05), Moment(1.0, 0.0, 0.1, -0.05, 0.1), Moment(2.0, 0.6, 0.0, 0.0, 0)),
+    "Close": (
+        Close(tolerance=1e-3, speed=0.01),
+        Moment(0.6, 0.0, 9e-4, 0.02, 0.0),
+        Moment(0.6, 0.0, 9e-4, 0.005, 0.0),
+    ),
     "Press": (Press(20.0), Moment(0.6, 18.0, 0.0, 0.0, 20.0), Moment(0.6, 19.5, 0.0, 0.0, 20.0)),
     "Press early": (
         Press(ConstantReference(20.0)),

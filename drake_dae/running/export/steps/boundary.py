@@ -242,7 +242,7 @@ def _known_signals(loop: ClosedLoop | Diagram, plant: Plant) -> dict[str, tuple[
         "estimated_state": dae.state_signals,
         "constraint_force": dae.force_signals,
         "measured_force": dae.constraint_input_signals,
-        "constraint_residual": plant.structure.manifold.residual_signals,
+        "constraint_residual": plant.port_signals["constraint_residual"],
         "controlled_output": dae.output_signals,
         CONTROL: dae.control_signals,
         **plant.further_signals,

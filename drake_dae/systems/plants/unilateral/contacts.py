@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -10,8 +10,8 @@ import numpy as np
 from drake_dae.arrays import FloatArray, number, show, unknown_name
 from drake_dae.dae.system.contacts import PainleveOutcome, painleve_outcome
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import ModelError, PainleveError
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError, PainleveError, SimulationError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
@@ -77,14 +77,18 @@ class ConstraintTerms:
 
 
 class UnilateralContacts:
-    """The constraints of a robot that open and close.
+    """The constraints of a robot that open and close: contacts by themselves, latches by commands.
 
     Args:
         model: The robot.
         restitution: Name of a constraint -> its coefficient of restitution e, 0 to 1.
+        latches: The names of holonomic bilateral constraints.
 
     Attributes:
         names: The names of the contacts, in the order of the model's constraints.
+        latches: The argument.
+        every: The names of contacts and latches, in the order of a mode.
+        latch_rows: The rows of each latch.
         dae: The system with all contacts closed.
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
@@ -97,10 +101,12 @@ class UnilateralContacts:
         residual: phi_i, phi_i' of each, or nonholonomic rows; `sizes` are the numbers of entries.
 
     Raises:
-        ModelError: There is no such constraint, or it is not unilateral.
+        ModelError: There is no such constraint, or it is not unilateral, or not fit for a latch.
     """
 
-    def __init__(self, model: RobotModel, restitution: Mapping[str, float]) -> None:
+    def __init__(
+        self, model: RobotModel, restitution: Mapping[str, float], latches: Sequence[str] = ()
+    ) -> None:
         parts = {c.name: (c, part) for c, part in ConstraintSet(model.constraints).parts()}
         fitting = [
             name
@@ -108,7 +114,7 @@ class UnilateralContacts:
             if sum(constraint.is_unilateral) == 1
             and constraint.is_unilateral.index(True) < constraint.residual(model.links).numel()
         ]
-        if not restitution:
+        if not restitution and not latches:
             raise ModelError(
                 f"{model.name}: no opening contacts are given; possible ones are {fitting}. If no "
                 "contact opens, use a RobotPlant"
@@ -127,16 +133,21 @@ class UnilateralContacts:
                 "and close cannot; leave `compliances` out"
             )
         self.names = tuple(name for name in parts if name in restitution)
-        self.touches = []
+        self.touches = list[TouchRows]()
         for name in self.names:
             constraint, part = parts[name]
             normal = part.start + constraint.is_unilateral.index(True)
             self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
-        opening = np.concatenate([touch.rows for touch in self.touches])
-        self.bilateral: Indices = np.setdiff1d(np.arange(model.dae.num_constraints), opening)
+        self.latches, self.every = tuple(latches), (*self.names, *latches)
+        self.latch_rows = [_latch_rows(model, parts, name) for name in latches]
+        opening = [*(touch.rows for touch in self.touches), *self.latch_rows]
+        self.bilateral: Indices = np.setdiff1d(
+            np.arange(model.dae.num_constraints), np.concatenate(opening)
+        )
         self.normals = [touch.normal for touch in self.touches]
         self.restitution = np.array(
-            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]
+            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names],
+            dtype=float,
         )
         dae, links = model.dae, model.links
         self.dae = dae
@@ -156,6 +167,7 @@ class UnilateralContacts:
         self.gaps = dae.trace(
             "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         )
+        self.off = dae.trace("latches", {"value": dae.k}) if latches else None
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
         sliding = self._sliding(model, parts)
@@ -209,11 +221,52 @@ class UnilateralContacts:
             touch.normal, self.along[place], float(parameters[mu]), restitution
         )
 
+    def rows(self) -> list[Indices]:
+        """The rows of each contact and latch."""
+        return [*(touch.rows for touch in self.touches), *self.latch_rows]
+
+    def bilateral_in(self, closed: Sequence[bool]) -> Indices:
+        """The rows of all bilateral constraints that hold in a mode.
+
+        Args:
+            closed: The closed contacts and latches, one flag for each.
+        """
+        shut = zip(self.latch_rows, closed[len(self.names) :], strict=True)
+        return np.concatenate([self.bilateral, *(rows for rows, is_shut in shut if is_shut)])
+
+    def check_capture(
+        self, place: int, time: float, state: FloatArray, parameters: FloatArray, capture: float
+    ) -> None:
+        """Refuses a latch that closes too far from its place.
+
+        Raises:
+            SimulationError: A distance or angle of the latch is larger than `capture`.
+        """
+        assert self.off is not None
+        values = self.off.evaluate(state, parameters)[0]
+        off = float(np.max(np.abs(values[self.latch_rows[place]])))
+        if not off <= capture:
+            raise SimulationError(
+                f"{self.dae.name}: the latch '{self.latches[place]}' is commanded to close at t = "
+                f"{time:.6g} s, and is {off:.3g} m or rad off its place, more than its capture of "
+                f"{capture:g}. Lead it nearer before it closes",
+                time,
+                state.copy(),
+            )
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        """Names and units of `residual`."""
+        signals = list[Signal]()
+        for signal, size in zip(self.dae.constraint_output_signals, self.sizes, strict=True):
+            signals += [signal, signal.derivative(1)][:size]
+        return tuple(signals)
+
     def holds(self, closed: Sequence[bool]) -> FloatArray:
         """For each entry of the residual 1, or 0 if its contact is open."""
         rows = np.ones(self.dae.num_constraints)
-        for touch, shut in zip(self.touches, closed, strict=True):
-            rows[touch.rows] = shut
+        for own, shut in zip(self.rows(), closed, strict=True):
+            rows[own] = shut
         return np.repeat(rows, self.sizes)
 
     def terms(
@@ -255,33 +308,24 @@ class UnilateralContacts:
         )
 
 
-def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
-    """The system with some of the constraints only.
+def _latch_rows(
+    model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]], name: str
+) -> Indices:
+    """The rows of a latch.
 
-    Args:
-        contacts: The contacts.
-        rows: The constraints that hold.
-        state: A state near which it is examined, shape (n,).
+    Raises:
+        ModelError: There is no such constraint, or it is unilateral or nonholonomic.
     """
-    dae, rows = contacts.dae, list(rows)
-    embed = ca.SX.eye(dae.num_constraints)[:, rows]
-    whole = dae.implicit
-
-    def implicit(rate: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert whole is not None
-        balance, constraint_rate = whole(rate, ca.mtimes(embed, force))
-        return balance, constraint_rate[rows]
-
-    return replace(
-        dae,
-        g=dae.g[:, rows],
-        k=dae.k[rows],
-        m=dae.m[:, rows],
-        constraint_input_signals=tuple(dae.constraint_input_signals[i] for i in rows),
-        constraint_output_signals=tuple(dae.constraint_output_signals[i] for i in rows),
-        implicit=None if whole is None or not rows else implicit,
-        nominal_state=state,
-    )
+    if name not in parts:
+        raise ModelError(f"{model.name}: {unknown_name('constraint', name, parts)}")
+    constraint, part = parts[name]
+    rows = np.arange(part.start, part.stop)
+    if any(constraint.is_unilateral) or constraint.residual(model.links).numel() < rows.size:
+        raise ModelError(
+            f"{model.name}: '{name}' cannot be a latch, since it only pushes, or restricts "
+            "velocities; use a bilateral constraint such as WeldedFrames or CoincidentPoints"
+        )
+    return rows
 
 
 def coefficient(name: str, value: float) -> float:

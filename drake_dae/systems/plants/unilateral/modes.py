@@ -1,14 +1,16 @@
 """The modes of a robot with opening contacts: one system for each set of closed contacts."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, find_constraint_structure
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import DrakeDaeError, ModelError
-from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, subsystem
+from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.plants.unilateral.impacts import rows_of
 from drake_dae.trace.functions import TracedFunction
 
@@ -20,7 +22,7 @@ class Mode:
     """The motion of the robot while some contacts are closed.
 
     Attributes:
-        closed: The closed contacts, one flag for each.
+        closed: The closed contacts and latches, one flag for each.
         structure: The structure of the system with their constraints alone.
         rows: The indices of its constraints among all; of sticking contacts, the independent ones.
         dynamics: x', a function of state, control if there is one, and parameters.
@@ -68,11 +70,12 @@ class Modes:
 
     def _traced(self, closed: Closed, state: FloatArray) -> Mode:
         contacts = self._contacts
-        names = [n for n, shut in zip(contacts.names, closed, strict=True) if shut]
+        names = [n for n, shut in zip(contacts.every, closed, strict=True) if shut]
         dae = contacts.dae
         terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
-        pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
-        independent = rows_of(terms.impulse_matrix, contacts.bilateral, pushing)
+        pushing = [t for t, shut in zip(contacts.touches, closed, strict=False) if shut]
+        bilateral = contacts.bilateral_in(closed)
+        independent = rows_of(terms.impulse_matrix, bilateral, pushing)
         if independent is None:
             raise ModelError(
                 f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "
@@ -80,7 +83,7 @@ class Modes:
             )
         rows = sorted(independent.tolist())
         whole = self._whole if len(rows) == dae.num_constraints else None
-        system = subsystem(contacts, rows, state) if whole is None else whole.system
+        system = _subsystem(contacts, rows, state) if whole is None else whole.system
         try:
             structure = whole or find_constraint_structure(system)
         except DrakeDaeError as error:
@@ -105,6 +108,35 @@ class Modes:
             output=structure.trace("controlled output", output, by_control[1]),
             holds=contacts.holds(closed),
         )
+
+
+def _subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
+    """The system with some of the constraints only.
+
+    Args:
+        contacts: The contacts.
+        rows: The constraints that hold.
+        state: A state near which it is examined, shape (n,).
+    """
+    dae, rows = contacts.dae, list(rows)
+    embed = ca.SX.eye(dae.num_constraints)[:, rows]
+    whole = dae.implicit
+
+    def implicit(rate: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        assert whole is not None
+        balance, constraint_rate = whole(rate, ca.mtimes(embed, force))
+        return balance, constraint_rate[rows]
+
+    return replace(
+        dae,
+        g=dae.g[:, rows],
+        k=dae.k[rows],
+        m=dae.m[:, rows],
+        constraint_input_signals=tuple(dae.constraint_input_signals[i] for i in rows),
+        constraint_output_signals=tuple(dae.constraint_output_signals[i] for i in rows),
+        implicit=None if whole is None or not rows else implicit,
+        nominal_state=state,
+    )
 
 
 def closed_of(values: FloatArray) -> Closed:

@@ -1,6 +1,7 @@
 """A RobotModel with opening contacts, as a LeafSystem."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -22,7 +23,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, Guard
+from drake_dae.systems.blocks.traced import Block, Guard, ones
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
 from drake_dae.systems.plants.unilateral.log import RunLog, clearance
@@ -48,6 +49,9 @@ class UnilateralRobotPlant(ModalPorts):
       the others touch without force. If friction leaves no motion or two, the run ends with a
       PainleveError.
 
+    - A latch, such as a weld, opens and closes by commands. It closes where it is within `capture`
+      of its place, with an inelastic impact; its forces have any sign.
+
     Drake's Simulator finds these times as zeros of witness functions, to within a hundredth of the
     context's accuracy in s under error control, and of a step with fixed steps. So the context's
     accuracy must be set, as `simulate` does: context.SetAccuracy(1e-9) gives 1e-11 s. After each
@@ -57,10 +61,13 @@ class UnilateralRobotPlant(ModalPorts):
         control: u, shape (p,).
         exogenous: The signals w with their derivatives, if the system has any; see
             `ParameterizedSystem`.
+        latch: The commands of the latches, if there are any: above 1/2 to be closed, shape (l,).
+            All are closed without a wire.
 
     Output ports:
         state: x, shape (n,).
-        mode: For each contact 1 if it is closed and 0 if it is open, shape (k,).
+        mode: For each contact and then each latch 1 if it is closed and 0 if it is open, shape
+            (k + l,).
         gap: phi of each contact, m, shape (k,).
         constraint_force: lambda, zero where open, shape (m,).
         constraint_residual: phi_i, phi_i' of each constraint (or nonholonomic rows),
@@ -77,10 +84,15 @@ class UnilateralRobotPlant(ModalPorts):
             to 1 (no loss). It becomes the parameter "<name>.restitution".
         settling_time: Bouncing that would end within this time, in s, ends at once; positive.
         structure: The structure of `model.dae`, with all contacts closed; found if None.
+        latches: The names of bilateral constraints that open and close by commands.
+        capture: The largest distance in m, or angle in rad, at which a latch closes.
+        latch_sets: The sets of latches that a run closes together, for rollouts and exports; all
+            sets if empty.
 
     Attributes:
         model: The robot.
-        contacts: The names of the contacts that open and close, in the order of `mode`.
+        contacts: The names of the contacts and latches, in the order of `mode`.
+        latches: The argument.
         modes: The closed contacts -> the motion then; see `Mode`.
         gap_signals: Names and units of `gap`.
         mode_signals: Names of `mode`.
@@ -92,7 +104,8 @@ class UnilateralRobotPlant(ModalPorts):
         InconsistentStateError: A simulation starts off the bilateral constraints, or inside a
             surface.
         AssumptionError: The constraints of a mode are dependent.
-        SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
+        SimulationError: No forces fit, impacts do not end, a latch is commanded to close too far
+            from its place, or the context has no accuracy.
         PainleveError: The Painleve paradox: a contact with no motion, or two.
     """
 
@@ -106,10 +119,17 @@ class UnilateralRobotPlant(ModalPorts):
         *,
         settling_time: float = 1e-3,
         structure: ConstraintStructure | None = None,
+        latches: Sequence[str] = (),
+        capture: float = 1e-3,
+        latch_sets: Collection[Collection[str]] = (),
     ) -> None:
         settling = positive(f"{model.name}: settling_time", settling_time)
-        super().__init__(model, contacts, structure)
-        self._resets = Resets(self._contacts, self.modes, settling)
+        super().__init__(model, contacts, structure, latches)
+        captured = positive(f"{model.name}: capture", capture)
+        self._latch_sets = [
+            tuple(name in closed for name in self.latches) for closed in latch_sets
+        ] or list(product((False, True), repeat=len(self.latches)))
+        self._resets = Resets(self._contacts, self.modes, settling, captured)
         self._log_index = self.DeclareCacheEntry(
             "events",
             ValueProducer(lambda: AbstractValue.Make(RunLog()), _keep),
@@ -118,13 +138,13 @@ class UnilateralRobotPlant(ModalPorts):
         self._margins_index = self.DeclareCacheEntry(
             "margins",
             ValueProducer(lambda: AbstractValue.Make(np.zeros(0)), weakly(self._calc_margins)),
-            self._by_control,
+            self._by_control | self._by_latch,
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
         self._witnesses = [
             self.MakeWitnessFunction(
-                f"{name}: gap or force",
+                f"{name}: gap, force or command",
                 WitnessFunctionDirection.kPositiveThenNonPositive,
                 weakly(self._guard, i),
                 UnrestrictedUpdateEvent(weakly(self._at_guard)),
@@ -140,7 +160,7 @@ class UnilateralRobotPlant(ModalPorts):
     @property
     def graph(self) -> ContactGraph:
         """Modes, guards and resets: print it, or draw its `graphviz()`."""
-        return ContactGraph(self.dae.name, self.contacts)
+        return ContactGraph(self.dae.name, self._contacts.names)
 
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
@@ -154,9 +174,11 @@ class UnilateralRobotPlant(ModalPorts):
         """Positive while a contact keeps its mode: Drake locates the zero."""
         margin, log = float(self._margins(context)[place]), self._log(context)
         closed = context.get_discrete_state_vector().value()[place] > 0.5
-        if not closed or context.get_time() != log.time:
+        is_latch = place >= len(self._contacts.names)
+        if not (closed or is_latch) or context.get_time() != log.time:
             return -1.0 if place in log.pulled else margin
-        # After a jump of a sampled control the force may be negative from the start of a step on.
+        # After a jump of a sampled control the force may be negative from the start of a step on;
+        # and after an event a command may differ from the mode.
         # Drake sees a zero only if the sign was different at the start, and the force may be
         # positive again at the end of the step.
         if margin <= 0.0 and log.held:
@@ -164,12 +186,16 @@ class UnilateralRobotPlant(ModalPorts):
         return margin if margin > 0.0 else 1.0
 
     def _margins(self, context: Context) -> FloatArray:
-        """For each contact: its force if closed; otherwise positive until it penetrates."""
+        """For each contact its force if closed; otherwise positive until it penetrates.
+
+        For each latch positive while it is as it is commanded.
+        """
         margins: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
         return margins
 
     def _calc_margins(self, context: Context, value: AbstractValue) -> None:
-        closed = context.get_discrete_state_vector().value() > 0.5
+        mode = context.get_discrete_state_vector().value() > 0.5
+        closed, latched = np.split(mode, [len(self._contacts.names)])
         margins = np.zeros(closed.size)
         if not closed.all():
             state = context.get_continuous_state_vector().value()
@@ -178,7 +204,8 @@ class UnilateralRobotPlant(ModalPorts):
             margins[:] = clearance(log, context.get_time(), gaps, rates)
         if closed.any():
             margins[closed] = self._mode_force(context)[self._contacts.normals][closed]
-        value.set_value(margins)
+        as_commanded = latched == np.array(self._commanded(context), dtype=bool)
+        value.set_value(np.concatenate([margins, np.where(as_commanded, 1.0, -1.0)]))
 
     def _at_guard(
         self, context: Context, event: UnrestrictedUpdateEvent, state: State
@@ -202,7 +229,7 @@ class UnilateralRobotPlant(ModalPorts):
         if np.isnan(self._control(context)).any():
             # Values held between samples change with this event, at the start of the first step.
             log.waits = True
-            closed = self._resets.resting(x, values)
+            closed = self._resets.resting(x, values, self._commanded(context))
             state.get_mutable_discrete_state().set_value(numbers_of(closed))
             self._begin_step(context, x, values)
             return EventStatus.Succeeded()
@@ -229,8 +256,8 @@ class UnilateralRobotPlant(ModalPorts):
                 residual,
             )
         gaps = self._contacts.gaps.evaluate(state, values)[0].copy()
-        deepest = int(np.argmin(gaps))
-        if gaps[deepest] < -TOUCHING:
+        deepest = int(np.argmin(gaps)) if gaps.size else 0
+        if gaps.size and gaps[deepest] < -TOUCHING:
             raise InconsistentStateError(
                 f"{self.dae.name}: the start state is {-gaps[deepest]:.3g} m inside the surface of "
                 f"'{self.contacts[deepest]}'; start outside",
@@ -264,7 +291,8 @@ class UnilateralRobotPlant(ModalPorts):
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
             e = context.get_numeric_parameter(1).value()
-            after = self._resets(time, x, closed, self._control(context), values, e)
+            latched = self._commanded(context)
+            after = self._resets(time, x, closed, self._control(context), values, e, latched)
         except InconsistentStateError as error:
             raise off_manifold(time, x, error) from error
         log, before = self._log(context), (time, x.tobytes())
@@ -281,7 +309,10 @@ class UnilateralRobotPlant(ModalPorts):
         return self._reset(context, state)
 
     def traced(self) -> Block:
-        traced, dae = TracedContacts(self._contacts, self.modes, self._residual), self.dae
+        traced, dae = (
+            TracedContacts(self._contacts, self.modes, self._residual, self._latch_sets),
+            self.dae,
+        )
         return Block(
             self,
             traced.computations(self._ports),
@@ -290,6 +321,7 @@ class UnilateralRobotPlant(ModalPorts):
             scale=dae.scale,
             moving=tuple(self.exogenous_places),
             guard=Guard(traced.guard(), self._react),
+            unwired={} if self._latch_port is None else {"latch": ones("latch", len(self.latches))},
             signals=self._signals,
             ports={
                 **self.port_signals,

@@ -12,7 +12,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, SimulationError, SingularityError
+from drake_dae.errors import AssumptionError, ModelError, SimulationError, SingularityError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
@@ -21,7 +21,7 @@ from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, coefficient
-from drake_dae.systems.plants.unilateral.modes import Mode, Modes, closed_of
+from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -33,6 +33,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         model: The robot.
         contacts: Name of a unilateral constraint -> its coefficient of restitution.
         structure: The structure of `model.dae`, if it is known.
+        latches: The names of bilateral constraints that open and close by commands.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -43,20 +44,21 @@ class ModalPorts(ParameterizedSystem, Plant):
         model: RobotModel,
         contacts: Mapping[str, float],
         structure: ConstraintStructure | None = None,
+        latches: Sequence[str] = (),
     ) -> None:
         if structure is not None:
             structure = constraint_structure_of(type(self).__name__, model.dae, structure)
-        self._contacts = bound = UnilateralContacts(model, contacts)
+        self._contacts = bound = UnilateralContacts(model, contacts, latches)
         dae = bound.dae
         signals = {"state": dae.state_signals, "control": dae.control_signals}
         super().__init__(dae, dae.parameter_values, signals)
         self.DeclareNumericParameter(BasicVector(bound.restitution))
         self.set_name(model.name)
         self.model: RobotModel = model
-        self.contacts = bound.names
+        self.contacts, self.latches = bound.every, bound.latches
         self.normals = tuple(bound.normals)
         self.gap_signals = tuple(Signal(f"{name}.gap", "m") for name in bound.names)
-        self.mode_signals = tuple(Signal(f"{name}.closed") for name in bound.names)
+        self.mode_signals = tuple(Signal(f"{name}.closed") for name in bound.every)
         self.modes = Modes(bound, structure)
         self._by_numbers: dict[bytes, Mode] = {}
         self._now: Mode | None = None
@@ -67,6 +69,9 @@ class ModalPorts(ParameterizedSystem, Plant):
         self.DeclareDiscreteState(count)
         self._is_controlled = dae.num_controls > 0
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
+        self._latch_port = None
+        if latches:
+            self._latch_port = self.DeclareVectorInputPort("latch", len(latches))
         residual = bound.residual
         self._residual = dae.trace("constraint residual", {"value": residual})
         moved = (dae.f, dae.g, dae.h, dae.l, dae.m, residual, dae.exogenous.rate(bound.drift))
@@ -81,11 +86,14 @@ class ModalPorts(ParameterizedSystem, Plant):
         self._by_control = set(self._by_state)
         if ca.depends_on(balanced, derivatives.control):
             self._by_control.add(self.input_port_ticket(self._control_port.get_index()))
+        self._by_latch = set()
+        if self._latch_port is not None:
+            self._by_latch.add(self.input_port_ticket(self._latch_port.get_index()))
         by_state, by_control, by_mode = self._by_state, self._by_control, {self.xd_ticket()}
         for name, size, value, tickets in (
             ("state", dae.num_states, self._state, by_state),
             ("mode", count, self._mode_numbers, by_mode),
-            ("gap", count, self._gap, by_state),
+            ("gap", len(bound.names), self._gap, by_state),
             ("constraint_force", dae.num_constraints, self._force, by_control),
             ("constraint_residual", residual.numel(), self._held_residual, by_state),
             ("controlled_output", dae.num_outputs, self._output, by_control),
@@ -129,7 +137,7 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     def _restitution_place(self, name: str) -> int | None:
         """The index of the contact whose coefficient of restitution has a name, or None."""
-        names = [f"{contact}.restitution" for contact in self.contacts]
+        names = [f"{contact}.restitution" for contact in self._contacts.names]
         return names.index(name) if name in names else None
 
     @property
@@ -152,12 +160,23 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     @cached_property
     def structure(self) -> ConstraintStructure:  # type: ignore[override]
-        """The structure of the system with all contacts closed.
+        """The structure with all contacts closed, and all latches if that is possible, else none.
 
         Raises:
-            ModelError: They cannot be closed together, likewise as an AssumptionError.
+            ModelError: The contacts cannot be closed together, likewise as an AssumptionError.
         """
-        return self.modes((True,) * len(self.contacts), self.dae.nominal_state).structure
+        touching, nominal = (True,) * len(self._contacts.names), self.dae.nominal_state
+        try:
+            return self.modes((True,) * len(self.contacts), nominal).structure
+        except (ModelError, AssumptionError):
+            if not self.latches:
+                raise
+            return self.modes((*touching, *(False for _ in self.latches)), nominal).structure
+
+    @property
+    def port_signals(self) -> dict[str, tuple[Signal, ...]]:
+        residual = self._contacts.residual_signals
+        return {**super().port_signals, "constraint_residual": residual}
 
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""
@@ -208,6 +227,13 @@ class ModalPorts(ParameterizedSystem, Plant):
         self._now = mode
         return mode
 
+    def _commanded(self, context: Context) -> Closed:
+        """The latches that are commanded to be closed; all without a wire."""
+        port = self._latch_port
+        if port is None or not port.HasValue(context):
+            return (True,) * len(self.latches)
+        return closed_of(port.Eval(context))
+
     def _control(self, context: Context) -> FloatArray:
         return self._control_port.Eval(context) if self._is_controlled else np.zeros(0)
 
@@ -226,9 +252,10 @@ class ModalPorts(ParameterizedSystem, Plant):
         control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
         contacts = self._contacts
         terms = contacts.terms(error.state, control, parameters)
-        places = [i for i, shut in enumerate(self._now.closed) if shut]
+        places = [i for i, shut in enumerate(self._now.closed[: len(contacts.names)]) if shut]
         normals = [contacts.normals[i] for i in places]
-        outcome = terms.painleve_outcome(contacts.bilateral.tolist(), normals)
+        bilateral = contacts.bilateral_in(self._now.closed).tolist()
+        outcome = terms.painleve_outcome(bilateral, normals)
         if outcome is None:
             return error
         names = [self.contacts[i] for i in places]

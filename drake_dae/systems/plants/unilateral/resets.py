@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.contacts import PainleveOutcome
+from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
@@ -69,14 +70,22 @@ class Resets:
 
     Then the touching contacts with force are closed: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
 
+    Latches open and close by commands. Closed ones are bilateral: what is left of the rates of a
+    latch that closes ends by an inelastic impact. It closes where no distance or angle of it is
+    larger than `capture`, and the state is projected to its place.
+
     Args:
         contacts: The contacts.
         modes: Their modes.
         settling_time: T, s.
+        capture: The largest distance or angle at which a latch closes, in m or rad.
     """
 
-    def __init__(self, contacts: UnilateralContacts, modes: Modes, settling_time: float) -> None:
+    def __init__(
+        self, contacts: UnilateralContacts, modes: Modes, settling_time: float, capture: float
+    ) -> None:
         self._contacts = contacts
+        self._capture = capture
         self._modes = modes
         self._settling_time = settling_time
 
@@ -88,19 +97,31 @@ class Resets:
         control: FloatArray,
         parameters: FloatArray,
         restitution: FloatArray,
+        latched: Closed = (),
     ) -> ResetResult:
         """The reset at a time from a state, in a mode, with the e of each contact.
 
+        Args:
+            time, state, closed, control, parameters, restitution: As above.
+            latched: The latches that are commanded to be closed, one flag for each.
+
         Raises:
-            SimulationError: No set of contacts fits, or impacts do not end.
+            SimulationError: No set of contacts fits, impacts do not end, or a latch is too far from
+                its place.
         """
-        contacts = self._contacts
+        contacts, count = self._contacts, len(self._contacts.names)
         events: list[ContactEvent] = []
         x, before = state, closed
+        joining = [
+            i for i, (now, was) in enumerate(zip(latched, closed[count:], strict=True)) if now > was
+        ]
+        for i in joining:
+            contacts.check_capture(i, time, x, parameters, self._capture)
+        bilateral = contacts.bilateral_in((*closed[:count], *latched))
         for _ in range(REPEATED):
             terms = contacts.terms(x, control, parameters)
             gaps, rates = (value.copy() for value in contacts.gaps.evaluate(x, parameters))
-            touching = [i for i in range(len(closed)) if closed[i] or gaps[i] <= TOUCHING]
+            touching = [i for i in range(count) if closed[i] or gaps[i] <= TOUCHING]
             if len(touching) > MOST:
                 names = ", ".join(contacts.names[i] for i in touching)
                 raise SimulationError(
@@ -111,10 +132,15 @@ class Resets:
                 )
             # Separating contacts take no part.
             touching = [i for i in touching if rates[i] <= SLOW]
-            if not any(rates[i] < -SLOW for i in touching):
+            own = [row for i in joining for row in contacts.latch_rows[i]]
+            if not any(rates[i] < -SLOW for i in touching) and not (
+                own and np.max(np.abs(terms.rates[own])) > SLOW
+            ):
                 break
             e = restitution[touching]
-            x, event = self._impact(time, x, touching, terms, control, parameters, e)
+            x, event = self._impact(
+                time, x, touching, terms, control, parameters, e, bilateral, joining
+            )
             events.append(event)
         else:
             raise SimulationError(
@@ -126,30 +152,31 @@ class Resets:
         touches = [contacts.touches[i] for i in touching]
         if contacts.dae.frictional_contacts:
             outcome = terms.painleve_outcome(
-                contacts.bilateral.tolist(), [touch.normal for touch in touches]
+                bilateral.tolist(), [touch.normal for touch in touches]
             )
             if outcome in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
                 in_paradox = [contacts.names[i] for i in touching]
                 raise contacts.painleve_error(time, x, in_paradox, outcome)
-        fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
+        fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches, bilateral)
         pushing = {touching[place] for place in fit.pushing}
-        closed = tuple(i in pushing for i in range(len(closed)))
+        closed = (*(i in pushing for i in range(count)), *latched)
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
         return ResetResult(x, closed, tuple(self._completed(events, closed)))
 
-    def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
-        """The contacts that touch at rest, as many as can be closed together."""
+    def resting(self, state: FloatArray, parameters: FloatArray, latched: Closed) -> Closed:
+        """The contacts that touch at rest, as many as can be closed together, and the latches."""
         contacts = self._contacts
         control = np.zeros(contacts.dae.num_controls)
         matrix = contacts.terms(state, control, parameters).impulse_matrix
         gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
+        bilateral = contacts.bilateral_in((*(False for _ in contacts.names), *latched))
         closed: list[int] = []
         for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
             trial = [contacts.touches[j] for j in (*closed, i)]
-            if rows_of(matrix, contacts.bilateral, trial) is not None:
+            if rows_of(matrix, bilateral, trial) is not None:
                 closed.append(i)
-        return tuple(i in closed for i in range(len(contacts.touches)))
+        return (*(i in closed for i in range(len(contacts.touches))), *latched)
 
     def _impact(
         self,
@@ -160,28 +187,32 @@ class Resets:
         control: FloatArray,
         parameters: FloatArray,
         e: FloatArray,
+        bilateral: Indices,
+        joining: Sequence[int],
     ) -> tuple[FloatArray, ContactEvent]:
         contacts, before = self._contacts, terms.all_rates
         touches = [contacts.touches[i] for i in touching]
-        normals = np.array([touch.normal for touch in touches])
+        normals = np.array([touch.normal for touch in touches], dtype=int)
         matrix = terms.all_impulses
         frictional = [
             contacts.frictional_contact(i, parameters, coefficient)
             for i, coefficient in zip(touching, e, strict=True)
         ]
         if any(0.0 < contact.friction < np.inf for contact in frictional):
-            impulse = impact(matrix, before, contacts.bilateral, frictional)
+            impulse = impact(matrix, before, bilateral, frictional)
         else:
             offset = before.copy()
             offset[normals] *= 1.0 + e
-            impulse = self._fit(time, state, matrix, offset, touches).values
+            impulse = self._fit(time, state, matrix, offset, touches, bilateral).values
         if impulse is None:
             raise self._unfit(time, state)
         after = before + matrix @ impulse
         x = state + terms.velocity_change @ impulse
-        rest = self._rest(time, x, touches, before, control, parameters)
+        rest = None
+        if touches:
+            rest = self._rest(time, x, touches, before, control, parameters, bilateral)
         if rest is not None:
-            rows = np.array([*contacts.bilateral, *(r for touch in touches for r in touch.rows)])
+            rows = np.array([*bilateral, *(r for touch in touches for r in touch.rows)])
             impulse = impulse + stopping(matrix, after, rows)
             after = before + matrix @ impulse
             x = state + terms.velocity_change @ impulse
@@ -189,9 +220,15 @@ class Resets:
         return x, ContactEvent(
             time=time,
             kind=ContactChange.IMPACT if rest is None else ContactChange.REST,
-            contacts=tuple(contacts.names[i] for i in took_part),
+            contacts=(
+                *(contacts.names[i] for i in took_part),
+                *(contacts.latches[i] for i in joining),
+            ),
             closed=(),
-            impulses=tuple(float(impulse[contacts.normals[i]]) for i in took_part),
+            impulses=(
+                *(float(impulse[contacts.normals[i]]) for i in took_part),
+                *(float(np.max(np.abs(impulse[contacts.latch_rows[i]]))) for i in joining),
+            ),
             energy_lost=float(-0.5 * impulse @ (before + after)),
             rest_time=None if rest is None else float(time + rest),
         )
@@ -204,6 +241,7 @@ class Resets:
         before: FloatArray,
         control: FloatArray,
         parameters: FloatArray,
+        bilateral: Indices,
     ) -> float | None:
         """The remaining duration of bouncing after an impact, in s; None if it is long."""
         terms = self._contacts.terms(state, control, parameters)
@@ -212,9 +250,7 @@ class Resets:
         if not leaving:
             return 0.0
         staying = [touch for touch in touches if touch not in leaving]
-        fit = complementary(
-            terms.force_matrix, terms.accelerations, self._contacts.bilateral, staying
-        )
+        fit = complementary(terms.force_matrix, terms.accelerations, bilateral, staying)
         if fit is None:
             return None
         normals = [touch.normal for touch in leaving]
@@ -233,8 +269,9 @@ class Resets:
         matrix: FloatArray,
         offset: FloatArray,
         touches: Sequence[TouchRows],
+        bilateral: Indices,
     ) -> ImpactSolution:
-        fit = complementary(matrix, offset, self._contacts.bilateral, touches)
+        fit = complementary(matrix, offset, bilateral, touches)
         if fit is None:
             raise self._unfit(time, state)
         return fit
@@ -256,7 +293,7 @@ class Resets:
         for kind, was in ((ContactChange.OPENING, True), (ContactChange.CLOSING, False)):
             names = tuple(
                 name
-                for name, old, new in zip(self._contacts.names, before, closed, strict=True)
+                for name, old, new in zip(self._contacts.every, before, closed, strict=True)
                 if old is was and new is not was and not (name in named and not was)
             )
             if names:
@@ -264,7 +301,7 @@ class Resets:
         return changes
 
     def _completed(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
-        names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
+        names = tuple(n for n, shut in zip(self._contacts.every, closed, strict=True) if shut)
         all_events = []
         for event in events:
             completed = replace(event, closed=names)

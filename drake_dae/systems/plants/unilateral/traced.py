@@ -27,8 +27,8 @@ from drake_dae.systems.plants.unilateral.log import MARGIN
 from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of
 from drake_dae.trace.functions import TracedFunction
 
-MOST = 3
-"""The largest number of contacts: each function contains all of their eight modes."""
+MOST = 8
+"""The largest number of modes, as of three contacts: each function contains all of them."""
 
 
 class TracedContacts:
@@ -38,28 +38,33 @@ class TracedContacts:
         contacts: The contacts.
         modes: Their modes.
         residual: The function of the constraint residual.
+        latch_sets: The latches that are closed together, one flag for each.
 
     Raises:
         ModelError: There are too many contacts.
     """
 
     def __init__(
-        self, contacts: UnilateralContacts, modes: Modes, residual: TracedFunction
+        self,
+        contacts: UnilateralContacts,
+        modes: Modes,
+        residual: TracedFunction,
+        latch_sets: Sequence[Closed],
     ) -> None:
-        count = len(contacts.names)
-        if count > MOST:
-            raise not_traced(f"a plant with more than {MOST} contacts that open and close")
+        count = len(contacts.every)
+        touching = product((False, True), repeat=len(contacts.names))
+        every = [(*closed, *latched) for closed, latched in product(touching, latch_sets)]
+        if len(every) > MOST:
+            raise not_traced(f"a plant with {len(every)} modes of its contacts, more than {MOST},")
         dae = self._dae = contacts.dae
         self._contacts, self._modes, self._residual = contacts, modes, residual
         self._state, self._held = ca.SX.sym("state", dae.num_states), ca.SX.sym("mode", count)
         self._control = ca.SX.sym("control", dae.num_controls)
         size = dae.parameter_symbol.numel()
         # The coefficients of restitution come last; no motion depends on them.
-        self._all = ca.SX.sym("parameters", size + count)
+        self._all = ca.SX.sym("parameters", size + len(contacts.names))
         self._parameters = self._all[:size]
-        self._all_modes = [
-            (closed, self._mode(closed)) for closed in product((False, True), repeat=count)
-        ]
+        self._all_modes = [(closed, self._mode(closed)) for closed in every]
 
     def _mode(self, closed: Closed) -> Mode | None:
         """A mode; None if its contacts cannot be closed together."""
@@ -140,7 +145,7 @@ class TracedContacts:
             "shown", [x, mode], [x, mode, *(x[part] for part in ports.parts.values())]
         )
         computations.append(Computation(same, (STATE, HELD), ("state", "mode", *ports.parts)))
-        holds = {row: mode[i] for i, touch in enumerate(contacts.touches) for row in touch.rows}
+        holds = {row: mode[i] for i, own in enumerate(contacts.rows()) for row in own}
         rows = [
             ca.repmat(ca.SX(holds.get(row, 1)), size, 1) for row, size in enumerate(contacts.sizes)
         ]
@@ -161,18 +166,26 @@ class TracedContacts:
         return tuple(computations)
 
     def guard(self) -> Computation:
-        """The margins of contacts, the same as those of the plant: their forces or clearances."""
-        acting = ca.SX.sym("force", self._dae.num_constraints)
-        gaps, rates = self._contacts.gaps.function.call([self._state, self._parameters])[:2]
+        """The margins of the plant: forces or clearances of contacts, and commands of latches."""
+        acting, contacts = ca.SX.sym("force", self._dae.num_constraints), self._contacts
+        gaps, rates = contacts.gaps.function.call([self._state, self._parameters])[:2]
         clear = ca.if_else(gaps < -TOUCHING, gaps, ca.fmax(gaps, rates + MARGIN))
-        is_closed = self._held > 0.5
-        margins = ca.if_else(is_closed, acting[self._contacts.normals], clear)
+        is_closed, latched = ca.vertsplit(
+            self._held > 0.5, [0, len(contacts.names), self._held.numel()]
+        )
+        margins = ca.if_else(is_closed, acting[contacts.normals], clear)
+        inputs, sources = (
+            [self._state, self._held, acting, self._all],
+            [STATE, HELD, "acting_force", PARAMETERS],
+        )
+        if contacts.latches:
+            latch = ca.SX.sym("latch", len(contacts.latches))
+            inputs, sources = [*inputs, latch], [*sources, "latch"]
+            margins = ca.vertcat(margins, ca.if_else((latch > 0.5) == latched, 1, -1))
         # The gap of a closed contact does not fall.
         values = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_closed, 0, rates))]
-        function = ca.Function("guard", [self._state, self._held, acting, self._all], values)
-        return Computation(
-            function, (STATE, HELD, "acting_force", PARAMETERS), (MARGINS, GAPS, RATES)
-        )
+        function = ca.Function("guard", inputs, values)
+        return Computation(function, tuple(sources), (MARGINS, GAPS, RATES))
 
     def projection(self) -> Projection:
         """The projection of the state onto the manifold of its mode."""
@@ -185,11 +198,13 @@ class TracedContacts:
 
         steps = self._chosen(values, [ca.SX.nan(self._dae.num_states, 1)])
         newton = ca.Function("newton", [self._state, start, self._all, self._held], steps)
-        return Projection(newton, self._dae.scale, partial(_project, self._modes))
+        return Projection(
+            newton, self._dae.scale, partial(_project, self._modes, len(self._contacts.names))
+        )
 
 
 def _project(
-    modes: Modes, state: FloatArray, parameters: FloatArray, held: FloatArray
+    modes: Modes, contacts: int, state: FloatArray, parameters: FloatArray, held: FloatArray
 ) -> FloatArray:
-    of_system = parameters[: parameters.size - held.size]
+    of_system = parameters[: parameters.size - contacts]
     return modes(closed_of(held), state).structure.manifold.project(state, of_system)

@@ -3,12 +3,21 @@
 from drake_dae.systems.task.phases.guarded import GuardedMove, Wait
 from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.insert import Insert
-from drake_dae.systems.task.phases.members import Approach, Dwell, Move, Press, Release, Retreat
+from drake_dae.systems.task.phases.members import (
+    Approach,
+    Close,
+    Dwell,
+    Move,
+    Press,
+    Release,
+    Retreat,
+)
 from drake_dae.systems.task.phases.phase import Moment, Outcome, Phase
 from drake_dae.systems.task.phases.search import Search
 
 __all__ = [
     "Approach",
+    "Close",
     "Dwell",
     "GuardedMove",
     "Insert",

@@ -105,7 +105,7 @@ class Wait(Phase):
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     if_lost: str | None = field(default=None, kw_only=True)
-    holds_contact = True
+    holds_contact, for_latch = True, True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -133,10 +133,61 @@ class Press(Phase):
         return f"a force within {self.tolerance:g} N of its reference"
 
 
+@checked(ModelError)
+@dataclass(frozen=True)
+class Close(Phase):
+    """A latch comes into its place, and a command closes it.
+
+    The distances and angles of the latch go smoothly to zero. What is left of its velocities ends
+    by an inelastic impact when it closes.
+
+    Attributes:
+        tolerance: The largest distance in m, and the largest angle in rad, at which it closes.
+        speed: The largest velocity in m/s, and the largest angular velocity in rad/s, at which it
+            closes.
+        over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
+    """
+
+    tolerance: float = 1e-4
+    speed: float = 1e-3
+    within: float = field(default=60.0, kw_only=True)
+    if_late: str | None = field(default=None, kw_only=True)
+    begins_in_contact, ends_in_contact = False, True
+    for_contact, for_latch = False, True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive("Close: tolerance", self.tolerance)
+        positive("Close: speed", self.speed)
+
+    def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
+        return {contact_output: 0.0}
+
+    def needed(self, contact_force: float) -> Mapping[str, float]:
+        return {"time": self.over}
+
+    def margin(self, now: Moment, contact_force: float) -> float:
+        off = ca.fmax(now.distance - self.tolerance, now.rate - self.speed)
+        margin: float = ca.fmax(self.over - now.time, off)
+        return margin
+
+    def lateness(self, now: Moment, contact_force: float) -> str:
+        return (
+            f"{super().lateness(now, contact_force)}, and is {now.distance:.3g} m or rad off with "
+            f"{now.rate:.3g} m/s or rad/s"
+        )
+
+    def awaited(self, contact_force: float) -> str:
+        return f"a latch within {self.tolerance:g} m or rad and {self.speed:g} m/s or rad/s"
+
+
 class _Lasting(Phase):
     """A phase that ends after its `duration`."""
 
     duration: float
+    for_latch = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,8 +253,10 @@ class Dwell(_Lasting):
 class Release(Phase):
     """The force goes smoothly to zero; the phase ends below the task's contact_force.
 
-    It is also late if the tool is 20 mm away and a force is still measured, which is then the bias
-    of a sensor.
+    All forces and moments of a latch go to zero; then a command opens it.
+
+    The phase is also late if the tool is 20 mm away and a force is still measured, which is then
+    the bias of a sensor.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -214,6 +267,7 @@ class Release(Phase):
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     begins_in_contact, ends_in_contact = True, False
+    for_latch = True
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: 0.0}

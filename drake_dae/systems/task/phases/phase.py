@@ -83,6 +83,9 @@ class Phase(ABC):
        most `retries` of the task times; "hold", the robot rests in its present state with contact
        and force; "leave", the force goes to zero, and the run ends; "stop", the robot rests, and
        the run ends; "fail", the run ends with an error.
+    6. `for_contact` and `for_latch` say whether it is for a contact that pushes, and for a latch: a
+       constraint that commands open and close, with forces of any sign. Of a latch, `Moment` has
+       the largest force, distance and rate of its directions.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -95,6 +98,8 @@ class Phase(ABC):
         retries: The number of times that it may be entered again; needed for a phase to which
             others lead back.
         if_spent: The successor in its place once these are used up.
+        contact: The name of the latch that it opens, closes or leads; that of the phase before in
+            the list if empty. Empty in all phases of a task with one contact.
     """
 
     over: float = 0.5
@@ -104,11 +109,14 @@ class Phase(ABC):
     on_failure: str | None = None
     retries: int | None = None
     if_spent: str = FAIL
+    contact: str = ""
     begins_in_contact: ClassVar[bool | None] = None
     ends_in_contact: ClassVar[bool | None] = None
     holds_contact: ClassVar[bool] = False
     ends_by_loss: ClassVar[bool] = False
     is_relative: ClassVar[bool] = False
+    for_contact: ClassVar[bool] = True
+    for_latch: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING
@@ -217,3 +225,51 @@ class Phase(ABC):
         if successor is None:
             return HOLD if outcome == "lost" else FAIL
         return str(successor)
+
+
+@dataclass(frozen=True)
+class ContactMode:
+    """The closed contacts of a task, and the one that it leads.
+
+    Attributes:
+        contact: The name of the contact that opens and closes; empty in a task with one contact.
+        is_closed: Whether this contact is closed.
+        others: The names of the other latches that are closed.
+    """
+
+    contact: str
+    is_closed: bool
+    others: frozenset[str] = frozenset()
+
+    @property
+    def closed(self) -> frozenset[str]:
+        """The names of all closed contacts."""
+        return self.others | {self.contact} if self.is_closed else self.others
+
+
+def modes_of(phases: Sequence[Phase]) -> tuple[ContactMode, ...]:
+    """The mode in which each phase begins; last the mode in which the last one ends.
+
+    A contact is closed at the start if the first phase that opens, closes or needs it says so.
+    """
+    names, name = list[str](), ""
+    for phase in phases:
+        name = phase.contact or name
+        names.append(name)
+    closed, known = set[str](), set[str]()
+    for name, phase in zip(names, phases, strict=True):
+        if phase.begins_in_contact is not None and name not in known:
+            known.add(name)
+            closed |= {name} if phase.begins_in_contact else set()
+    modes = []
+
+    def add(name: str, says: bool | None) -> None:
+        if says is not None:
+            (closed.add if says else closed.discard)(name)
+
+    for name, phase in zip(names, phases, strict=True):
+        add(name, phase.begins_in_contact)
+        modes.append(ContactMode(name, name in closed, frozenset(closed - {name})))
+        add(name, phase.ends_in_contact)
+    modes.append(ContactMode(names[-1], names[-1] in closed, frozenset(closed - {names[-1]})))
+    return tuple(modes)

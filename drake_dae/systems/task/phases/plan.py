@@ -15,8 +15,10 @@ from drake_dae.systems.task.phases.phase import (
     LEAVE,
     NEXT,
     STOP,
+    ContactMode,
     Outcome,
     Phase,
+    modes_of,
 )
 
 OUTCOMES: tuple[Outcome, ...] = ("success", "guard", "late", "lost")
@@ -64,18 +66,6 @@ def named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
     return tuple(renamed)
 
 
-def contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
-    """Whether each phase begins in contact; last whether the last one ends in contact."""
-    begins, in_contact = [], False
-    for phase in phases:
-        if phase.begins_in_contact is not None:
-            in_contact = phase.begins_in_contact
-        begins.append(in_contact)
-        if phase.ends_in_contact is not None:
-            in_contact = phase.ends_in_contact
-    return (*begins, in_contact)
-
-
 class PhasePlan:
     """The order of the phases of a task.
 
@@ -85,7 +75,10 @@ class PhasePlan:
 
     Attributes:
         phases: The same, followed by the Release for "leave" if it may be needed.
+        modes: The mode in which each phase begins; last the mode in which the last one ends.
         contacts: Whether each phase begins in contact; last whether the last one ends in contact.
+        pairs: For each contact beside other closed ones its name and their names.
+        latches: The names of the latches; empty in a task with one contact.
         last: The number of phases that were given.
         retries: The argument.
 
@@ -99,12 +92,17 @@ class PhasePlan:
         self._names = [phase.name for phase in phases]
         self.retries, self.last = retries, len(phases)
         self.phases: tuple[Phase, ...] = tuple(phases)
-        self.contacts = contacts_of(phases)
+        self.modes = modes_of(phases)
+        self.contacts = tuple(mode.is_closed for mode in self.modes)
+        self.pairs = tuple(dict.fromkeys((each.contact, each.others) for each in self.modes[:-1]))
+        self.latches = tuple(dict.fromkeys(name for name, _ in self.pairs if name))
+        self._check_latches()
         if self._leaves():
             # A model error may be larger than the task's contact_force, and holds the tool.
             leave = Release(name=LEAVE, within=5.0, on_success=STOP, on_failure=STOP)
             self.phases = (*phases, leave)
             self.contacts = (*self.contacts[:-1], True, False)
+            self.modes = tuple(ContactMode("", is_closed) for is_closed in self.contacts)
         self._edges = {place: self._all_from(place) for place in range(self.last)}
         self._check_reached()
         self._check_ends()
@@ -157,6 +155,21 @@ class PhasePlan:
             place, word = to, FAIL if word == APPROACH and phase.retries is None else phase.if_spent
         return Successor(FAIL, None, "; ".join(remarks))
 
+    def law_of(self, place: int) -> int:
+        """The number of the law of a phase: twice that of its pair, and 1 more if it is closed."""
+        mode = self.modes[place]
+        return 2 * self.pairs.index((mode.contact, mode.others)) + int(mode.is_closed)
+
+    def closed_by(self, law: int) -> frozenset[str]:
+        """The names of the latches that are closed while a law acts."""
+        contact, others = self.pairs[law // 2]
+        return ContactMode(contact, bool(law % 2), others).closed
+
+    @property
+    def latch_sets(self) -> set[frozenset[str]]:
+        """The sets of latches that are closed together; empty without latches."""
+        return {self.closed_by(law) for law in range(2 * len(self.pairs)) if self.latches}
+
     def ends_in_contact(self, place: int) -> bool:
         """Whether a phase that succeeds ends in contact."""
         ends = self.phases[place].ends_in_contact
@@ -183,6 +196,23 @@ class PhasePlan:
         return self._names.index(word) if word in self._names else None
 
     # The checks.
+
+    def _check_latches(self) -> None:
+        """Refuses phases that do not fit their contact."""
+        for place, phase in enumerate(self.phases):
+            name = self.modes[place].contact
+            text = ""
+            if self.latches and not name:
+                text = f"contact: needed, since later phases name {', '.join(self.latches)}"
+            elif name and not phase.for_latch:
+                text = f"it is not for the latch '{name}', but for a contact that pushes"
+            elif not name and not phase.for_contact:
+                text = "contact: needed, the name of a latch"
+            words = {phase.chosen(outcome) for outcome in OUTCOMES} | {phase.if_spent}
+            if name and LEAVE in words:
+                text = "leave does not say which latch to open; name a Release"
+            if text:
+                raise ModelError(f"{self.where(place)}: {text}")
 
     def _all_from(self, place: int) -> list[tuple[str, int]]:
         """The key words and phases that may follow a phase, each checked."""
@@ -221,13 +251,18 @@ class PhasePlan:
         is_next = to == place + 1 and outcome == "success" and key == "on_success"
         way = "" if is_next else f", after {self.phases[place].name} by {key}"
         begins, ends = self.contacts[to], self.ends_in_contact(to)
-        if outcome == "lost" and begins and ends:
+        in_contact = self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
+        closed = replace(self.modes[place], is_closed=in_contact).closed
+        if self.latches and closed != (needs := self.modes[to].closed):
+            has, wants = (", ".join(sorted(names)) or "none" for names in (closed, needs))
+            text = f"it begins with these latches closed: {wants}; but then closed: {has}"
+        elif self.latches:
+            text = ""
+        elif outcome == "lost" and begins and ends:
             text = "it begins in contact, but the contact is lost; choose another one by if_lost"
-        elif begins and not (
-            self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
-        ):
+        elif begins and not in_contact:
             text = "it begins in contact, but the robot is free; an Approach must lead there"
-        elif outcome == "success" and not begins and self.ends_in_contact(place):
+        elif outcome == "success" and not begins and in_contact:
             text = "it begins with a free robot, but it is in contact; a Release must lead there"
         if text:
             raise ModelError(f"phase {to + 1} of the task, {after.name}{way}: {text}")
