@@ -86,6 +86,7 @@ class TaskPlanner:
             outputs in m including the distance, then their derivatives. Of several distances it has
             the mean.
         moved: The number of these outputs.
+        controls: The index of the control that each phase measures; None for none.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -99,6 +100,7 @@ class TaskPlanner:
         pairs = list(enumerate(task.contacts[:-1]))
         self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
         self.rates = [_rates(task, index, laws[closed], contact, closed) for index, closed in pairs]
+        self.controls = [_measured_control(task, index, laws[CONTACT]) for index, _ in pairs]
         self._nothing = [_no_goals(law) for law in laws]
         free = laws[FREE]
         chains = free.structure.output_chains
@@ -281,6 +283,16 @@ def _rates(
     if not closed:
         rates[contact.others] = rates[contact.main]
     return rates
+
+
+def _measured_control(task: Task, index: int, law: TrackingLaw) -> int | None:
+    """The index of the control that a phase measures; None for none."""
+    name = task.plan.phases[index].measured_control
+    names = [signal.name for signal in law.system.control_signals]
+    if name and name not in names:
+        text = unknown_name("control", name, names)
+        raise ModelError(f"{task.plan.where(index)}: {text}")
+    return names.index(name) if name else None
 
 
 def _no_goals(law: TrackingLaw) -> PhaseReferences:

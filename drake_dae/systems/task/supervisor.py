@@ -40,7 +40,7 @@ class TaskSupervisor(LeafSystem):
 
     Input ports:
         estimated_state, measured_force, hold, signal_<name>: As of `TaskController`.
-        control: u, shape (p,); only if a guard watches it.
+        control: u, shape (p,); only if a guard watches it, or a phase measures a control.
         exogenous: As of the laws; only for exogenous signals that are not an observer's. Without
             a wire these keep the values of the parameters.
 
@@ -173,8 +173,11 @@ class TaskSupervisor(LeafSystem):
         wanted = [contact.main] if change.in_contact else list(contact.places)
         desired = np.mean(segment.reference(time)[segment.layout.lowest[wanted]])
         port, signal = self._control_port, 0.0
-        control = 0.0 if port is None else float(np.abs(port.Eval(context)).max())
+        controls = np.zeros(1) if port is None else np.abs(port.Eval(context))
+        torque = 0.0
         if not self._is_over(segment):
+            place = self._plan.controls[change.place]
+            torque = 0.0 if place is None else float(controls[place])
             name = self._phases[change.place].signal
             if name and self.signal_ports[name].HasValue(context):
                 signal = float(self.signal_ports[name].Eval(context)[0])
@@ -188,9 +191,10 @@ class TaskSupervisor(LeafSystem):
             speed=float(np.linalg.norm(rates)),
             travel=float(np.linalg.norm(moved - segment.origin)),
             work=self._traced.work_of(context.get_discrete_state(self._held).value()),
-            control=control,
+            control=float(controls.max()),
             eccentricity=float(eccentricity(forces, self.task.contact_force)),
             signal=signal,
+            torque=torque,
         )
 
     def _filtered(self, context: Context) -> FloatArray:

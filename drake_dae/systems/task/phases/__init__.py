@@ -5,6 +5,7 @@ from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.insert import Insert
 from drake_dae.systems.task.phases.members import Approach, Dwell, Move, Press, Release, Retreat
 from drake_dae.systems.task.phases.phase import Moment, Outcome, Phase
+from drake_dae.systems.task.phases.screw import Screw
 from drake_dae.systems.task.phases.search import Search
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Press",
     "Release",
     "Retreat",
+    "Screw",
     "Search",
     "Wait",
 ]
