@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Touch
+from drake_dae.robots.constraints.constraint import Application
 from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.links.kinematics import Frames, Kinematics, position_index
 
@@ -72,5 +72,5 @@ class ScrewHead(PointOnSurface):
         turning = Application(axis.point, *torque, axis.child, axis.parent)
         return (*super().applications(kinematics), turning)
 
-    def touch(self, frames: Frames) -> Touch | None:
-        return None
+    def touch(self, frames: Frames) -> None:  # type: ignore[override]
+        """None: the free side moves with the joint, which compliant contacts do not know."""

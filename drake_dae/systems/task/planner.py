@@ -86,7 +86,7 @@ class TaskPlanner:
             outputs in m including the distance, then their derivatives. Of several distances it has
             the mean.
         moved: The number of these outputs.
-        controls: The index of the control that each phase measures; None for none.
+        controls: The index of the control that each phase measures, None for none; last None.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -100,7 +100,8 @@ class TaskPlanner:
         pairs = list(enumerate(task.contacts[:-1]))
         self.goals = [_goals(task, index, laws[closed], contact, closed) for index, closed in pairs]
         self.rates = [_rates(task, index, laws[closed], contact, closed) for index, closed in pairs]
-        self.controls = [_measured_control(task, index, laws[CONTACT]) for index, _ in pairs]
+        measured = [_measured_control(task, index, laws[CONTACT]) for index, _ in pairs]
+        self.controls = [*measured, None]
         self._nothing = [_no_goals(law) for law in laws]
         free = laws[FREE]
         chains = free.structure.output_chains

@@ -170,14 +170,12 @@ class TaskSupervisor(LeafSystem):
         time, change = context.get_time(), segment.change
         distance, rate, moved, rates = self._plan.motion(self._now(context))
         contact, forces = self._contact, self._traced.forces(self._filtered(context))
-        wanted = [contact.main] if change.in_contact else list(contact.places)
-        desired = np.mean(segment.reference(time)[segment.layout.lowest[wanted]])
-        port, signal = self._control_port, 0.0
+        places = segment.layout.lowest[
+            [contact.main] if change.in_contact else list(contact.places)
+        ]
+        port, signal, measured = self._control_port, 0.0, self._plan.controls[change.place]
         controls = np.zeros(1) if port is None else np.abs(port.Eval(context))
-        torque = 0.0
         if not self._is_over(segment):
-            place = self._plan.controls[change.place]
-            torque = 0.0 if place is None else float(controls[place])
             name = self._phases[change.place].signal
             if name and self.signal_ports[name].HasValue(context):
                 signal = float(self.signal_ports[name].Eval(context)[0])
@@ -186,7 +184,7 @@ class TaskSupervisor(LeafSystem):
             force=sum(forces),
             distance=distance,
             rate=rate,
-            wanted=float(desired),
+            wanted=float(np.mean(segment.reference(time)[places])),
             away=distance - change.distance,
             speed=float(np.linalg.norm(rates)),
             travel=float(np.linalg.norm(moved - segment.origin)),
@@ -194,7 +192,7 @@ class TaskSupervisor(LeafSystem):
             control=float(controls.max()),
             eccentricity=float(eccentricity(forces, self.task.contact_force)),
             signal=signal,
-            torque=torque,
+            torque=0.0 if measured is None else float(controls[measured]),
         )
 
     def _filtered(self, context: Context) -> FloatArray:
