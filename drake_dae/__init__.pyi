@@ -80,6 +80,7 @@ from .robots.constraints.points import PointOnSurface as PointOnSurface
 from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel
+from .robots.constraints.screws import ScrewHead as ScrewHead
 from .robots.constraints.welds import WeldedFrames as WeldedFrames
 from .robots.force_outputs import FaceForces as FaceForces
 from .robots.force_outputs import ForceCombination as ForceCombination
@@ -201,6 +202,7 @@ from .systems.task.phases import PhaseGuard as PhaseGuard
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
+from .systems.task.phases import Screw as Screw
 from .systems.task.phases import Search as Search
 from .systems.task.phases import Wait as Wait
 from .systems.task.task import Task as Task

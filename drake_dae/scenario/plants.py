@@ -182,7 +182,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 
     @property
     def rolled(self) -> ScenarioPlant:
-        if self.contact_model != "point" or self.pegs:
+        if self.contact_model != "point":
             return self
         return CompliantContact(**{f.name: getattr(self, f.name) for f in fields(PointMaterial)})
 

@@ -55,8 +55,10 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
 def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
     """The plain data of a scenario with a plant that rollouts support, as for `for_rollout`."""
     kind = plant_kind(data["plant"])
+    own = {key: value for key, value in data["plant"].items() if key != TAG}
+    pegs = own.pop("pegs", ())  # Still data.
     try:
-        plant = kind(**{key: value for key, value in data["plant"].items() if key != TAG})
+        plant = kind(**own)
     except (ModelError, TypeError):
         return data  # The reader of the data reports it.
     if (rolled := plant.rolled) is plant:
@@ -65,7 +67,7 @@ def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
     viscous = _without_viscous(c["name"] for c in data["constraints"] if c.get("viscous_friction"))
     return {
         **data,
-        "plant": {TAG: f"!{type(rolled).__name__}", **numbers},
+        "plant": {TAG: f"!{type(rolled).__name__}", **numbers, "pegs": pegs},
         "plant_parameters": {**data["plant_parameters"], **viscous},
     }
 

@@ -54,7 +54,8 @@ Constraint = Annotated[
     | contact.AxisNormalToSurface
     | contact.Blade
     | contact.RollingWheel
-    | contact.RollingBall,
+    | contact.RollingBall
+    | contact.ScrewHead,
     Choice({**_WRITTEN, surface.Surface: Surface}),
 ]
 Output = Annotated[
@@ -131,6 +132,7 @@ Phase = Annotated[
     | phases.GuardedMove
     | phases.Search
     | phases.Insert
+    | phases.Screw
     | phases.Release
     | phases.Retreat
     | phases.Close,

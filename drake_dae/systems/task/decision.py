@@ -123,10 +123,9 @@ def moment_of(
     forces: Sequence[float],
     contact_force: float,
     work: float,
-    control: float,
     signal: float,
 ) -> Moment:
-    """The measurements that decide when the phase of a segment ends.
+    """The measurements that decide when the phase of a segment ends, without those of controls.
 
     Args:
         segment: The current references.
@@ -135,7 +134,7 @@ def moment_of(
         motion: As of `TaskPlanner.motion`.
         forces: The measured forces of the contact.
         contact_force: Forces below this, in N, count as zero.
-        work, control, signal: As of `Moment`.
+        work, signal: As of `Moment`.
     """
     (distance, rate, moved, rates), change = motion, segment.change
     wanted = [contact.main] if change.in_contact else list(contact.places)
@@ -149,7 +148,6 @@ def moment_of(
         speed=float(np.linalg.norm(rates)),
         travel=float(np.linalg.norm(moved - segment.origin)),
         work=work,
-        control=control,
         eccentricity=float(eccentricity(forces, contact_force)),
         signal=signal,
     )

@@ -83,6 +83,7 @@ class TaskPlanner:
             model, then all outputs in m including the distance, then their derivatives. Of several
             distances it has the mean, and of a latch the largest one.
         moved: The number of these outputs.
+        controls: The index of the control that each phase measures, None for none; last None.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
@@ -92,12 +93,14 @@ class TaskPlanner:
         self._task, self._pairs = task, pairs
         self._laws = [law for pair in pairs for law in pair.laws]
         self._phases = task.plan.phases
-        self.goals, self.rates = [], []
+        self.goals, self.rates, self.controls = [], [], list[int | None]()
         for index in range(len(self._phases)):
             number = task.plan.law_of(index)
             contact, closed = pairs[number // 2].contact, number % 2 == CONTACT
             self.goals.append(_goals(task, index, self._laws[number], contact, closed))
             self.rates.append(_rates(task, index, self._laws[number], contact, closed))
+            self.controls.append(_measured_control(task, index, self._laws[number]))
+        self.controls.append(None)
         self._nothing = [_no_goals(law) for law in self._laws]
         self.motion_functions, self.moved = [], 0
         for pair in pairs:
@@ -309,6 +312,16 @@ def _rates(
     if not closed:
         rates[contact.others] = rates[contact.main]
     return rates
+
+
+def _measured_control(task: Task, index: int, law: TrackingLaw) -> int | None:
+    """The index of the control that a phase measures; None for none."""
+    name = task.plan.phases[index].measured_control
+    names = [signal.name for signal in law.system.control_signals]
+    if name and name not in names:
+        text = unknown_name("control", name, names)
+        raise ModelError(f"{task.plan.where(index)}: {text}")
+    return names.index(name) if name else None
 
 
 def _no_goals(law: TrackingLaw) -> PhaseReferences:

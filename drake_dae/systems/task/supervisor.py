@@ -1,6 +1,7 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -40,7 +41,7 @@ class TaskSupervisor(LeafSystem):
 
     Input ports:
         estimated_state, measured_force, hold, signal_<name>: As of `TaskController`.
-        control: u, shape (p,); only if a guard watches it.
+        control: u, shape (p,); only if a guard watches it, or a phase measures a control.
         exogenous: As of the laws; only for exogenous signals that are not an observer's. Without
             a wire these keep the values of the parameters.
 
@@ -174,18 +175,20 @@ class TaskSupervisor(LeafSystem):
     # The end of a phase.
 
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
-        port, control, signal = self._control_port, 0.0, 0.0
-        if port is not None:
-            control = float(np.abs(port.Eval(context)).max())
+        port, signal, place = self._control_port, 0.0, segment.change.place
+        controls = np.zeros(1) if port is None else np.abs(port.Eval(context))
         if not self._is_over(segment):
-            name = self._phases[segment.change.place].signal
+            name = self._phases[place].signal
             if name and self.signal_ports[name].HasValue(context):
                 signal = float(self.signal_ports[name].Eval(context)[0])
         work = self._traced.work_of(context.get_discrete_state(self._held).value())
         forces = self._traced.filter.forces(self._filtered(context), segment.law)
         contact, least = self._pairs[segment.law // 2].contact, self.task.contact_force
         motion, time = self._plan.motion(self._now(context), segment.law), context.get_time()
-        return moment_of(segment, contact, time, motion, forces, least, work, control, signal)
+        moment = moment_of(segment, contact, time, motion, forces, least, work, signal)
+        measured = self._plan.controls[place]
+        torque = 0.0 if measured is None else float(controls[measured])
+        return replace(moment, control=float(controls.max()), torque=torque)
 
     def _filtered(self, context: Context) -> FloatArray:
         """The state of the force filter after the present sample; see `TracedTask`."""

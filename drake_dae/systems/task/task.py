@@ -125,7 +125,9 @@ class Task:
         return tuple(dict.fromkeys(phase.signal for phase in self.phases if phase.signal))
 
     def watches(self, of: Watched) -> bool:
-        """Whether a guard of a phase watches this quantity."""
+        """Whether a guard of a phase watches this quantity, or a phase itself a control."""
+        if of == "control" and any(phase.measured_control for phase in self.phases):
+            return True
         return any(guard.of == of for phase in self.phases for guard in phase.guards)
 
     def __repr__(self) -> str:

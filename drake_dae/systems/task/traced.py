@@ -102,6 +102,7 @@ class TracedTask:
         self._faded = ca.reshape(fade, *self._shape)
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
+        self._control = ca.SX.sym("control", laws[FREE].system.num_controls)
         self._filter_places = slice(ends[0], ends[1])
         self._filtered = self.filter.after(before, self._forces)
         self._filter_function = ca.Function("filter", [before, self._forces], [self._filtered])
@@ -269,8 +270,8 @@ class TracedTask:
         inputs = [self._time, self._held, x, self._forces, parameters]
         sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
         if self.task.watches("control"):
-            u = ca.SX.sym("control", law.system.num_controls)
-            inputs, sources, control = [*inputs, u], [*sources, "control"], ca.norm_inf(u)
+            inputs, sources = [*inputs, self._control], [*sources, "control"]
+            control = ca.norm_inf(self._control)
         moment = Moment(
             self._time - named["start"],
             self._force,
@@ -325,6 +326,8 @@ class TracedTask:
         def margins(index: int) -> ca.SX:
             phase = self._phases[index]
             now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
+            if (measured := self._plan.controls[index]) is not None:
+                now = replace(now, torque=ca.fabs(self._control[measured]))
             end, late = self._ends(phase, now)
             guards = [ca.fmin(margin, 1e9) for margin in self.tally.margins(phase, counts, now)]
             if self.filter.tares:

@@ -34,6 +34,8 @@ PURE = {
     ("!HeightMap", "normal"),
     ("!MeshSurface", "normal"),
     ("!PointOnSurface", "friction"),
+    ("!ScrewHead", "friction"),
+    ("!Screw", "turns"),
     ("!Press", "eccentricity"),
     ("!JointCoupler", "ratio"),
     ("!AxisNormalToSurface", "axis"),

@@ -18,6 +18,7 @@ from drake_dae import (
     Press,
     Release,
     Retreat,
+    Screw,
     Search,
     Wait,
 )
@@ -76,6 +77,16 @@ MEMBERS = {
         Insert(0.02, lag=0.005),
         Moment(1.0, 2.0, -0.015, -0.01, -0.019),
         Moment(2.0, 2.0, -0.0201, -0.01, -0.022),
+    ),
+    "Screw": (
+        Screw("joint7", 0.001, 2.0, speed=6.0),
+        Moment(1.0, 20.0, -0.0007, -0.001, 20.0, away=-0.0006),
+        Moment(5.0, 20.0, -0.002, 0.0, 20.0, away=-0.002),
+    ),
+    "Screw until it is tight": (
+        Screw("joint7", 0.001, -2.0, "joint7", 0.8, speed=6.0),
+        Moment(1.0, 20.0, -0.0007, -0.001, 20.0, away=-0.0006, torque=0.7),
+        Moment(1.0, 20.0, -0.0007, -0.001, 20.0, away=-0.0006, torque=0.81),
     ),
     "Rise": (Rise(0.5), Moment(0.4, 0.0, 0.1, 0.0, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
     "Release": (Release(), Moment(0.3, 3.0, 0.0, 0.0, 3.0), Moment(0.5, 0.4, 0.0, 0.0, 0.3)),

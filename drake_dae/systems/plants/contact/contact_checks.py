@@ -11,7 +11,7 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 
 
 def check_model(model: RobotModel, material: ContactMaterial) -> None:
@@ -45,8 +45,18 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
                 f"hydroelastic contact needs a Plane or a Sphere as surface of "
                 f"'{constraint.name}'; use point contact (contact_model: point)"
             )
+    check_pegs(model, material)
+
+
+def check_pegs(model: RobotModel, material: PointMaterial) -> None:
+    """Refuses a peg whose constraint the robot does not have.
+
+    Raises:
+        ModelError: It has none; the message has the name.
+    """
+    names = [constraint.name for constraint in model.constraints]
     for peg in material.pegs:
-        if peg.constraint not in (names := [constraint.name for constraint in model.constraints]):
+        if peg.constraint not in names:
             raise ModelError(f"pegs: {unknown_name('constraint', peg.constraint, names)}")
 
 

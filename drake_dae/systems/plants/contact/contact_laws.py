@@ -98,7 +98,12 @@ def contact_step(
     "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
     solves for v_c to round-off by a primal-dual Newton's method: since p = v_t / |v_t|_s are
     separate unknowns, it also converges if the sliding direction turns (Chan, Golub and Mulet
-    1999). Only the last step is differentiated, with the velocity before it and the matrix as
+    1999). For n velocities of joints it solves n equations if these are fewer than the 3 k of the
+    contacts: with the slope G of the impulses and W = J A^-1 J^T
+
+        (1 - W G)^-1 = 1 + J (A - J^T G J)^-1 J^T G.
+
+    Only the last step is differentiated, with the velocity before it and the matrix as
     constants: by the implicit function theorem, first derivatives are then those of the solution,
     at a third of the operations.
 
@@ -114,7 +119,8 @@ def contact_step(
     factored = PositiveDefiniteFactorization(mass)
     jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
     response = factored.solve(jacobian.T)
-    delassus = ca.mtimes(jacobian, response)
+    is_reduced = 3 * count > v.numel()
+    delassus = None if is_reduced else ca.mtimes(jacobian, response)
     surface = ca.vertcat(*(contact.velocity for contact in contacts))
     before = ca.mtimes(jacobian, v) - surface
     target = ca.mtimes(jacobian, free) - surface
@@ -128,16 +134,27 @@ def contact_step(
         return ca.vertcat(*(law.impulse(velocity[p]) for p, law in laws))
 
     def residual(velocity: ca.SX) -> ca.SX:
-        return velocity - target - ca.mtimes(delassus, impulses(velocity))
+        gamma = impulses(velocity)
+        moved = ca.mtimes(response, gamma)
+        changed = ca.mtimes(jacobian, moved) if is_reduced else ca.mtimes(delassus, gamma)
+        return velocity - target - changed
 
     velocity = before
     shares = ca.vertcat(*(law.share(before[p]) for p, law in laws))
     for remaining in reversed(range(ITERATIONS)):
         slope = ca.diagcat(*(law.slope(velocity[p], shares[p]) for p, law in laws))
-        matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
+        if is_reduced:
+            matrix = mass - ca.mtimes([jacobian.T, slope, jacobian])
+        else:
+            matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
         if not remaining:
-            velocity, matrix = as_constant(velocity), as_constant(matrix)
-        change = -Factorization(matrix).solve(residual(velocity))
+            velocity, matrix, slope = map(as_constant, (velocity, matrix, slope))
+        change = -residual(velocity)
+        if is_reduced:
+            pushed = ca.mtimes([jacobian.T, slope, change])
+            change += ca.mtimes(jacobian, Factorization(matrix).solve(pushed))
+        else:
+            change = Factorization(matrix).solve(change)
         moved = [law.next_share(velocity[p], shares[p], change[p]) for p, law in laws]
         velocity, shares = velocity + change, ca.vertcat(*moved)
     slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))

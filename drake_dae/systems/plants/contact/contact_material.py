@@ -26,63 +26,6 @@ FRICTION = Signal("plant.friction")
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class PointMaterial:
-    """The point contact of a robot's balls with surfaces.
-
-    If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
-    distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
-    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
-    stiffer contact. A tool that stays normal to its surface does not roll.
-
-    Attributes:
-        time_step: The step of the plant in s; 0 for a continuous plant.
-        stiffness: The stiffness of point contact, N/m.
-        dissipation: The Hunt-Crossley dissipation, s/m.
-        friction: The coefficient of friction of all contacts; None for those of the constraints.
-        stiction_tolerance: v_s of Drake's regularized friction, m/s.
-        radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
-            constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
-            radius.
-
-    Raises:
-        ModelError: A number is not valid.
-    """
-
-    time_step: float = 1e-3
-    stiffness: float = 1e5
-    dissipation: float = 0.0
-    friction: float | None = None
-    stiction_tolerance: float = 1e-4
-    radius: float = 0.01
-
-    def __post_init__(self) -> None:
-        for name in ("stiffness", "stiction_tolerance", "radius"):
-            positive(name, getattr(self, name))
-        for name in ("time_step", "dissipation", "friction"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0.0:
-                raise ModelError(f"{name} must be 0 or more, got {value:g}")
-
-    def stiffness_at(self, force: float) -> float:
-        """The slope of the normal force over depth, in N/m, at a normal force in N."""
-        return self.stiffness
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """Names and units of `values`, named by the keys of a scenario's `plant`."""
-        named = {"stiffness": "N/m", "dissipation": "s/m"}
-        first = (Signal(f"plant.{name}", unit) for name, unit in named.items())
-        return (*first, FRICTION, Signal("plant.radius", "m"))
-
-    @property
-    def values(self) -> FloatArray:
-        """The numbers that are parameters of a `CompliantPlant`: k, d, mu and the radius."""
-        friction = 0.0 if self.friction is None else self.friction
-        return np.array([self.stiffness, self.dissipation, friction, self.radius])
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
 class Peg:
     """A round peg at a contact: rings of balls around an axis of the frame of its constraint.
 
@@ -134,11 +77,81 @@ class Peg:
                 f"a peg with a radius of {self.radius:g} m and a length of {self.length:g} m has "
                 f"no room for balls with a radius of {radius:g} m"
             )
+        hull, inward = self.shape
+        return hull + radius * inward
+
+    @property
+    def shape(self) -> tuple[FloatArray, FloatArray]:
+        """P and D of its balls, shapes (k, 3): with a radius r they have the centers P + r D."""
         angles = 2.0 * np.pi * np.arange(self.balls) / self.balls
-        ring = (self.radius - radius) * np.column_stack([np.cos(angles), np.sin(angles)])
-        heights = np.linspace(radius, self.length - radius, self.rings)
-        centers = np.vstack([np.insert(ring, 2, -height, axis=1) for height in heights])
-        return np.asarray(centers @ axes_along(self.axis).T)
+        ring = np.column_stack([np.cos(angles), np.sin(angles)])
+        behind = np.linspace(0.0, 1.0, self.rings)
+        hull = [np.insert(self.radius * ring, 2, -self.length * part, axis=1) for part in behind]
+        inward = [np.insert(-ring, 2, 2.0 * part - 1.0, axis=1) for part in behind]
+        axes = axes_along(self.axis).T
+        return np.vstack(hull) @ axes, np.vstack(inward) @ axes
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class PointMaterial:
+    """The point contact of a robot's balls with surfaces.
+
+    If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
+    distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
+    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
+    stiffer contact. A tool that stays normal to its surface does not roll.
+
+    Attributes:
+        time_step: The step of the plant in s; 0 for a continuous plant.
+        stiffness: The stiffness of point contact, N/m.
+        dissipation: The Hunt-Crossley dissipation, s/m.
+        friction: The coefficient of friction of all contacts; None for those of the constraints.
+        stiction_tolerance: v_s of Drake's regularized friction, m/s.
+        radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
+            constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
+            radius.
+        pegs: The pegs with which the robot touches at some constraints, in place of a ball.
+
+    Raises:
+        ModelError: A number is not valid.
+    """
+
+    time_step: float = 1e-3
+    stiffness: float = 1e5
+    dissipation: float = 0.0
+    friction: float | None = None
+    stiction_tolerance: float = 1e-4
+    radius: float = 0.01
+    pegs: Sequence[Peg] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "stiction_tolerance", "radius"):
+            positive(name, getattr(self, name))
+        for name in ("time_step", "dissipation", "friction"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0.0:
+                raise ModelError(f"{name} must be 0 or more, got {value:g}")
+        object.__setattr__(self, "pegs", tuple(self.pegs))
+        for peg in self.pegs:
+            peg.centers(self.radius)
+
+    def stiffness_at(self, force: float) -> float:
+        """The slope of the normal force over depth, in N/m, at a normal force in N."""
+        return self.stiffness
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of `values`, named by the keys of a scenario's `plant`."""
+        named = {"stiffness": "N/m", "dissipation": "s/m"}
+        first = (Signal(f"plant.{name}", unit) for name, unit in named.items())
+        return (*first, FRICTION, Signal("plant.radius", "m"))
+
+    @property
+    def values(self) -> FloatArray:
+        """The numbers that are parameters of a `CompliantPlant`: k, d, mu and the radius."""
+        friction = 0.0 if self.friction is None else self.friction
+        return np.array([self.stiffness, self.dissipation, friction, self.radius])
 
 
 @checked(ModelError)
@@ -156,7 +169,6 @@ class ContactMaterial(PointMaterial):
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer, m; hydroelastic contact only.
-        pegs: The pegs with which the robot touches at some constraints, in place of a ball.
 
     Raises:
         ModelError: A number is not valid.
@@ -165,15 +177,11 @@ class ContactMaterial(PointMaterial):
     contact_model: Literal["point", "hydroelastic"] = "point"
     modulus: float = 1e7
     thickness: float = 0.01
-    pegs: Sequence[Peg] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("time_step", "modulus", "thickness"):
             positive(name, getattr(self, name))
-        object.__setattr__(self, "pegs", tuple(self.pegs))
-        for peg in self.pegs:
-            peg.centers(self.radius)
 
     def stiffness_at(self, force: float) -> float:
         """The slope of the normal force over depth, in N/m, at a normal force in N.

@@ -13,6 +13,7 @@ from drake_dae.systems.task.phases.members import (
     Retreat,
 )
 from drake_dae.systems.task.phases.phase import Moment, Outcome, Phase
+from drake_dae.systems.task.phases.screw import Screw
 from drake_dae.systems.task.phases.search import Search
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "Press",
     "Release",
     "Retreat",
+    "Screw",
     "Search",
     "Wait",
 ]

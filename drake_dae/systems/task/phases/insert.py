@@ -20,14 +20,15 @@ class Insert(Phase):
 
         e_i'' + a_i1 e_i' + a_i0 e_i = (P M^-1 J^T)_i F
 
-    with the gains a of the free law, `task.gains` in a scenario. An output with both poles at -p is
-    a spring of m p^2 and a damper of 2 m p at the point of the tool, where m is the mass that it
-    feels there. So the phase needs soft gains along and about the surface, and no observer of
-    disturbances, which would cancel what the hole exerts.
+    with the gains a of the free law, `task.gains` in a scenario. An output with the poles -p and -s
+    is a spring of m p s and a damper of m (p + s) at the point of the tool, where m is the mass
+    that it feels there. So the phase needs soft gains along and about the surface, and no observer
+    of disturbances, which would cancel what the hole exerts. A slow and a fast pole along the
+    surface let the hole move the tool without a force that remains, and damp it.
 
     The phase fails if the distance falls behind its reference by more than `lag`, as where the tool
     jams, or sits on the face beside the hole. The push along the hole is then at most m (p^2 lag +
-    2 p speed).
+    2 p speed), with both poles of the distance at -p.
 
     Attributes:
         depth: The depth of the tool below the surface of the model at which it ends, in m.

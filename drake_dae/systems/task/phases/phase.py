@@ -46,6 +46,7 @@ class Moment:
         speed, travel, work, control, eccentricity: See `PhaseGuard`; work and control only if a
             guard watches them.
         signal: The signal that the phase waits for; 0 without one.
+        torque: The magnitude of the control `Phase.measured_control`; 0 without one.
     """
 
     time: float
@@ -60,6 +61,7 @@ class Moment:
     control: float = 0.0
     eccentricity: float = 0.0
     signal: float = 0.0
+    torque: float = 0.0
 
 
 @checked(ModelError)
@@ -160,6 +162,11 @@ class Phase(ABC):
     @property
     def signal(self) -> str:
         """The name of the signal that it waits for; empty for none."""
+        return ""
+
+    @property
+    def measured_control(self) -> str:
+        """The name of the control whose magnitude is `Moment.torque`; empty for none."""
         return ""
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pydrake.systems.analysis import Simulator
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario
+from drake_dae import CompliantPlant, PointMaterial, build_scenario
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
@@ -113,3 +114,50 @@ def test_a_tool_leaves_the_edge_of_a_plate_alike_on_both_compliant_plants():
     assert by_drake["constraint_residual"][-1, 0] < -0.001
     assert_allclose(rolled["constraint_force"][:, 0], forces, atol=2e-3)
     assert_allclose(rolled["state"], by_drake["state"], atol=1e-5)
+
+
+EIGHT = "[{constraint: wall, radius: 0.005, length: 0.02, rings: 2, balls: 4}]"
+"""Eight balls press with more forces than the robot has joints."""
+
+
+@pytest.fixture(scope="module")
+def plants():
+    """Drake's plant and the traced one, on a plane."""
+    plant = f"plant=!MultibodyPlant {{radius: 0.001, friction: 0.3, pegs: {EIGHT}}}"
+    loop = build_completed(scenario("wall_point_contact", plant))[1]
+    pegs = [Peg("wall", 0.005, 0.02, rings=2, balls=4)]
+    material = PointMaterial(radius=0.001, friction=0.3, pegs=pegs)
+    return loop.plant, CompliantPlant(loop.plant.robot("peg"), material)
+
+
+def stepped(plant, state, control):
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, state)
+    plant.GetInputPort("control").FixValue(context, control)
+    Simulator(plant, context).AdvanceTo(0.5e-3)
+    return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
+
+
+def test_a_step_of_a_peg_is_that_of_drakes_contact(plants):
+    """Drake's solver stops at a relative residual of 1e-6; ours solves 24 equations as seven."""
+    drakes, traced = plants
+    random, size = np.random.default_rng(4), 7
+    at_rest = traced.structure.manifold.project(traced.dae.nominal_state)
+    pressed = 0
+    for _ in range(30):
+        speed = random.choice([1e-3, 0.1])
+        state = at_rest + np.concatenate([random.normal(0, 2e-4, 7), random.normal(0, speed, 7)])
+        control = random.normal(0.0, 20.0, 7)
+        (found, force), (wanted, theirs) = (
+            stepped(plant, state, control) for plant in (traced, drakes)
+        )
+        moved = np.abs(wanted[size:] - state[size:]).max()
+        assert_allclose(found[size:], wanted[size:], rtol=0.0, atol=1e-5 * moved)
+        assert_allclose(force, theirs, rtol=0.0, atol=1e-4 * max(1.0, np.abs(theirs).max()))
+        pressed += bool(force.any())
+    assert 8 < pressed < 30
+
+
+def test_a_traced_peg_needs_its_constraint(plants):
+    with pytest.raises(ModelError, match=r"pegs: .*'hole'.*wall"):
+        CompliantPlant(plants[0].robot("peg"), PointMaterial(pegs=[Peg("hole", 0.02, 0.1)]))
