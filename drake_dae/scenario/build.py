@@ -82,6 +82,10 @@ def build_completed(
     chosen = advised(completed.scenario, model, structure)
     in_time, motion = timed(chosen.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *in_time.notes)
+    if (bound := in_time.scenario.error_bound) is not None:
+        with at("error_bound"):
+            bound.places(model.dae.output_signals)
+        notes = (*notes, str(bound))
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(
         completed.scenario,
