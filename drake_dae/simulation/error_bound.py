@@ -35,7 +35,8 @@ class BoundedOutput:
     def __str__(self) -> str:
         name, unit = self.signal.name, f" {self.signal.unit}".rstrip()
         if self.exceeded is None:
-            return f"{name} reaches {self.largest / self.bound:.0%} of its bound of {self.bound:.3g}{unit}"
+            used = f"{self.largest / self.bound:.0%}"
+            return f"{name} reaches {used} of its bound of {self.bound:.3g}{unit}"
         return (
             f"the error of {name} exceeds its bound of {self.bound:.3g}{unit} from "
             f"{self.exceeded:.4g} s on, by up to {self.largest - self.bound:.2g}{unit} at "

@@ -62,5 +62,5 @@ def test_a_bound_checks_its_numbers(outputs, text):
 
 
 def test_a_bound_of_an_unknown_output_is_refused():
-    with pytest.raises(ModelError, match="no output 'tool.q'"):
+    with pytest.raises(ModelError, match=r"no output 'tool\.q'"):
         ErrorBound({"tool.q": 1.0}).check(record(TIME))

@@ -93,7 +93,7 @@ def test_a_run_that_fails_leaves_no_bound_and_its_cause_is_named():
         ({START: [0.1]}, {}, ModelError, "no number varies"),
         ({START: (0.0, 0.1)}, {"after": 1.0}, ModelError, "less than the duration of 1 s, got 1 s"),
         ({START: (0.0, 0.1)}, {"corners": 4}, ModelError, "corners"),
-        ({"start.errors.tool.q": (0.0, 0.1)}, {}, ScenarioError, "no output 'tool.q'"),
+        ({"start.errors.tool.q": (0.0, 0.1)}, {}, ScenarioError, r"no output 'tool\.q'"),
         ({START: (0.1, 0.0)}, {}, ScenarioError, "empty"),
     ],
 )
