@@ -53,7 +53,6 @@ class Arm:
         tilt: The largest tilt of the table about two axes, in rad.
         payload: The largest payload, in kg.
         friction: The largest Coulomb friction of a joint relative to its effort limit.
-        encoders: The encoders at a sample time of 1 ms.
     """
 
     file: str
@@ -62,27 +61,30 @@ class Arm:
     tilt: float = 0.087
     payload: float = 0.5
     friction: float = 0.02
-    encoders: str = "{{resolution: 1.0e-5, velocity_bandwidth: {bandwidth}}}"
 
 
 LIGHT: dict[str, Any] = {"push": 10.0, "tilt": 0.035, "payload": 0.25, "friction": 0.007}
 """What is declared for lighter arms."""
 
-NOISY = "{{position_noise: 5.0e-6, velocity_noise: 0.001}}"
 ARMS = {
     "ur5": Arm("ur_description/urdf/ur5_robot.urdf", ("upper_arm_link", "forearm_link")),
     "panda": Arm("panda_description/urdf/panda.urdf", ("panda_link4", "panda_link3"), **LIGHT),
     "kinova": Arm(
         "kinova_description/robots/kinova.urdf", ("j2s6s200_link_2", "j2s6s200_link_3"), **LIGHT
     ),
-    "xarm7": Arm("xarm_description/urdf/xarm7.urdf", ("link2", "link4"), **LIGHT, encoders=NOISY),
+    "xarm7": Arm("xarm_description/urdf/xarm7.urdf", ("link2", "link4"), **LIGHT),
 }
 STIFFNESSES = {
     "soft": (1e4, 1e5, 1e-3),
+    "firm": (3e4, 1e5, 1e-3),
     "hard": (1e5, 6e5, 5e-4),
     "steel": (6e5, 3e6, 2.5e-4),
 }
 """The stiffness of the contact from, to, in N/m, and the sample time in s that the latter needs."""
+
+
+USUAL = ["ur5-soft", "panda-firm", "xarm7-firm", "kinova-firm"]
+"""The classes that run if none is named."""
 
 
 def scenario_of(arm: Arm, stiffness: float, period: float, folder: Path) -> Scenario:
@@ -93,7 +95,6 @@ def scenario_of(arm: Arm, stiffness: float, period: float, folder: Path) -> Scen
     frame = nominal.constraints[0].frame
     joints = ", ".join(nominal.start.positions)
     half = period / 2.0
-    sensed = arm.encoders.format(bandwidth=0.5 / period)
     settings = [
         "gains=",
         "constraints.0.friction=0.0",
@@ -101,7 +102,7 @@ def scenario_of(arm: Arm, stiffness: float, period: float, folder: Path) -> Scen
         f"references.table.force={FORCE}",
         f"plant=!MultibodyPlant {{time_step: {half}, stiffness: {stiffness}, friction: 0.3}}",
         f"sampling={{period: {period}, delay: {half}, jitter: {half}}}",
-        f"encoders={sensed}",
+        f"encoders={{resolution: 1.0e-5, velocity_bandwidth: {0.5 / period}}}",
         f"force_feedback=!MeasuredForce {{sample_period: {period}, noise_deviation: 0.1}}",
         f"known_forces=[!JointFriction {{joints: [{joints}]}}]",
         f"plant_payloads=[{{frame: {frame}, mass: 0.01}}]",
@@ -179,9 +180,16 @@ def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict
         each: "m" if each.endswith((".x", ".y")) else "N" if each.endswith(".force") else "rad"
         for each in signals
     }
-    ratios: dict[str, list[float]] = {"m": [], "N": [], "rad": []}
-    for each, unit in units.items():
-        ratios[unit] += (1.0 / study.values(f"{USED}, {each}")).tolist()
+    # A run has one position: of its coordinates the one that comes closest to its bound counts.
+    ratios = {
+        unit: (
+            1.0
+            / np.max(
+                [study.values(f"{USED}, {n}") for n, of in units.items() if of == unit], axis=0
+            )
+        ).tolist()
+        for unit in dict.fromkeys(units.values())
+    }
     used = study.values(USED)
     return {
         "arm": name,
@@ -205,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     classes = [f"{name}-{kind}" for name in ARMS for kind in STIFFNESSES]
     parser.add_argument("classes", nargs="*", help=f"any of {', '.join(classes)}")
     options = parser.parse_args(arguments)
-    chosen = [each.split("-") for each in options.classes or [f"{name}-soft" for name in ARMS]]
+    chosen = [each.split("-") for each in options.classes or USUAL]
     rows = []
     for i, (name, kind) in enumerate(chosen):
         count = options.runs // len(chosen) + (i < options.runs % len(chosen))

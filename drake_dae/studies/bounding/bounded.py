@@ -13,14 +13,12 @@ from drake_dae.errors import ModelError
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import ErrorBound
 
-MARGIN = 1.1
-"""The bound relative to the largest error of all corners."""
-
 MOST_CAUSES = 12
 """The largest number of causes with a row of their own."""
 
-_SIDED = 0.75
-"""A cause is named for failures if it is on one side in at least this share of the failed runs."""
+_SIDED, _FEW = 0.75, 4
+"""A number is named for failures if it is at one end in at least this share of the failed runs, and
+if at least so many runs failed."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class BoundedErrors:
         """
         if self.failed:
             raise ModelError(self._no_bound)
-        named = zip(self.signals, (MARGIN * self.worst).tolist(), strict=True)
+        named = zip(self.signals, self.worst.tolist(), strict=True)
         # An output that is exact in all runs has no positive bound.
         return ErrorBound({s.name: value for s, value in named if value > 0.0}, self.after)
 
@@ -97,6 +95,8 @@ class BoundedErrors:
     def _sides(self) -> list[str]:
         """The numbers that are on one side of their range in most failed runs."""
         found = []
+        if len(self.failed) < _FEW:
+            return []
         for name in self.failed[0].fractions:
             at = [failed.fractions[name] for failed in self.failed]
             for end, side in ((0.0, "low"), (1.0, "high")):
@@ -143,9 +143,8 @@ class BoundedErrors:
         if rest := order[MOST_CAUSES:]:
             text = f"{len(rest)} others, each at most"
             rows.append((text, np.max([self.shares[name] for name in rest], axis=0)))
-        rows.append((f"the worst of {self.runs} runs", self.worst))
-        if not self.failed:
-            rows.append(("bound", MARGIN * self.worst))
+        worst = f"the worst of {self.runs - len(self.failed)} runs"
+        rows.append((worst if self.failed else f"bound: {worst}", self.worst))
         table = Table(head, [[name, *(f"{v:.2g}" for v in values)] for name, values in rows])
         lines = [
             f"The largest errors |z - r| from {self.after:g} s on. A cause: the largest change "
@@ -159,7 +158,7 @@ class BoundedErrors:
             lines.append(f"PROBLEM  {self._no_bound}")
         else:
             lines.append(
-                f"The bound is {MARGIN - 1.0:.0%} above the largest error of {self.corners} random "
-                "corners of the ranges and of the runs with one number at an end."
+                f"The bound is the largest error of {self.corners} random corners of the ranges and of "
+                "the runs with one number at an end."
             )
         return [table, lines]
