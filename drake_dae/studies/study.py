@@ -19,7 +19,8 @@ from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import USED
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.variations import Variation, rerun_commands, run_name
+from drake_dae.studies.run_names import rerun_commands, run_name
+from drake_dae.studies.variations import Variation
 
 FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
 """The names of the files that `Study.save` writes."""

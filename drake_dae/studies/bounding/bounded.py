@@ -158,7 +158,7 @@ class BoundedErrors:
             lines.append(f"PROBLEM  {self._no_bound}")
         else:
             lines.append(
-                f"The bound is the largest error of {self.corners} random corners of the ranges and of "
-                "the runs with one number at an end."
+                f"The bound is the largest error of {self.corners} random corners of the ranges "
+                "and of the runs with one number at an end."
             )
         return [table, lines]
