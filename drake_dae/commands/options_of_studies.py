@@ -118,7 +118,7 @@ def add_bound(commands: Any, scenario: CommandParser) -> None:
         "--vary",
         "KEY=LOW..HIGH",
         'what is not known, as for `sweep --random`: "plant.friction=0.05..0.8", '
-        '"plant_payloads.0.mass=0..0.5", "plant_parameters.wall.position=[[0.69..0.71, 0, 0]]"; '
+        '"plant_payloads.0.mass=0.01..0.5", "plant_parameters.wall.position=[[0.69..0.71, 0, 0]]"; '
         "may be repeated",
         required=True,
     )

@@ -112,7 +112,7 @@ def bound_errors(
         if not found.middle.size:
             raise ModelError(f"in the middle of all ranges the run fails: {reason}")
     shares = dict(zip(names, found.shares[: len(names)], strict=True))
-    if others:
+    if found.shares[-1].any():
         shares[NOISE] = found.shares[-1]
     return BoundedErrors(
         signals=found.signals,
