@@ -43,10 +43,10 @@ help:
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
-	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
+	@echo 'make unknowns    $(RUNS) plants of four arms beside the bound of their errors, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
-	@echo 'make estimated   the same with payloads, tilts and joint friction, which the observer estimates'
+	@echo 'make estimated   $(RUNS) runs whose payload, tilt and joint friction the observer estimates'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
@@ -95,23 +95,11 @@ robots: $(VENV)/installed-dev
 benches: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/benches.py --out runs/benches $(ARGS)
 
-# Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
-# all the same ends its run, with the reason.
-unknowns: $(VENV)/installed
-	$(BIN)/drake-dae sweep wall_point_contact --rollout --random $(RUNS) --seed $(SEED) --out runs/unknowns \
-		--set duration=1.6 --set 'constraints.0.rpy=[0, 0, 0]' \
-		--set 'force_feedback=!MeasuredForce {sample_period: 0.001}' \
-		--set 'tolerances={outputs: {tool.y: 0.005, tool.z: 0.005, wall.force: 10}, after: 0.5}' \
-		--vary plant.friction=0.1..0.6 --vary 'plant.stiffness=[3.0e+4, 1.0e+5, 3.0e+5, 1.0e+6]' \
-		--vary 'plant_parameters.wall.position=[[0.698..0.702, 0, 0]]' \
-		--vary 'plant_parameters.wall.rpy=[[0, -0.02..0.02, -0.02..0.02]]' \
-		--vary plant_parameters.link3.mass=5.6..6.9 \
-		--vary 'plant_payloads=[[{frame: tool, mass: 0.01..0.5}]]' \
-		--vary 'plant_disturbances=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
-		--vary 'encoders=[{resolution: 1.0e-5, velocity_bandwidth: 500}, {position_noise: 5.0e-6, velocity_noise: 0.001}]' \
-		--vary force_feedback.bias=-0.3..0.3 --vary force_feedback.noise_deviation=0..0.3 --vary force_feedback.seed=1..1000
+# Plants of four vendors' arms: the bound of their errors for the declared ranges, then the runs.
+unknowns: $(VENV)/installed-dev
+	$(BIN)/python examples/bounded_arms --runs $(RUNS) --seed $(SEED) --out runs/unknowns $(ARGS)
 
-# Wider, with payload, tilt and friction of joints, which the observer estimates; what is left of
+# Payload, tilt and friction of joints, which the observer estimates; what is left of
 # errors after the push is in the columns "late error" of runs.csv.
 JOINTS = joint1 joint2 joint3 joint4 joint5 joint6 joint7
 COMMA := ,

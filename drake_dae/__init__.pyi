@@ -134,10 +134,13 @@ from .scenario.new.new_scenario import new_scenario as new_scenario
 from .scenario.plants import Unilateral as Unilateral
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
+from .simulation.error_bound import ErrorBound as ErrorBound
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
 from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
+from .studies.bounding.bound import bound_errors as bound_errors
+from .studies.bounding.bounded import BoundedErrors as BoundedErrors
 from .studies.excitation.excitation import Excitation as Excitation
 from .studies.excitation.excite import excite as excite
 from .studies.excitation.promised import Promised as Promised

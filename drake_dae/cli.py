@@ -40,6 +40,7 @@ _MODULES = {
     "live": "play",
     "render": "plot",
     "diagram": "plot",
+    "bound": "sweep",
     "excite": "identify",
     "analyze": "new",
 }

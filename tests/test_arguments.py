@@ -59,6 +59,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
+from drake_dae.studies.bounding.bounded import FailedRun
 from drake_dae.studies.identification.identified import Identified, Noise
 from drake_dae.studies.identification.unknowns import Unknown
 from drake_dae.studies.optimization.variables import Variable as Variable_
@@ -248,6 +249,11 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     ),
     dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
+    dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
+    FailedRun: lambda: FailedRun({"link1.mass": 1.0}, "no start"),
+    dd.BoundedErrors: lambda: dd.BoundedErrors(
+        (dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, scenario()
+    ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: lambda: dd.DisturbanceObserver(

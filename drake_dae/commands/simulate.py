@@ -49,6 +49,7 @@ from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.simulation.error_bound import bound_words, exceeds
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
@@ -276,9 +277,14 @@ def _write(run: _CommandRun) -> bool:
             notes=limit_remarks(record, limits),
         )
         verdict = judge(record, predicted, accuracy)
+        bounded = None
+        if (error_bound := run.scenario.error_bound) is not None:
+            bounded = error_bound.check(record)
+            lines += ["", *bound_words(bounded), ""]
         is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
         run.results = {
-            "missed": job.outcome is JobOutcome.BAD or is_unexplained,
+            "missed": job.outcome is JobOutcome.BAD or is_unexplained or exceeds(bounded),
+            "error_bound": None if bounded is None else list(map(asdict, bounded)),
             "job": job.to_dict(),
             "phases": [asdict(change) for change in changes],
             **asdict(near),

@@ -11,7 +11,7 @@ from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.pace import paced
-from drake_dae.scenario.forms.keys import violated
+from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
@@ -55,6 +55,10 @@ def build_completed(
     slowed = paced(chosen.scenario, model, structure)
     in_time, motion = timed(slowed.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
+    if (bound := in_time.scenario.error_bound) is not None:
+        with at("error_bound"):
+            bound.places(model.dae.output_signals)
+        notes = (*notes, str(bound))
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(
         completed.scenario,

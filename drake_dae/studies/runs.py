@@ -76,6 +76,12 @@ class Runner:
             raise self._built
         return cast(ClosedLoop, self._built)
 
+    @property
+    def limits(self) -> Limits:
+        """The limits of the robot whose loop was built last."""
+        assert isinstance(self._built, ClosedLoop)
+        return Limits.of(self._built.plant.robot("a study"))
+
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """Returns the error in the keys and values of a variation; None if there is none.
 
@@ -100,6 +106,30 @@ class Runner:
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
         """Simulates runs; yields their results in the same order."""
+        for run in self._started(batch):
+            if isinstance(run, _StartedRun):
+                yield self._timed(run.number, run.seconds, self._finish, run)
+            else:
+                yield run
+
+    def records(self, batch: Batch) -> Iterator[tuple[Record | None, str]]:
+        """Simulates runs; yields the record of each, and the reason if it ended early.
+
+        The record is None if a run has no start.
+        """
+        for run in self._started(batch):
+            if not isinstance(run, _StartedRun):
+                yield None, run.reason
+                continue
+            try:
+                record, _, failure = self._recorded(run)
+            except DrakeDaeError as error:
+                yield None, str(error)
+            else:
+                yield record, "" if failure is None else str(failure)
+
+    def _started(self, batch: Batch) -> Iterator["_StartedRun | RunResult"]:
+        """Starts runs, with their rollouts where these can be computed together."""
         size = 1 if self._lasting is None else TOGETHER
         for first in range(0, len(batch), size):
             started = [
@@ -107,11 +137,7 @@ class Runner:
                 for number, variation in batch[first : first + size]
             ]
             self._roll_together([run for run in started if isinstance(run, _StartedRun)])
-            for run in started:
-                if isinstance(run, _StartedRun):
-                    yield self._timed(run.number, run.seconds, self._finish, run)
-                else:
-                    yield run
+            yield from started
 
     def _timed(
         self, number: int, before: float, function: Callable[..., Any], *arguments: Any
@@ -160,23 +186,30 @@ class Runner:
             for run in runs:
                 run.seconds += seconds
 
+    def _recorded(self, run: "_StartedRun") -> tuple[Record, int, SimulationError | None]:
+        """Simulates a run, unless its rollout exists; returns record, steps, and failure if any."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if self._lasting is None:
+                return _stepped(run.scenario, run.loop, run.context)
+            from drake_dae.scenario.rolled import roll_scenario
+
+            rollout = run.rollout or roll_scenario(
+                run.scenario, run.loop, run.context, self._lasting
+            )
+            return rollout.record, rollout.steps, rollout.failure
+
     def _finish(self, run: "_StartedRun") -> RunResult:
         """Simulates a run, unless its rollout exists, and returns its result."""
-        number, scenario, loop, context = run.number, run.scenario, run.loop, run.context
+        number, bound = run.number, run.scenario.error_bound
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                if self._lasting is None:
-                    record, steps, failure = _stepped(scenario, loop, context)
-                else:
-                    from drake_dae.scenario.rolled import roll_scenario
-
-                    rollout = run.rollout or roll_scenario(scenario, loop, context, self._lasting)
-                    record, steps, failure = rollout.record, rollout.steps, rollout.failure
+            record, steps, failure = self._recorded(run)
+            limits = Limits.of(run.loop.plant.robot("a study"))
+            figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
+            if bound is not None and record.time.size:
+                figures |= bound.figures(record)
         except DrakeDaeError as error:
             return _not_started(number, error)
-        limits = Limits.of(loop.plant.robot("a study"))
-        figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
         if failure is not None:
             return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
         return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)

@@ -17,6 +17,9 @@ from drake_dae.studies.variations import Variation
 TOGETHER = 32
 """The largest number of rollouts that are computed together."""
 
+_OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
+"""The keys of a scenario that the closed loop does not depend on."""
+
 Batch = Sequence[tuple[int, Variation]]
 """(number, variation) of runs with one structure."""
 
@@ -63,7 +66,14 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
     Then the loop does not depend on the order of runs.
     """
     own = dict(data)
-    for key in ("description", "plant_parameters", "duration", "integrator", "write"):
+    for key in (
+        "description",
+        "plant_parameters",
+        "duration",
+        "integrator",
+        "write",
+        "error_bound",
+    ):
         own[key] = base[key]
     kind, plant = plant_kind(own["plant"]), base["plant"]
     if kind is plant_kind(plant):

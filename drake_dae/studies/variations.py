@@ -1,12 +1,10 @@
 """The variations of a study: for each run, keys of the scenario and their values."""
 
 import re
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import product
 from math import isfinite, prod
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -16,7 +14,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, vector
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml
+from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 
 MOST_RUNS = 1_000_000
@@ -107,7 +105,7 @@ def parse_variations(
     Raises:
         ScenarioError: An option cannot be read, or its values are empty.
     """
-    columns = _columns(texts, scenario, count is not None)
+    columns = parse_choices(texts, scenario, count is not None)
     if count is not None:
         return random_variations(columns, count, seed)
     return listed_variations(columns) if together else grid_variations(columns)
@@ -119,15 +117,21 @@ def parse_ranges(texts: Sequence[str], scenario: Scenario) -> dict[str, tuple[fl
     Raises:
         ScenarioError: An option cannot be read, or is no range of numbers.
     """
-    columns = _columns(texts, scenario, True)
+    columns = parse_choices(texts, scenario)
     for key, ends in columns.items():
         if not isinstance(ends, tuple):
             raise _wrong(key, "expected LOW..HIGH, of a key that takes any number in between")
     return columns
 
 
-def _columns(texts: Sequence[str], scenario: Scenario, is_random: bool) -> dict[str, Any]:
-    """The keys and parsed values of options "KEY=VALUES"."""
+def parse_choices(
+    texts: Sequence[str], scenario: Scenario, is_random: bool = True
+) -> dict[str, Any]:
+    """Returns the keys and the parsed values of options "KEY=VALUES", see `parse_variations`.
+
+    Raises:
+        ScenarioError: An option cannot be read.
+    """
     data, columns = scenario_data(scenario), dict[str, Any]()
     for text in texts:
         key, separator, values = text.partition("=")
@@ -216,85 +220,97 @@ def _values(key: str, values: Any) -> list[Any]:
 
 def _drawn(key: str, choices: Any, count: int, seed: int) -> list[Any]:
     """Draws the values of a key for all runs, see `random_variations`."""
-    random = np.random.default_rng([seed, crc32(key.encode())])
+    values = _checked_choices(key, choices)
+
+    @cache
+    def fractions_at(path: str) -> FloatArray:
+        # One random number for each value, so that the values of fewer runs are the first of more.
+        name = f"{key}.{path}" if path else key
+        return np.random.default_rng([seed, crc32(name.encode())]).random(count)
+
+    def drawn(run: int) -> Any:
+        return _at(key, values, lambda path: fractions_at(path)[run].item())
+
+    return [drawn(run) for run in range(count)]
+
+
+def _checked_choices(key: str, choices: Any) -> Any:
+    """Checks the choices of a key, see `random_variations`."""
     if isinstance(choices, tuple):
         low, high = vector(f"the range of {key}", choices, 2)
         if not low < high:
             raise _wrong(key, f"the range {brief(choices)} is empty; the first is the lower one")
         _check_width(key, low, high)
-        fractions = random.random(count)
-        return (low * (1.0 - fractions) + high * fractions).tolist()
-    # One random number for each value, so that the values of fewer runs are the first of more runs.
+        return float(low), float(high)
     if isinstance(choices, range) and choices:
         if choices[-1] - choices[0] > 2**53:
             raise _wrong(key, f"{brief(choices)} has more whole numbers than can be drawn from")
-        return [choices[int(len(choices) * fraction)] for fraction in random.random(count)]
-    values = _values(key, choices)
-    chosen = [values[int(len(values) * fraction)] for fraction in random.random(count)]
+        return choices
+    return _values(key, choices)
 
-    @cache
-    def fractions_at(path: str) -> FloatArray:
-        return np.random.default_rng([seed, crc32(f"{key}.{path}".encode())]).random(count)
 
-    def filled(value: Any, path: str, run: int) -> Any:
+def _at(key: str, choices: Any, fraction: Callable[[str], float]) -> Any:
+    """Returns the value of a key at fractions of its ranges.
+
+    Args:
+        key: The key.
+        choices: Its choices, as `_checked_choices` returns them.
+        fraction: Path -> the fraction, from 0 to 1: "" of the choices themselves, ".0.force.1" of
+            an interval within a value.
+    """
+    if isinstance(choices, tuple):
+        share = fraction("")
+        return choices[0] * (1.0 - share) + choices[1] * share
+    chosen = choices[0]
+    if len(choices) > 1:
+        chosen = choices[min(int(len(choices) * fraction("")), len(choices) - 1)]
+
+    def filled(value: Any, path: str) -> Any:
         if isinstance(value, list):
-            return [filled(entry, f"{path}.{i}", run) for i, entry in enumerate(value)]
+            return [filled(entry, f"{path}.{i}") for i, entry in enumerate(value)]
         if isinstance(value, dict):
-            return {name: filled(entry, f"{path}.{name}", run) for name, entry in value.items()}
+            return {name: filled(entry, f"{path}.{name}") for name, entry in value.items()}
         interval = _INTERVAL.fullmatch(value) if path and isinstance(value, str) else None
         if not interval or interval[3]:
             return value
         low, high = _ends(key, interval)
-        fraction = fractions_at(path)[run].item()
-        return low * (1.0 - fraction) + high * fraction
+        share = fraction(path)
+        return low * (1.0 - share) + high * share
 
-    return [filled(value, "", run) for run, value in enumerate(chosen)]
-
-
-def run_name(changes: Variation) -> str:
-    """Returns a name of a run from its values: "link1.mass=9.6, tool.z=0.05".
-
-    A key is shortened to its last two parts, or more if needed to distinguish it from other keys.
-    """
-    parts = {key: key.split(".") for key in changes}
-
-    def short(key: str) -> str:
-        for count in range(2, len(parts[key]) + 1):
-            tail = parts[key][-count:]
-            if not any(other[-count:] == tail for name, other in parts.items() if name != key):
-                return ".".join(tail)
-        return key
-
-    return ", ".join(f"{short(key)}={_in_brief(value)}" for key, value in changes.items())
+    return filled(chosen, "")
 
 
-def _in_brief(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else setting("", value)[1:]
-
-
-def setting(key: str, value: Any) -> str:
-    """Returns a change as "key=value", in the form that the command line accepts."""
-    return f"{key}={dump_yaml({'v': value}, on_one_line=True).strip()[4:-1]}"
-
-
-def rerun_commands(made: Sequence[str], variations: Sequence[Variation], folder: Path) -> list[str]:
-    """For each run of a study the command that makes its record, plots and animation.
+def numbers_that_vary(ranges: Mapping[str, Any]) -> list[str]:
+    """Returns the names of the numbers that vary in ranges, and of keys with several values.
 
     Args:
-        made: The words of the command that runs the scenario, without what varies.
-        variations: What varies in each run.
-        folder: The folder of the study, in which that of a run is made.
+        ranges: As for `random_variations`.
     """
-    return [
-        shlex.join(
-            [
-                *made,
-                *(part for item in changes.items() for part in ("--set", setting(*item))),
-                *("--out", str(folder / f"run{number}")),
-            ]
-        )
-        for number, changes in enumerate(variations)
-    ]
+    names = dict[str, None]()
+    for key, choices in ranges.items():
+        count = 2 if isinstance(choices, tuple) else len(choices)
+        for i in range(1 if isinstance(choices, (tuple, range)) else count):
+
+            def fraction(path: str, key: str = key, share: float = (i + 0.5) / count) -> float:
+                names.setdefault(key + path)
+                return share
+
+            _at(key, _checked_choices(key, choices), fraction)
+    return list(names)
+
+
+def variation_at(ranges: Mapping[str, Any], fractions: Mapping[str, float]) -> Variation:
+    """Returns the values of keys at given fractions of their ranges.
+
+    Args:
+        ranges: As for `random_variations`.
+        fractions: A name of `numbers_that_vary` -> 0 for the lowest value, 1 for the highest.
+    """
+
+    def value(key: str, choices: Any) -> Any:
+        return _at(key, _checked_choices(key, choices), lambda path: fractions[key + path])
+
+    return {key: value(key, choices) for key, choices in ranges.items()}
 
 
 def plain(key: str, value: Any) -> Any:

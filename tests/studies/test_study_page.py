@@ -16,7 +16,7 @@ from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.variations import run_name, setting
+from drake_dae.studies.run_names import run_name, setting
 
 MARKUP = '</script><img src=x onerror="window.hit = 1">'
 

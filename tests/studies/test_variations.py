@@ -8,7 +8,8 @@ from runs import scenario
 
 from drake_dae import grid_variations, listed_variations, random_variations
 from drake_dae.errors import ScenarioError
-from drake_dae.studies.variations import parse_variations, setting
+from drake_dae.studies.run_names import setting
+from drake_dae.studies.variations import parse_variations
 
 
 def test_a_grid_has_every_combination_the_last_key_first():

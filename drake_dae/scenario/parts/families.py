@@ -19,6 +19,7 @@ from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts import time_optimal, written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
+from drake_dae.simulation import error_bound
 from drake_dae.systems.control import sampling
 from drake_dae.systems.plants.contact import contact_material, disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
@@ -111,6 +112,7 @@ Plant = Annotated[
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
+ErrorBound = Annotated[error_bound.ErrorBound, Form()]
 Observer = Annotated[parts.Observer, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]
 _Guards = Annotated[

@@ -1,0 +1,252 @@
+"""Plants of four vendors' arms that no law knows: the bound of their errors beside the errors.
+
+    python examples/bounded_arms [ur5-soft panda-soft ...] [--runs 1000] [--out FOLDER] [--seed 0]
+
+Each arm draws a circle on a table and presses on it with 40 N, on contact with the equations of
+Drake's. Ranges are declared: of friction, stiffness, place and tilt of the table, masses of links,
+payload, friction of each joint, bias and noise of the force sensor, and of a push along each axis;
+controls are late by a random half of a sample. Before the runs of a class of plants `bound_errors`
+prints the bound of each output with its causes. Then `sweep` draws plants from the ranges. The
+robots are those of the package example-robot-data.
+
+Claim: all plants keep their bound, and the median of bound / largest error is at most 5 for
+positions and for forces.
+
+If it is killed, the same command continues.
+"""
+
+import argparse
+import json
+import logging
+import sys
+import sysconfig
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import drake_dae as dd
+from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.rolled import for_rollout
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.simulation.error_bound import USED
+
+ROBOTS = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
+
+DURATION, AFTER, PUSHED = 2.4, 0.8, 1.6
+"""The end of a run, the time from which its errors are bounded, and that of the push, in s."""
+
+FORCE = 40.0
+"""The pressing force in N."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm, and what disturbs it at most.
+
+    Attributes:
+        file: The robot's file.
+        links: Two links whose masses are known within 10 %.
+        push: The largest push in each direction, in N.
+        tilt: The largest tilt of the table about two axes, in rad.
+        payload: The largest payload, in kg.
+        friction: The largest Coulomb friction of a joint relative to its effort limit.
+    """
+
+    file: str
+    links: tuple[str, str]
+    push: float = 20.0
+    tilt: float = 0.087
+    payload: float = 0.5
+    friction: float = 0.02
+
+
+LIGHT: dict[str, Any] = {"push": 10.0, "tilt": 0.035, "payload": 0.25, "friction": 0.007}
+"""What is declared for lighter arms."""
+
+ARMS = {
+    "ur5": Arm("ur_description/urdf/ur5_robot.urdf", ("upper_arm_link", "forearm_link")),
+    "panda": Arm("panda_description/urdf/panda.urdf", ("panda_link4", "panda_link3"), **LIGHT),
+    "kinova": Arm(
+        "kinova_description/robots/kinova.urdf", ("j2s6s200_link_2", "j2s6s200_link_3"), **LIGHT
+    ),
+    "xarm7": Arm("xarm_description/urdf/xarm7.urdf", ("link2", "link4"), **LIGHT),
+}
+STIFFNESSES = {
+    "soft": (1e4, 1e5, 1e-3),
+    "firm": (3e4, 1e5, 1e-3),
+    "hard": (1e5, 6e5, 5e-4),
+    "steel": (6e5, 3e6, 2.5e-4),
+}
+"""The stiffness of the contact from, to, in N/m, and the sample time in s that the latter needs."""
+
+
+USUAL = ["ur5-soft", "panda-firm", "xarm7-firm", "kinova-firm"]
+"""The classes that run if none is named."""
+
+
+def scenario_of(arm: Arm, stiffness: float, period: float, folder: Path) -> Scenario:
+    """The scenario of an arm on a table, with sensors, late controls and friction of joints."""
+    file = folder / "task.yaml"
+    nominal, text = dd.new_scenario(str(ROBOTS / arm.file))
+    file.write_text(text, encoding="utf-8")
+    frame = nominal.constraints[0].frame
+    joints = ", ".join(nominal.start.positions)
+    half = period / 2.0
+    settings = [
+        "gains=",
+        "constraints.0.friction=0.0",
+        "constraints.0.rpy=[0.0, 0.0, 0.0]",
+        f"references.table.force={FORCE}",
+        f"plant=!MultibodyPlant {{time_step: {half}, stiffness: {stiffness}, friction: 0.3}}",
+        f"sampling={{period: {period}, delay: {half}, jitter: {half}}}",
+        f"encoders={{resolution: 1.0e-5, velocity_bandwidth: {0.5 / period}}}",
+        f"force_feedback=!MeasuredForce {{sample_period: {period}, noise_deviation: 0.1}}",
+        f"known_forces=[!JointFriction {{joints: [{joints}]}}]",
+        f"plant_payloads=[{{frame: {frame}, mass: 0.01}}]",
+        f"plant_disturbances=[{{frame: {frame}, force: [0, 0, 0], start_time: {PUSHED},"
+        f" end_time: {PUSHED + 0.1}}}]",
+        f"duration={DURATION}",
+    ]
+    return for_rollout(dd.load_scenario(file, settings))[0]
+
+
+def ranges_of(arm: Arm, scenario: Scenario, stiffness: tuple[float, float]) -> dict[str, Any]:
+    """What is declared to be unknown, as for `random_variations`."""
+    loop, _ = dd.build_scenario(scenario)
+    model = loop.plant.robot("ranges")
+    values = {p.name: p.value for p in model.dae.parameters}
+    x, y, z = values["table.position"].tolist()
+    around = {f"{link}.mass": float(values[f"{link}.mass"][0]) for link in arm.links}
+    dry = [name for name in values if name.endswith(".coulomb")]
+    efforts = dict(zip(dry, model.control_limits.tolist(), strict=True))
+    within = f"{-arm.push}..{arm.push}"
+    return {
+        "plant.friction": (0.05, 0.8),
+        "plant.stiffness": stiffness,
+        "plant_parameters.table.position": [[x, y, f"{z - 0.002}..{z + 0.002}"]],
+        "plant_parameters.table.rpy": [[*[f"{-arm.tilt}..{arm.tilt}"] * 2, 0.0]],
+        **{f"plant_parameters.{name}": (0.9 * m, 1.1 * m) for name, m in around.items()},
+        "plant_payloads.0.mass": (0.01, arm.payload),
+        **{
+            f"plant_parameters.{name}": (0.0, min(3.0, arm.friction * effort))
+            for name, effort in efforts.items()
+        },
+        "force_feedback.bias": (-0.3, 0.3),
+        "force_feedback.noise_deviation": (0.02, 0.3),
+        "plant_disturbances.0.force": [[within, within, within]],
+    }
+
+
+def seeds(scenario: Scenario, count: int, seed: int) -> list[dict[str, int]]:
+    """Other seeds of sensors and jitter for each run."""
+    own = np.random.default_rng(seed).integers(1, 2**31, count).tolist()
+    keys = ("force_feedback.seed", "encoders.seed", "sampling.seed")
+    return [dict.fromkeys(keys, number) for number in own]
+
+
+def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
+    """Bounds the errors of a class of plants, runs it, and returns its figures."""
+    folder.mkdir(parents=True, exist_ok=True)
+    low, high, period = STIFFNESSES[kind]
+    arm = ARMS[name]
+    file, causes = folder / "bounded.yaml", folder / "bound.txt"
+    ranges_file = folder / "ranges.json"
+    if not file.exists():
+        scenario = scenario_of(arm, high, period, folder)
+        try:
+            ranges = ranges_of(arm, scenario, (low, high))
+        except dd.errors.ScenarioError as error:  # No gains are stable at this sample time.
+            print(f"{name}, {kind}: {error}", flush=True)
+            return {"arm": name, "kind": kind, "bounded": False}
+        ranges_file.write_text(json.dumps(ranges))
+        found = dd.bound_errors(scenario, ranges, after=AFTER)
+        causes.write_text(f"{found}\n", encoding="utf-8")
+        if found.failed:
+            print(f"{name}, {kind}\n\n{found}", flush=True)
+            return {"arm": name, "kind": kind, "bounded": False}
+        save_scenario(found.bounded_scenario, file)
+    print(f"{name}, {kind}\n\n{causes.read_text(encoding='utf-8')}", flush=True)
+    scenario = dd.load_scenario(file)
+    ranges = json.loads(ranges_file.read_text())
+    pairs = {key: tuple(v) if isinstance(v[0], float) else v for key, v in ranges.items()}
+    variations = dd.random_variations(pairs, count, seed=seed + 1)
+    variations = [
+        {**changes, **own}
+        for changes, own in zip(variations, seeds(scenario, count, seed), strict=True)
+    ]
+    study = dd.sweep(scenario, variations, folder / f"runs{count}.jsonl", rollout=True, workers=1)
+    study.save(folder)
+    signals = dict.fromkeys(scenario.error_bound.outputs)
+    units = {
+        each: "m" if each.endswith((".x", ".y")) else "N" if each.endswith(".force") else "rad"
+        for each in signals
+    }
+    # A run has one position: of its coordinates the one that comes closest to its bound counts.
+    ratios = {
+        unit: (
+            1.0
+            / np.max(
+                [study.values(f"{USED}, {n}") for n, of in units.items() if of == unit], axis=0
+            )
+        ).tolist()
+        for unit in dict.fromkeys(units.values())
+    }
+    used = study.values(USED)
+    return {
+        "arm": name,
+        "kind": kind,
+        "bounded": True,
+        "runs": count,
+        "failed": sum(str(result.outcome) != "finished" for result in study.results),
+        "held": int(np.sum(used <= 1.0)),
+        "worst": float(np.nanmax(used)),
+        "ratios": ratios,
+        "bound": dict(scenario.error_bound.outputs),
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints a table; returns 0 if every bound held with a median ratio of at most 5."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=1000, help="of all classes together")
+    parser.add_argument("--out", type=Path, default=Path("runs/unknowns"))
+    parser.add_argument("--seed", type=int, default=0)
+    classes = [f"{name}-{kind}" for name in ARMS for kind in STIFFNESSES]
+    parser.add_argument("classes", nargs="*", help=f"any of {', '.join(classes)}")
+    options = parser.parse_args(arguments)
+    chosen = [each.split("-") for each in options.classes or USUAL]
+    rows = []
+    for i, (name, kind) in enumerate(chosen):
+        count = options.runs // len(chosen) + (i < options.runs % len(chosen))
+        row = run_class(name, kind, count, options.seed, options.out / f"{name}-{kind}")
+        rows.append(row)
+        print({key: value for key, value in row.items() if key != "ratios"}, flush=True)
+    print(
+        f"\n{'arm':8}{'contact':9}{'runs':>6}{'held':>6}{'failed':>7}{'bound / error: m':>18}"
+        f"{'N':>6}{'rad':>6}"
+    )
+    done = [row for row in rows if row["bounded"]]
+    for row in done:
+        medians = "".join(
+            f"{np.nanmedian(row['ratios'][unit]):{w}.2f}"
+            for unit, w in (("m", 18), ("N", 6), ("rad", 6))
+        )
+        print(
+            f"{row['arm']:8}{row['kind']:9}{row['runs']:6}{row['held']:6}{row['failed']:7}{medians}"
+        )
+    total, held = sum(row["runs"] for row in done), sum(row["held"] for row in done)
+    median = {
+        unit: float(np.nanmedian(np.concatenate([row["ratios"][unit] for row in done])))
+        for unit in ("m", "N", "rad")
+    }
+    print(f"{held} of {total} within their bound; median of bound / error: {median}")
+    return 0 if held == total and max(median["m"], median["N"]) <= 5.0 else 1
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    logging.getLogger("drake").setLevel(logging.ERROR)
+    sys.exit(main())
