@@ -93,12 +93,15 @@ def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> No
                 "then; begin with a phase without contact, such as Approach"
             )
         plant.set_state(at_plant, at_rest)
-    _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
+    _begin_sensor(loop, context, q, forces)
 
 
-def _begin_sensor(loop: ClosedLoop, context: Context, force: FloatArray) -> None:
-    """Starts the force sensor, if there is one, as it measures a constant force."""
+def _begin_sensor(loop: ClosedLoop, context: Context, q: FloatArray, forces: FloatArray) -> None:
+    """Starts the force sensor, if there is one, at the constraint forces at rest."""
     if loop.sensor is not None:
+        plant = loop.plant
+        parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
+        force = plant.robot("a scenario").rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
 
 
@@ -122,7 +125,7 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
         if scenario.exogenous:
             state = _in_motion(loop, context, outputs, state)
         plant.set_consistent_state(at_plant, state)
-    _begin_sensor(loop, context, model.rest_forces(q, forces, parameters))
+    _begin_sensor(loop, context, q, forces)
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:

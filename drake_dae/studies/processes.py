@@ -13,11 +13,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import deque
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import suppress
 from math import isfinite
 from typing import IO, Any
+
+import numpy as np
 
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
@@ -62,7 +63,7 @@ def run_in_processes(
     Raises:
         ModelError: A process does not start.
     """
-    waiting, workers = deque(batches), min(workers, len(batches))
+    waiting, workers = dict(enumerate(batches)), min(workers, len(batches))
     running: list[_Worker] = []
     results: list[RunResult] = []
     last_report = -PERIOD
@@ -86,9 +87,10 @@ def run_in_processes(
                         if crashed := worker.close():
                             results.append(crashed)
                         if worker.unfinished:
-                            waiting.appendleft(worker.unfinished)
+                            waiting[worker.place] = worker.unfinished
                     elif worker.is_idle and waiting and worker.builds < BUILDS:
-                        worker.start(waiting.popleft())
+                        worker.place = next_place(waiting, worker.place)
+                        worker.start(waiting.pop(worker.place))
                     elif worker.is_idle:
                         worker.finish()
                 for worker in running:
@@ -104,12 +106,31 @@ def run_in_processes(
                 worker.kill()
 
 
+def next_place(waiting: Collection[int], last: int) -> int:
+    """Returns the place of the batch that a worker simulates next.
+
+    Neighbors have mostly one structure, for which the worker has a loop already. A worker without
+    a neighbor begins in the middle of the longest gap between other workers.
+
+    Args:
+        waiting: The places of batches without a worker; not empty.
+        last: The place of the worker's last batch; -1 before the first.
+    """
+    if last + 1 in waiting:
+        return last + 1
+    places = np.sort(np.fromiter(waiting, int))
+    stretches = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+    longest = max(stretches, key=len)
+    return int(longest[len(longest) // 2])
+
+
 class _Worker:
     """A worker process and its runs.
 
     Attributes:
         output: The pipe with the results of the process.
         unfinished: The runs of the process that have no result yet.
+        place: The place of its last batch; -1 before the first.
         is_idle: Whether the process waits for runs.
         builds: The number of loops that the process has built.
         began: The time at which the present run began, by the monotonic clock in s; infinite while
@@ -133,6 +154,7 @@ class _Worker:
         )
         self.output: IO[bytes] = self._process.stdout  # type: ignore[assignment]
         self.unfinished: Batch = []
+        self.place = -1
         self.is_idle = False
         self.builds = 0
         self.began = time.monotonic()

@@ -111,24 +111,34 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
     return own
 
 
-def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
-    """The simulated time of all runs divided by the number of structures, in s.
+def structures_of(
+    base: Mapping[str, Any], variations: Iterable[Variation], are_rollouts: bool
+) -> list[tuple[str, float]]:
+    """Returns the structure and the simulated time in s of each run; "" and 0 of an invalid one.
 
     Args:
         base: The plain data of the study's scenario.
-        variations: All runs of the study.
+        variations: The runs.
+        are_rollouts: Whether the runs are rollouts.
     """
-    total, keys, own = 0.0, set(), study_data(base, {}, True)
+    own, structures = study_data(base, {}, are_rollouts), list[tuple[str, float]]()
     for variation in variations:
+        key, duration = "", 0.0
         with suppress(ScenarioError):  # The run itself reports the error.
-            data = study_data(base, variation, True)
-            total += data["duration"]
-            keys.add(structure_key(data, own))
-    return total / max(len(keys), 1)
+            data = study_data(base, variation, are_rollouts)
+            key, duration = structure_key(data, own), data["duration"]
+        structures.append((key, duration))
+    return structures
+
+
+def lasting(structures: Sequence[tuple[str, float]]) -> float:
+    """Returns the simulated time of all runs divided by the number of structures, in s."""
+    keys = {key for key, _ in structures if key}
+    return sum(duration for _, duration in structures) / max(len(keys), 1)
 
 
 def batches(
-    base: Mapping[str, Any],
+    structures: Sequence[tuple[str, float]],
     runs: Iterable[tuple[int, Variation]],
     workers: int,
     are_rollouts: bool = False,
@@ -136,20 +146,18 @@ def batches(
     """Divides runs into batches of one structure; a worker builds one loop for a batch.
 
     Args:
-        base: The plain data of the study's scenario.
-        runs: The numbers and variations of the runs.
+        structures: The result of `structures_of` for all runs of the study.
+        runs: The numbers and variations of some of them.
         workers: The number of workers.
         are_rollouts: Whether the runs are rollouts.
     """
     groups: dict[str, list[tuple[int, Variation]]] = {}
-    own = study_data(base, {}, are_rollouts)
     for number, variation in runs:
-        key = ""
-        with suppress(ScenarioError):  # The run itself reports the error.
-            key = structure_key(study_data(base, variation, are_rollouts), own)
-        groups.setdefault(key, []).append((number, variation))
+        groups.setdefault(structures[number][0], []).append((number, variation))
     total = sum(map(len, groups.values()))
-    size = max(1, min(TOGETHER, total // (32 * workers)))
+    # Rollouts go side by side, and take milliseconds.
+    parts = 8 if are_rollouts else 32
+    size = max(1, min(TOGETHER, total // (parts * workers)))
     return [
         group[first : first + size]
         for group in groups.values()

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import cache
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
@@ -24,7 +25,7 @@ from drake_dae.studies.journal import Journal, open_journal, study_head
 from drake_dae.studies.processes import cores, run_in_processes
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.runs import Runner
-from drake_dae.studies.structures import batches, lasting
+from drake_dae.studies.structures import batches, lasting, structures_of
 from drake_dae.studies.study import Study
 from drake_dae.studies.variations import MOST_RUNS, Variation, plain
 
@@ -85,12 +86,13 @@ def sweep(
         check_whole_number("workers", workers, 1)
     positive("time_limit", time_limit)
     path, head = Path(file), study_head(version("drake_dae"), base, chosen, rollout)
-    settings = base, lasting(base, chosen) if rollout else None
+    structures = cache(lambda: structures_of(base, chosen, rollout))
+    settings = base, lasting(structures()) if rollout else None
     with ending_signals(end_at_once):
         if not os.path.lexists(path):
             _try(Runner(*settings), chosen)
         with open_journal(path, head) as journal:
-            _run(settings, chosen, journal, workers, cluster, progress, time_limit)
+            _run(settings, chosen, structures, journal, workers, cluster, progress, time_limit)
     found = tuple(journal.results[run] for run in range(len(chosen)))
     return Study(tuple(chosen), found, scenario, rollout)
 
@@ -98,6 +100,7 @@ def sweep(
 def _run(
     settings: Sequence[Any],
     variations: Sequence[Variation],
+    structures: Callable[[], Sequence[tuple[str, float]]],
     journal: Journal,
     workers: int | None,
     cluster: str | None,
@@ -109,11 +112,11 @@ def _run(
     missing = [pair for pair in enumerate(variations) if pair[0] not in final]
     if not missing:
         return
-    base, total = settings[0], len(variations)
+    total = len(variations)
     with _bar(total, total - len(missing), progress) as show, ExitStack() as stack:
         connected = None if cluster is None else stack.enter_context(Cluster(cluster))
         count = connected.workers if connected else workers or cores()
-        groups = batches(base, missing, count, settings[1] is not None)
+        groups = batches(structures(), missing, count, settings[1] is not None)
         results = (
             connected.run(settings, groups)
             if connected

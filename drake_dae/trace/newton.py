@@ -170,17 +170,19 @@ def shortest_steps(
         inverse = np.linalg.pinv(rows, DEPENDENT)
         return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
     # LAPACK itself: SciPy's solve_triangular takes ten times as long around the same call.
-    return NewtonModel(lambda x: -q @ dtrtrs(r.T, residual(x) / length, lower=1)[0], True)
+    return NewtonModel(lambda x: -q @ dtrtrs(r, residual(x) / length, trans=1)[0], True)
 
 
 def _orthogonalized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Q and R of a matrix, shapes (n, l) and (l, k) with l = min(n, k).
 
+    The entries below the diagonal of R are not zero: LAPACK does not read them.
+
     LAPACK itself: SciPy's `qr` takes several times as long around the same calls.
     """
     least = min(matrix.shape)
     factors, tau, *_ = dgeqrf(matrix)
-    return dorgqr(factors[:, :least], tau)[0], np.triu(factors[:least])
+    return dorgqr(factors[:, :least], tau)[0], factors[:least]
 
 
 def steps_along(

@@ -13,9 +13,16 @@ from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
+from drake_dae.studies.processes import next_place
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.runs import Runner
-from drake_dae.studies.structures import batches, lasting, structure_key, study_data
+from drake_dae.studies.structures import (
+    batches,
+    lasting,
+    structure_key,
+    structures_of,
+    study_data,
+)
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
 
@@ -186,7 +193,8 @@ def test_how_long_runs_of_one_structure_last():
     base = scenario_data(scenario("two_link_wall", *SHORT))
     walls = [{"constraints.0.surface.point": [x, 0.0, 0.0]} for x in (1.2, 1.25)]
     starts = [{"start.errors.tool.z": z, "duration": 0.6} for z in (0.0, 0.01)]
-    assert lasting(base, [*starts, *walls]) == pytest.approx((2 * 0.6 + 2 * 0.3) / 2)
+    structures = structures_of(base, [*starts, *walls], True)
+    assert lasting(structures) == pytest.approx((2 * 0.6 + 2 * 0.3) / 2)
 
 
 def test_batches_have_one_structure_and_all_runs():
@@ -196,14 +204,29 @@ def test_batches_have_one_structure_and_all_runs():
         (i, {"constraints.0.surface.point": [walls[i % 3], 0, 0], "start.errors.tool.z": 1e-5 * i})
         for i in range(3000)
     ]
-    found = batches(base, runs, workers=2)
+    structures = structures_of(base, [changes for _, changes in runs], False)
+    found = batches(structures, runs, workers=2)
     assert sorted(pair for batch in found for pair in batch) == runs
     for batch in found:
         assert 1 <= len(batch) <= 32
         assert len({run % 3 for run, _ in batch}) == 1
     assert max(map(len, found)) > 1
     # With few runs no worker waits for another one.
-    assert [len(batch) for batch in batches(base, runs[:5], workers=2)] == [1] * 5
+    assert [len(batch) for batch in batches(structures, runs[:5], workers=2)] == [1] * 5
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_a_worker_stays_with_a_structure_as_long_as_it_has_runs(workers):
+    """Workers that take turns build each structure once, and one more for each further worker."""
+    structure_of = [place // 10 for place in range(60)]
+    waiting, last, builds = set(range(60)), [-1] * workers, 0
+    while waiting:
+        for worker in range(min(workers, len(waiting))):
+            place = next_place(waiting, last[worker])
+            waiting.remove(place)
+            builds += last[worker] < 0 or structure_of[place] != structure_of[last[worker]]
+            last[worker] = place
+    assert 6 <= builds <= 6 + 2 * (workers - 1)
 
 
 def test_the_data_of_a_run_are_complete_and_of_the_plant_that_a_rollout_runs():

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.common import RandomGenerator
+from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import System
+from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -95,7 +96,22 @@ def _drawn(
         source.SetRandomContext(context, RandomGenerator(seed))
     simulator, port = Simulator(source, context), source.get_output_port()
     values = [port.Eval(context).copy()]
+    if seed is not None:
+        # A source with more outputs draws all numbers at once. Drake does not return the
+        # distribution of a source, so that its first numbers decide.
+        for distribution in RandomDistribution.__members__.values():
+            if (_first(distribution, values[0].size, seed) == values[0]).all():
+                numbers = _first(distribution, values[0].size * (times.size + 1), seed)
+                return numbers.reshape(times.size + 1, -1)
     for moment in times:
         simulator.AdvanceTo(moment + 0.5 * period)
         values.append(port.Eval(context).copy())
     return np.array(values)
+
+
+def _first(distribution: RandomDistribution, size: int, seed: int) -> FloatArray:
+    """Returns the numbers with which a source of this size starts."""
+    source = RandomSource(distribution, size, 1.0)
+    context = source.AllocateContext()
+    source.SetRandomContext(context, RandomGenerator(seed))
+    return source.get_output_port().Eval(context)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from blocks_of_users import Counter_, Guarded
 from by_hand import OUTPUTS, wired
-from pydrake.common import RandomDistribution
+from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import (
@@ -231,6 +231,28 @@ def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
     )
     assert first == again
     assert len({*first, *second}) == len(first) + len(second)
+
+
+@pytest.mark.parametrize("seed", [None, 5])
+@pytest.mark.parametrize("distribution", RandomDistribution.__members__.values())
+def test_noise_is_that_of_a_simulator_for_each_distribution(distribution, seed):
+    """Equal, from a start between two samples on."""
+    builder = DiagramBuilder()
+    noise = builder.AddSystem(RandomSource(distribution, 3, 0.1))
+    builder.ExportOutput(noise.get_output_port(), "noise")
+    diagram = builder.Build()
+    context, times = diagram.CreateDefaultContext(), 0.25 + 0.1 * np.arange(30)
+    context.SetTime(0.25)
+    given = diagram, *start_values(diagram, context), times
+    seeds = None if seed is None else [seed]
+    (found,) = rollout(*given, config=fixed(5e-2), compiled=False, seeds=seeds)
+    if seed is not None:
+        noise.SetRandomContext(noise.GetMyContextFromRoot(context), RandomGenerator(seed))
+    simulator, wanted = Simulator(diagram, context), []
+    for time in times:
+        simulator.AdvanceTo(time)
+        wanted.append(noise.get_output_port().Eval(noise.GetMyContextFromRoot(context)))
+    np.testing.assert_array_equal(found.record["noise"], wanted)
 
 
 @both
