@@ -17,12 +17,16 @@ from scipy.stats import qmc
 from contact_peers.laws import LAWS
 from contact_peers.measure import run_law
 from contact_peers.plants import CONDITIONS, FRICTION
+from contact_peers.task_laws import WithObserver
 from drake_dae.arrays import FloatArray
 
 GAINS = Path(__file__).with_name("gains.json")
 
 SPREAD, DESCENT = 8, 20
-"""How many points of each kind."""
+"""How many points of each kind; laws with an observer start from their law without it."""
+
+FIRST_RATE = 100.0
+"""The first rate of an observer, in 1/s."""
 
 QUIET, NOISY = (3.5, 2.0), (1.5, 1.0)
 """How long the runs are, and from when on they count, in s."""
@@ -69,10 +73,15 @@ def search(law: type) -> dict[str, Any]:
         print(f"{law.__name__} {len(tried)}: {found:.3g} {gains(place)}", flush=True)
         return float(np.log(found))
 
-    # The first of the sequence is the corner.
-    for place in qmc.Halton(len(names), scramble=False).fast_forward(1).random(SPREAD):
-        tell(place)
-    best = min(tried, key=lambda one: one[0])[1]
+    if issubclass(law, WithObserver):
+        before = {LAWS[name]: gains for name, gains in load_gains().items()}[law.LAW]
+        start = np.log([(before | {"observer": FIRST_RATE})[name] for name in names])
+        best = (start - low) / (high - low)
+    else:
+        # The first of the sequence is the corner.
+        for place in qmc.Halton(len(names), scramble=False).fast_forward(1).random(SPREAD):
+            tell(place)
+        best = min(tried, key=lambda one: one[0])[1]
     steps = np.where(best > 0.8, -0.2, 0.2)
     simplex = np.vstack([best, best + np.diag(steps)])
     minimize(
