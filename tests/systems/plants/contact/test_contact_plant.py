@@ -203,7 +203,7 @@ def test_shipped_hydroelastic_wall_is_tracked_by_such_a_law():
 def test_the_stiffness_of_a_hydroelastic_contact_is_drakes(sphere):
     """k = dF/dd = 2 F / d of a ball at rest in Drake's plane or sphere, for a force like d^2.
 
-    A mesh with edges of 3 mm: the forces are 6 % off those of the round bodies at most.
+    A mesh with edges of 3 mm: the forces are 8 % off those of the round bodies at most.
     """
     material = ContactMaterial(1e-3, contact_model="hydroelastic", modulus=1e6, radius=0.02)
     depth = 1e-3
@@ -229,7 +229,7 @@ def test_the_stiffness_of_a_hydroelastic_contact_is_drakes(sphere):
     plant.SetFreeBodyPose(context, ball, height)
     results = plant.get_contact_results_output_port().Eval(context)
     force = abs(results.hydroelastic_contact_info(0).F_Ac_W().translational()[2])
-    assert material.stiffness_at(force, sphere) == pytest.approx(2.0 * force / depth, rel=0.06)
+    assert material.stiffness_at(force, sphere) == pytest.approx(2.0 * force / depth, rel=0.08)
 
 
 @pytest.mark.slow
