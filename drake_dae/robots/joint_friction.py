@@ -1,7 +1,7 @@
 """Coulomb and viscous friction of joints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -11,6 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import numbers, positive
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.presliding import Bristles, FrictionState, Presliding
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.kinematics import Kinematics, Reaction, position_index
 
@@ -22,21 +23,29 @@ class JointFriction(Load):
 
         tau = -(F_c / sqrt(q'^2 + v_s^2) + d) q'.
 
-    It does not stick: below the Coulomb torque a joint creeps with at most v_s. The parameters
-    "<joint>.coulomb" and "<joint>.viscous" are F_c and d. A law compensates the friction that its
-    model has; with the values 0 in the model, and others in `plant_parameters`, it is unknown.
+    It does not stick: below the Coulomb torque a joint creeps with at most v_s. With `presliding`,
+    bristles take the place of v_s and hold the joint: see `Presliding`; their state is
+    "<joint>.bristle". The parameters "<joint>.coulomb" and "<joint>.viscous" are F_c and d. A law
+    compensates the friction that its model has; with the values 0 in the model, and others in
+    `plant_parameters`, it is unknown.
 
     Attributes:
         joints: Names of joint positions.
         coulomb: F_c in N m (N), not negative, a number or one for each joint.
         viscous: d in N m s (N s/m), likewise.
         stiction_tolerance: v_s in rad/s (m/s), positive.
+        presliding: The bristles of each joint, in rad (m); None for regularized friction.
+
+    Raises:
+        ModelError: A number is negative or not positive, or the joints are not names, each once.
     """
 
     joints: Sequence[str]
     coulomb: ArrayLike = 0.0
     viscous: ArrayLike = 0.0
     stiction_tolerance: float = 0.001
+    presliding: Presliding | None = None
+    bristles: tuple[Bristles, ...] = field(init=False, default=(), repr=False, compare=False)
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -59,23 +68,47 @@ class JointFriction(Load):
                 for joint, value in zip(self.joints, values, strict=True)
             ]
         object.__setattr__(self, "parameters", tuple(parameters))
+        if self.presliding is not None:
+            sizes = [ca.SX(number) for number in astuple(self.presliding)]
+            bristles = tuple(Bristles.of([f"{joint}.bristle"], sizes) for joint in self.joints)
+            object.__setattr__(self, "bristles", bristles)
 
     @property
     def dry(self) -> tuple[str, ...]:
         return tuple(f"{joint}.coulomb" for joint in self.joints)
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
-        return Reaction(-ca.mtimes(self.resistance(kinematics), kinematics.v))
+        force = -ca.mtimes(self.resistance(kinematics), kinematics.v)
+        for joint, bristles in zip(self.joints, self.bristles, strict=False):
+            rate, row = self._rate(kinematics, joint)
+            force -= self._number(f"{joint}.coulomb") * bristles.traction(rate) * row.T
+        return Reaction(force)
+
+    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
+        if not self.bristles:
+            return None
+        pairs = zip(self.joints, self.bristles, strict=True)
+        return FrictionState.of(
+            [b.state_at(self._rate(kinematics, joint)[0]) for joint, b in pairs]
+        )
 
     def resistance(self, kinematics: Kinematics) -> ca.SX:
-        symbols = {p.name: p.symbol for p in self.parameters}
         size = kinematics.v.numel()
         total = ca.SX(size, size)
         for joint in self.joints:
-            i = position_index(kinematics, joint)
-            rate = kinematics.value(kinematics.derivative(kinematics.q[i]))
-            row = ca.sparsify(ca.simplify(ca.jacobian(rate, kinematics.v)))
-            speed = ca.sqrt(rate**2 + self.stiction_tolerance**2)
-            factor = symbols[f"{joint}.coulomb"] / speed + symbols[f"{joint}.viscous"]
+            rate, row = self._rate(kinematics, joint)
+            factor = self._number(f"{joint}.viscous")
+            if not self.bristles:
+                speed = ca.sqrt(rate**2 + self.stiction_tolerance**2)
+                factor += self._number(f"{joint}.coulomb") / speed
             total += factor * ca.mtimes(row.T, row)
         return total
+
+    def _number(self, name: str) -> ca.SX:
+        return next(p.symbol for p in self.parameters if p.name == name)
+
+    def _rate(self, kinematics: Kinematics, joint: str) -> tuple[ca.SX, ca.SX]:
+        """q_i' of a joint, and its gradient with respect to v, shape (1, nv)."""
+        i = position_index(kinematics, joint)
+        rate = kinematics.value(kinematics.derivative(kinematics.q[i]))
+        return rate, ca.sparsify(ca.simplify(ca.jacobian(rate, kinematics.v)))

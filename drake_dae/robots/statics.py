@@ -5,6 +5,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.robots.links.links import Links
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
 
@@ -57,19 +58,22 @@ class StaticBalance:
     Entries of lambda that are outputs themselves (a row of the identity) are not unknowns.
 
     Args:
-        dae: The robot's system, with the state (q, v, s).
-        q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
+        dae: The robot's system, with the state (q, v, s, friction).
+        robot: The links, with positions and velocities.
+        friction: The states of friction, shape (c, 1), which are zero here.
         S: The matrix of the given combinations of lambda, shape (k, m); without redundant
             constraints.
     """
 
-    def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, S: ca.SX) -> None:
-        links = q.numel() + v.numel()
+    def __init__(self, dae: DaeSystem, robot: Links, friction: ca.SX, S: ca.SX) -> None:
+        q, v = robot.q, robot.v
+        links, still = q.numel() + v.numel(), ca.vertcat(v, friction)
+        end = dae.num_states - friction.numel()
         control = ca.SX.sym("u", dae.num_controls)
         force = ca.SX.sym("lambda", dae.num_constraints)
         load = ca.SX.sym("z_2", S.shape[0])
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
-        balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
+        balance = ca.substitute(balance[q.numel() : end], still, ca.SX.zeros(still.numel()))
         alone = [_unit_row(S[i, :]) for i in range(S.shape[0])]
         determined = {place: i for i, place in enumerate(alone) if place is not None}
         forces = ca.SX(force)
@@ -78,12 +82,12 @@ class StaticBalance:
         combined = [i for i, place in enumerate(alone) if place is None]
         rows = (ca.mtimes(S, force) - load)[combined]
         balance = ca.substitute(ca.vertcat(balance, rows), force, forces)
-        all_forces = ca.substitute(dae.forces(forces), v, ca.SX.zeros(v.numel()))
+        all_forces = ca.substitute(dae.forces(forces), still, ca.SX.zeros(still.numel()))
         free = [i for i in range(dae.num_constraints) if i not in determined]
-        unknown = ca.vertcat(dae.state[links:], control, force[free])
+        unknown = ca.vertcat(dae.state[links:end], control, force[free])
         self._unknowns = unknown.numel()
-        self._stages = dae.num_states - links
-        self._still = np.zeros(v.numel())
+        self._stages = end - links
+        self._still, self._unbent = np.zeros(v.numel()), np.zeros(friction.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
             {"q": q, "z_2": load, "s, u, free forces": unknown, "parameters": dae.parameter_symbol},
@@ -121,7 +125,7 @@ class StaticBalance:
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
         residuals, _, constraint_force = self._function(q, forces, solution, parameters)
-        state = np.concatenate([q, self._still, solution[: self._stages]])
+        state = np.concatenate([q, self._still, solution[: self._stages], self._unbent])
         return state, constraint_force, float(np.max(np.abs(residuals), initial=0.0))
 
 

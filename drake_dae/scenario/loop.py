@@ -68,6 +68,13 @@ def build_loop(
     """
     # The law, and its exogenous signals.
     check_adaptive(scenario)
+    if model.stages and model.friction.signals:
+        text = (
+            f"'{model.friction.owner}' has presliding, and the law behind springs and motors "
+            "differentiates friction, which bristles at rest do not allow: leave presliding out, "
+            "or leave the actuation out"
+        )
+        raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
     opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))

@@ -1,7 +1,14 @@
 """The laws that the table compares, in its order."""
 
 from contact_peers.joint_laws import InverseDynamics, JointStiffness
-from contact_peers.task_laws import Admittance, Hybrid, Impedance, LeastSquares
+from contact_peers.task_laws import (
+    Admittance,
+    Hybrid,
+    HybridWithObserver,
+    Impedance,
+    ImpedanceWithObserver,
+    LeastSquares,
+)
 
 LAWS = {
     "InverseDynamicsController + J^T lambda": InverseDynamics,
@@ -10,5 +17,7 @@ LAWS = {
     "impedance + force ahead": Impedance,
     "admittance": Admittance,
     "least squares (as TSID)": LeastSquares,
+    "hybrid, PI + momentum observer": HybridWithObserver,
+    "impedance + momentum observer": ImpedanceWithObserver,
 }
 """Name -> the law, with its limits of gains."""

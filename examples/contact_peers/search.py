@@ -1,8 +1,8 @@
 """Gains of the other laws, all by one search: the same plant, runs, cost and limits of bandwidth.
 
-The plant is the point contact of 1e5 N/m with the friction known, once without noise and once with
-it. Gains are sought on a logarithmic scale, first at points of Halton's sequence, then from the
-best of them by Nelder and Mead; each point takes two runs.
+The plant is the point contact of 1e5 N/m with the friction known, to laws with observers unknown,
+once without noise and once with it. Gains are sought on a logarithmic scale, first at points of
+Halton's sequence, then from the best of them by Nelder and Mead; each point takes two runs.
 """
 
 import json
@@ -17,12 +17,16 @@ from scipy.stats import qmc
 from contact_peers.laws import LAWS
 from contact_peers.measure import run_law
 from contact_peers.plants import CONDITIONS, FRICTION
+from contact_peers.task_laws import WithObserver
 from drake_dae.arrays import FloatArray
 
 GAINS = Path(__file__).with_name("gains.json")
 
 SPREAD, DESCENT = 8, 20
-"""How many points of each kind."""
+"""How many points of each kind; laws with an observer start from their law without it."""
+
+FIRST_RATE = 100.0
+"""The first rate of an observer, in 1/s."""
 
 QUIET, NOISY = (3.5, 2.0), (1.5, 1.0)
 """How long the runs are, and from when on they count, in s."""
@@ -35,10 +39,11 @@ def cost(law: type, gains: Mapping[str, float]) -> float:
     noise of position / 0.02 mm, force / 0.1 N and roughness / 0.4 N m.
     """
     by_title = {condition.title: condition for condition in CONDITIONS}
-    still = run_law(by_title["point 1e5 N/m"], law, gains, FRICTION, *QUIET)
+    friction = FRICTION if law.KNOWS else 0.0
+    still = run_law(by_title["point 1e5 N/m"], law, gains, friction, *QUIET)
     if still.is_lost:
         return 1e6
-    noisy = run_law(by_title["noise"], law, gains, FRICTION, *NOISY)
+    noisy = run_law(by_title["noise"], law, gains, friction, *NOISY)
     parts = (
         still.position / 0.02,
         still.force / 0.03,
@@ -68,10 +73,15 @@ def search(law: type) -> dict[str, Any]:
         print(f"{law.__name__} {len(tried)}: {found:.3g} {gains(place)}", flush=True)
         return float(np.log(found))
 
-    # The first of the sequence is the corner.
-    for place in qmc.Halton(len(names), scramble=False).fast_forward(1).random(SPREAD):
-        tell(place)
-    best = min(tried, key=lambda one: one[0])[1]
+    if issubclass(law, WithObserver):
+        before = {LAWS[name]: gains for name, gains in load_gains().items()}[law.LAW]
+        start = np.log([(before | {"observer": FIRST_RATE})[name] for name in names])
+        best = (start - low) / (high - low)
+    else:
+        # The first of the sequence is the corner.
+        for place in qmc.Halton(len(names), scramble=False).fast_forward(1).random(SPREAD):
+            tell(place)
+        best = min(tried, key=lambda one: one[0])[1]
     steps = np.where(best > 0.8, -0.2, 0.2)
     simplex = np.vstack([best, best + np.diag(steps)])
     minimize(
@@ -86,9 +96,10 @@ def load_gains() -> dict[str, dict[str, float]]:
     return {name: one["gains"] for name, one in json.loads(GAINS.read_text()).items()}
 
 
-def search_all() -> None:
-    """Searches for the gains of all laws, and writes them."""
-    found: dict[str, Any] = {}
+def search_all(only: str = "") -> None:
+    """Searches for the gains of all laws whose name contains a text, and writes them."""
+    found: dict[str, Any] = json.loads(GAINS.read_text()) if only else {}
     for name, law in LAWS.items():
-        found[name] = search(law)
+        if only in name:
+            found[name] = search(law)
         GAINS.write_text(json.dumps(found, indent=1) + "\n")

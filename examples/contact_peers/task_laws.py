@@ -42,6 +42,9 @@ class TaskLaw(LeafSystem):
 
     MEMORY: ClassVar[int] = 0
 
+    KNOWS: ClassVar[bool] = True
+    """Whether its gains are sought with the friction known."""
+
     def __init__(
         self, robot: Robot, goals: Goals, gains: Mapping[str, float], start: FloatArray
     ) -> None:
@@ -75,10 +78,16 @@ class TaskLaw(LeafSystem):
         output.SetFromVector(self.control(self.robot.at(state), goal, force, memory))
 
     def _remember(self, context: Context, state: State) -> EventStatus:
-        _, goal, force, memory = self._now(context)
-        grown = memory + PERIOD * self.rate(goal, force, memory)
-        state.get_mutable_discrete_state().set_value(0, grown)
+        now, goal, force, memory = self._now(context)
+        after = self.next_memory(self.robot.at(now), goal, force, memory)
+        state.get_mutable_discrete_state().set_value(0, after)
         return EventStatus.Succeeded()
+
+    def next_memory(
+        self, robot: RobotState, goal: Goal, force: float, memory: FloatArray
+    ) -> FloatArray:
+        """The memory of the next sample."""
+        return memory + PERIOD * self.rate(goal, force, memory)
 
 
 def posture(robot: RobotState, goal: Goal, rate: float) -> FloatArray:
@@ -178,6 +187,62 @@ def modal_damping(inertia: FloatArray, stiffness: FloatArray, ratio: float) -> F
     squares, modes = eigh(np.diag(stiffness), inertia)
     seen = inertia @ modes
     return seen @ np.diag(2.0 * ratio * np.sqrt(squares)) @ seen.T
+
+
+class WithObserver(TaskLaw):
+    """Another law, less the disturbance torque r of a momentum observer (De Luca and Mattone).
+
+    With p = M v, r' = w (p' - M' v - u - J_p^T F + bias - r), where u is what acts, and F the
+    measured force with the friction of the goal. In samples (M v)' - M' v is M times the difference
+    of v. The memory after that of the law is v, the last two controls, r, and 1 after the first.
+    """
+
+    KNOWS = False
+    LAW: ClassVar[type[TaskLaw]]
+
+    def __init__(
+        self, robot: Robot, goals: Goals, gains: Mapping[str, float], start: FloatArray
+    ) -> None:
+        super().__init__(robot, goals, gains, start)
+        self._law = self.LAW(robot, goals, gains, start)
+
+    def control(
+        self, robot: RobotState, goal: Goal, force: float, memory: FloatArray
+    ) -> FloatArray:
+        size = self._law.MEMORY
+        known: FloatArray = self._law.control(robot, goal, force, memory[:size])
+        return known - memory[size:-1].reshape(4, 7)[3]
+
+    def next_memory(
+        self, robot: RobotState, goal: Goal, force: float, memory: FloatArray
+    ) -> FloatArray:
+        size = self._law.MEMORY
+        inner = memory[:size]
+        if size:
+            inner = self._law.next_memory(robot, goal, force, inner)
+        velocity, before, acting, r = memory[size:-1].reshape(4, 7)
+        contact = robot.jacobian[:3].T @ (goal.contact * force / goal.force)
+        d = robot.mass @ (robot.v - velocity) / PERIOD - acting - contact + robot.bias
+        share = 1.0 - np.exp(-self.gains["observer"] * PERIOD)
+        r = r + memory[-1] * share * (d - r)
+        control = self.control(robot, goal, force, memory)
+        return np.concatenate([inner, robot.v, control, before, r, [1.0]])
+
+
+class HybridWithObserver(WithObserver):
+    """`Hybrid` with a momentum observer."""
+
+    LAW = Hybrid
+    LIMITS: ClassVar = {**Hybrid.LIMITS, "observer": (5.0, 200.0)}
+    MEMORY = Hybrid.MEMORY + 29
+
+
+class ImpedanceWithObserver(WithObserver):
+    """`Impedance` with a momentum observer."""
+
+    LAW = Impedance
+    LIMITS: ClassVar = {**Impedance.LIMITS, "observer": (5.0, 200.0)}
+    MEMORY = 29
 
 
 class Admittance(TaskLaw):

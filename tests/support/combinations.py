@@ -6,7 +6,7 @@ from pathlib import Path
 BASE = """
 robot: {file: package://drake_dae_models/two_link_arm.urdf}
 constraints:
-- {name: wall, frame: tool, friction: %s, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+- {name: wall, frame: tool, %s, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
 outputs: [{frame: tool, axes: z}]
 start: {positions: {joint1: 1.2, joint2: -1.6}}
 duration: 0.04
@@ -17,7 +17,11 @@ integrator:
   max_step_size: 1.0e-3
   accuracy: 1.0e-9
 """
-FRICTION = {"smooth": "0.0", "frictional": "0.3"}
+FRICTION = {
+    "smooth": "friction: 0.0",
+    "frictional": "friction: 0.3",
+    "bristles": "friction: 0.3, presliding: {distance: 0.01, static_ratio: 1.2}",
+}
 ACTUATION = {
     "rigid": "",
     "springs": "actuation: [!FlexibleJoints {stiffness: 1000.0, inertia: 0.5}]\n",

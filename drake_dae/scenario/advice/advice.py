@@ -142,7 +142,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         raise ScenarioError(("gains", text))
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
-    stiffness = material.stiffness_at(_FORCE)
+    stiffness = material.stiffness_on(model, _FORCE)
     fast, noise = None, velocity_noise(scenario, period)
     known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
     loop = scenario.spring_loop

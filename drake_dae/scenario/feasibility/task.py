@@ -181,7 +181,7 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
     found = roll_scenario(ideal, loop, context)
     record, changes = found.record, loop.changes(found.context or context)
     phases = _phases(record, changes, controller, model)
-    touches, trips = _touches(record, changes, controller, scenario)
+    touches, trips = _touches(record, changes, controller, scenario, model)
     plan = controller.task.plan.phases
     problems = [
         f"{needs.name} passes a singular configuration, after {needs.begin:.4g} s"
@@ -313,6 +313,7 @@ def _touches(
     changes: Sequence[PhaseChange],
     controller: TaskController,
     scenario: Scenario,
+    model: RobotModel,
 ) -> tuple[list[Touch], list[str]]:
     """The touches, and the guards of the force that they may trip."""
     touches, problems, material = list[Touch](), list[str](), scenario.plant.material
@@ -332,7 +333,7 @@ def _touches(
         )
         if material is not None:
             felt = phase.felt(task.contact_force)
-            stiffness = material.stiffness_at(felt)
+            stiffness = material.stiffness_on(model, felt)
             late = reaction_time(scenario.sampling, material.time_step)
             peak = touch_peak(felt, speed, stiffness, mobility, late)
             touch = replace(touch, peak=peak)

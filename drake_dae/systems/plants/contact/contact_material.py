@@ -11,6 +11,7 @@ from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
     ProximityProperties,
+    Sphere,
 )
 from pydrake.multibody.plant import CoulombFriction
 
@@ -18,6 +19,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import Vector, axes_along, unit_vector
 
 FRICTION = Signal("plant.friction")
@@ -136,9 +139,30 @@ class PointMaterial:
         for peg in self.pegs:
             peg.centers(self.radius)
 
-    def stiffness_at(self, force: float) -> float:
-        """The slope of the normal force over depth, in N/m, at a normal force in N."""
+    def stiffness_at(self, force: float, sphere: float | None = None) -> float:
+        """The slope of the normal force over depth, in N/m.
+
+        Args:
+            force: The normal force in N.
+            sphere: The radius of the sphere that the ball touches, in m; None for a plane.
+        """
         return self.stiffness
+
+    def stiffness_on(self, model: RobotModel, force: float) -> float:
+        """The largest of these slopes at the contacts of a robot.
+
+        Args:
+            model: The robot.
+            force: The normal force of each contact in N.
+        """
+        values = model.dae.parameter_values
+        forms = [
+            solid.form
+            for constraint in model.constraints
+            for solid in constraint.solids(own_values(constraint, model.dae, values))
+        ]
+        spheres = {form.radius() if isinstance(form, Sphere) else None for form in forms}
+        return max(self.stiffness_at(force, sphere) for sphere in spheres or {None})
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -168,7 +192,8 @@ class ContactMaterial(PointMaterial):
         time_step: The step of the plant, s, positive.
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
-        thickness: The thickness of the compliant layer, m; hydroelastic contact only.
+        thickness: The thickness of the compliant layer of a plane, m; hydroelastic contact only. A
+            sphere is compliant to its center.
 
     Raises:
         ModelError: A number is not valid.
@@ -183,15 +208,25 @@ class ContactMaterial(PointMaterial):
         for name in ("time_step", "modulus", "thickness"):
             positive(name, getattr(self, name))
 
-    def stiffness_at(self, force: float) -> float:
-        """The slope of the normal force over depth, in N/m, at a normal force in N.
+    def stiffness_at(self, force: float, sphere: float | None = None) -> float:
+        """The slope of the normal force over depth, in N/m.
 
         A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a
-        patch of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
+        patch of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h). In a
+        sphere of radius S, whose pressure rises to E at its center, h = S and 1 / R + 1 / S takes
+        the place of 1 / R. Drake's mesh of a sphere has edges of about R, so that the contact is
+        softer at small depths: by a third at R = 20 mm, S = 100 mm and d = 1 mm.
+
+        Args:
+            force: The normal force in N.
+            sphere: The radius of the sphere that the ball touches, in m; None for a plane.
         """
         if self.contact_model == "point":
             return self.stiffness
-        return float(2.0 * np.sqrt(np.pi * self.modulus * self.radius / self.thickness * force))
+        bend, depth = 1.0 / self.radius, self.thickness
+        if sphere is not None:
+            bend, depth = bend + 1.0 / sphere, sphere
+        return float(2.0 * np.sqrt(np.pi * self.modulus * force / (bend * depth)))
 
 
 def ball_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
