@@ -170,9 +170,6 @@ class TaskSupervisor(LeafSystem):
         time, change = context.get_time(), segment.change
         distance, rate, moved, rates = self._plan.motion(self._now(context))
         contact, forces = self._contact, self._traced.forces(self._filtered(context))
-        places = segment.layout.lowest[
-            [contact.main] if change.in_contact else list(contact.places)
-        ]
         port, signal, measured = self._control_port, 0.0, self._plan.controls[change.place]
         controls = np.zeros(1) if port is None else np.abs(port.Eval(context))
         if not self._is_over(segment):
@@ -184,7 +181,7 @@ class TaskSupervisor(LeafSystem):
             force=sum(forces),
             distance=distance,
             rate=rate,
-            wanted=float(np.mean(segment.reference(time)[places])),
+            wanted=segment.wanted(contact, time),
             away=distance - change.distance,
             speed=float(np.linalg.norm(rates)),
             travel=float(np.linalg.norm(moved - segment.origin)),
