@@ -21,7 +21,7 @@ OWN = object()
 EXAMPLES = Path(__file__).parent / "examples.yaml"
 
 _ONE = (
-    r"(?:m/s\^2|m/s|kg m\^2|N m s/rad|N s/m|m/\(N s\)|N m/rad|N m/A|N/m|N/s|rad/s"
+    r"(?:m/s\^2|m/s|rad/s\^2|kg m\^2|N m s/rad|N s/m|m/\(N s\)|N m/rad|N m/A|N/m|N/s|rad/s"
     r"|1/s(?:\^mu_i|\^mu)?|N m|rad|degrees|ohm|Pa|s/m|H|m|s|N|kg)"
 )
 _UNIT = re.compile(

@@ -40,8 +40,7 @@ class Screw(Phase):
         turns: The number of turns; negative if the output falls.
         control: The name of the control whose magnitude is the torque, such as that of the joint
             that turns; needed with a torque.
-        torque: The torque at which the screw is tight, in the unit of the control; None for an end
-            by the turns.
+        torque: The torque at which the screw is tight, in N m; None for an end by the turns.
         speed: The largest speed of the output, in rad/s.
         acceleration: The largest acceleration of the output, in rad/s^2.
         lag: The largest lag of the advance, in m.
