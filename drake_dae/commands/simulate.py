@@ -292,7 +292,7 @@ def _write(run: _CommandRun) -> bool:
         }
         scenario = run.scenario
         if model is not None:
-            material = scenario.plant.material
+            material = None if loop.plant.latches else scenario.plant.material
             lines += surface_remarks(model, record)
             lines += ball_remarks(None if material is None else material.radius)
         lines += map(str, (*near.distances, *near.speeds))

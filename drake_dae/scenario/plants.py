@@ -172,6 +172,9 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
     a) off the surface. A smaller radius reduces this deviation from ideal contact; a stiffer
     contact does not. A tool that stays normal to its surface does not roll.
+
+    In a task with latches it is a `LatchedPlant`: welds and balls of Drake that commands open and
+    close, without contact.
     """
 
     carries: ClassVar[bool] = True

@@ -37,13 +37,14 @@ def test_a_box_passes_from_hand_to_hand():
     force = columns(record, "constraint_force", "left.f") + columns(
         record, "constraint_force", "right.f"
     )
-    # In the box's axes, which stay those of the world; the box exerts them on the tools.
-    np.testing.assert_allclose(-force[:, 2], 4.0 * 9.81, atol=1e-3)
-    np.testing.assert_allclose(force[:, 0], 0.0, atol=1e-3)
-    rate = columns(record, "state", "object_y")[:, 1]
-    np.testing.assert_allclose(
-        -force[1:-1, 1], 4.0 * np.gradient(rate, record.time)[1:-1], atol=0.1
-    )
+    # In the box's axes, which turn a little. Rows are 5.5 ms apart, which leaves 0.1 N.
+    names = [entry.name for entry in record.signals["state"].signals]
+    rates = record["state"][:, [names.index(f"object_{axis}") + len(names) // 2 for axis in "xyz"]]
+    acceleration = np.gradient(rates, record.time, axis=0)
+    needed = 4.0 * (acceleration - [0.0, 0.0, -9.81])
+    sizes = [np.linalg.norm(values[2:-2], axis=1) for values in (force, needed)]
+    np.testing.assert_allclose(*sizes, atol=0.1)
+    np.testing.assert_allclose(-force[-1], [0.0, 0.0, 4.0 * 9.81], atol=1e-3)
     mode = record["mode"]
     assert {tuple(row) for row in mode.tolist()} == {(0.0, 1.0), (1.0, 1.0), (1.0, 0.0)}
 
@@ -55,7 +56,8 @@ def test_a_tool_changes_with_its_payload():
     assert [change.phase for change in changes][-1] == "done"
     driver = columns(record, "constraint_force", "driver_arm.fz")[:, 0]
     grinder = columns(record, "constraint_force", "grinder_arm.fz")[:, 0]
-    assert driver[0] == pytest.approx(-1.2 * 9.81, abs=1e-6)
+    above = np.searchsorted(record.time, changes[1].time)  # The arm comes to rest there.
+    assert driver[above] == pytest.approx(-1.2 * 9.81, abs=0.05)
     assert driver[-1] == 0.0 == grinder[0]
     assert grinder[-1] == pytest.approx(-3.0 * 9.81, abs=1e-4)
     assert np.max(np.abs(record["tracking_error"] - record["predicted_error"])) < 1e-6

@@ -16,7 +16,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
 from drake_dae.robots.constraints.friction import Friction, bristles_of, friction_parameters
 from drake_dae.robots.constraints.presliding import Bristles, FrictionState, Presliding
-from drake_dae.robots.links.frames import frame_named
+from drake_dae.robots.links.frames import body_with_frame
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
@@ -290,12 +290,11 @@ class CoincidentPoints(Constraint):
     def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
         if len(self.axes) < 3:
             return super().add_to(plant)
-        a, b = (frame_named(plant, name) for name in (self.frame_a, self.frame_b))
-        points = [
-            frame.GetFixedPoseInBodyFrame() @ np.array(point)
-            for frame, point in ((a, self.point_a), (b, self.point_b))
-        ]
-        return plant.AddBallConstraint(a.body(), points[0], b.body(), points[1])
+        (a, pose_a), (b, pose_b) = (
+            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
+        )
+        points = pose_a @ np.array(self.point_a), pose_b @ np.array(self.point_b)
+        return plant.AddBallConstraint(a, points[0], b, points[1])
 
     @property
     def _rows(self) -> list[int]:

@@ -11,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae.system.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.frames import frame_named
+from drake_dae.robots.links.frames import body_with_frame
 from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
@@ -78,6 +78,7 @@ class WeldedFrames(Constraint):
         return (Application(point, *axes, self.frame_b, self.frame_a),)
 
     def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
-        a, b = (frame_named(plant, name) for name in (self.frame_a, self.frame_b))
-        pose = a.GetFixedPoseInBodyFrame() @ self.pose
-        return plant.AddWeldConstraint(a.body(), pose, b.body(), b.GetFixedPoseInBodyFrame())
+        (a, pose_a), (b, pose_b) = (
+            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
+        )
+        return plant.AddWeldConstraint(a, pose_a @ self.pose, b, pose_b)

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, FrameIndex, Joint
+from pydrake.multibody.tree import (
+    Frame,
+    FrameIndex,
+    Joint,
+    RigidBody,
+    SpatialInertia,
+    default_model_instance,
+)
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
@@ -98,6 +105,29 @@ class PlantFrames:
                     elementary_joints(plant, joint),
                 )
         return None
+
+
+def body_with_frame(plant: MultibodyPlant, name: str) -> tuple[RigidBody, RigidTransform]:
+    """A body for a constraint of Drake, and the pose of a frame in it.
+
+    Drake 1.51 ends the process at a constraint with the world, but not at one with a body that is
+    welded to the world. So a frame of the world is put on such a body, which is added.
+
+    Args:
+        plant: A plant that is not finalized.
+        name: The name of the frame.
+
+    Raises:
+        ModelError: No frame, or more than one, has that name.
+    """
+    frame = frame_named(plant, name)
+    body, pose = frame.body(), frame.GetFixedPoseInBodyFrame()
+    if body.index() == plant.world_body().index():
+        ground = f"drake_dae_ground_{plant.num_bodies()}"
+        inertia = SpatialInertia.SolidBoxWithMass(1.0, 1.0, 1.0, 1.0)
+        body = plant.AddRigidBody(ground, default_model_instance(), inertia)
+        plant.WeldFrames(plant.world_frame(), body.body_frame())
+    return body, pose
 
 
 def frame_named(plant: MultibodyPlant, name: str) -> Frame:

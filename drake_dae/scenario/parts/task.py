@@ -53,7 +53,7 @@ class ScenarioTask:
         phases: The phases in their order; after the last one the robot rests.
         contact: The name of the constraint that opens and closes; not needed if there is only one.
             Or the list of the points of a face, whose force and moments are outputs by
-            `!FaceForces`.
+            `!FaceForces`. Left out where the phases name the latches that they open and close.
         contact_force: The force in N below which the contact counts as open.
         patience: The time in s after which a contact without force counts as lost.
         tare_time: The time in s at the beginning for which a task without contact measures the bias

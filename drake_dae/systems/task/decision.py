@@ -137,12 +137,13 @@ def moment_of(
         work, signal: As of `Moment`.
     """
     (distance, rate, moved, rates), change = motion, segment.change
+    wanted = [contact.main] if change.in_contact else list(contact.places)
     return Moment(
         time=time - change.time,
         force=float(contact.total(np.array(forces))),
         distance=distance,
         rate=rate,
-        wanted=segment.wanted(contact, time),
+        wanted=float(np.mean(segment.reference(time)[segment.layout.lowest[wanted]])),
         away=distance - change.distance,
         speed=float(np.linalg.norm(rates)),
         travel=float(np.linalg.norm(moved - segment.origin)),

@@ -99,11 +99,6 @@ class ReferenceSegment:
         desired[columns.of_law(self.law)] = self.reference(time)[self.layout.lowest]
         return desired
 
-    def wanted(self, contact: OpeningContact, time: float) -> float:
-        """The desired force in N if in contact, or the mean desired distance in m."""
-        places = [contact.main] if self.change.in_contact else list(contact.places)
-        return float(np.mean(self.reference(time)[self.layout.lowest[places]]))
-
     def _goal(self, passed: float) -> FloatArray:
         reference = self.goal(passed).copy()
         reference[self.layout.lowest] += self.base + self.rate * passed

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from latches import latched_crane
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
@@ -131,3 +132,16 @@ def test_what_drake_does_not_have_is_refused(model):
         dd.LatchedPlant(planar, add_robot, ["grip"], structure=structure)
     with pytest.raises(ModelError, match="each constraint is a latch; these are grip"):
         dd.LatchedPlant(model, add_robot, [], structure=structure)
+
+
+def test_a_latch_may_be_fixed_to_the_world():
+    """Drake 1.51 ends the process at a constraint with the world itself. The weight is 2 kg g."""
+    plant = latched_crane()
+    context = plant.CreateDefaultContext()
+    plant.set_state(context, np.zeros(6))
+    plant.GetInputPort("control").FixValue(context, np.zeros(0))
+    plant.GetInputPort("latch").FixValue(context, [1.0])
+    simulator = Simulator(plant, context)
+    simulator.AdvanceTo(0.1)
+    force = plant.GetOutputPort("constraint_force").Eval(simulator.get_context())
+    np.testing.assert_allclose(force, [0.0, 0.0, 2.0 * 9.81], atol=1e-6)
