@@ -11,6 +11,5 @@ def test_a_few_plants_keep_the_bound_that_is_printed_before(tmp_path, capsys):
     with loaded("bounded_arms") as module:
         module.main(["ur5-soft", "--runs", "4", "--out", str(tmp_path)])
     printed = capsys.readouterr().out
-    assert printed.index("bound: the worst of 170 runs") < printed.index(
-        "4 of 4 within their bound"
-    )
+    bound, held = map(printed.index, ("bound: the worst of 170 runs", "4 of 4 within their bound"))
+    assert bound < held
