@@ -1,6 +1,7 @@
-"""The touch of a task on a compliant contact: its largest force, and the speed at which it lasts."""
+"""The touch of a task on a compliant contact: its largest force, and the speed that keeps it."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import inf, pi
 
 import numpy as np
@@ -105,9 +106,9 @@ class Touching:
         return forces
 
     def slowed(self, task: ScenarioTask) -> ScenarioTask:
-        """The task with a `lasting_speed` for each Approach without a speed, at most its default."""
+        """The task with a `lasting_speed` for each Approach without a speed, or its default."""
         phases = list(task.phases)
-        for index, (phase, then) in enumerate(zip(phases, phases[1:], strict=False)):
+        for index, (phase, then) in enumerate(pairwise(phases)):
             if isinstance(phase, Approach) and phase.speed is None and isinstance(then, Press):
                 lasting = self._lasting(task, then)
                 phases[index] = replace(phase, speed=rounded(min(phase.speed_of_approach, lasting)))

@@ -148,14 +148,16 @@ class ContactMaterial(PointMaterial):
 
     The robot touches with a ball; the surfaces are those of its constraints. With point contact the
     force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness. Where the robot tilts, the ball rolls: see
-    `PointMaterial`.
+    the pressure modulus times depth / thickness; curved surfaces are meshes, see `Layer`. Where the
+    robot tilts, the ball rolls: see `PointMaterial`.
 
     Attributes:
         time_step: The step of the plant, s, positive.
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer, m; hydroelastic contact only.
+        piece: The length of the sides of the piece of an unbounded curved surface that is a solid
+            in hydroelastic contact, around the nominal contact point, m.
         pegs: The pegs with which the robot touches at some constraints, in place of a ball.
 
     Raises:
@@ -165,11 +167,12 @@ class ContactMaterial(PointMaterial):
     contact_model: Literal["point", "hydroelastic"] = "point"
     modulus: float = 1e7
     thickness: float = 0.01
+    piece: float = 0.4
     pegs: Sequence[Peg] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("time_step", "modulus", "thickness"):
+        for name in ("time_step", "modulus", "thickness", "piece"):
             positive(name, getattr(self, name))
         object.__setattr__(self, "pegs", tuple(self.pegs))
         for peg in self.pegs:
