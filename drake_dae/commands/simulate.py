@@ -294,6 +294,7 @@ def _write(run: _CommandRun) -> bool:
         if model is not None:
             material = None if loop.plant.latches else scenario.plant.material
             lines += surface_remarks(model, record)
+            lines += loop.plant.remarks
             lines += ball_remarks(None if material is None else material.radius)
         lines += map(str, (*near.distances, *near.speeds))
         lines += departure_remarks(record, limits.control)

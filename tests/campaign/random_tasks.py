@@ -1,14 +1,16 @@
 """Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads, lost controls.
 
-    python tests/campaign/random_tasks.py --count 1000 --seed 0
+    python tests/campaign/random_tasks.py --count 1000 --seed 0 --out FILE
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
 phases and retries allow. Without pushes and payloads the force of every touch on Drake's contact
 has to stay below the expected peak, and the impulse on a contact that opens below speed times mass
-at the tool. Returns 1 if one does not.
+at the tool. Returns 1 if one does not. With `--out` each outcome is a line of that file when it is
+known, and the tasks in the file are not run again.
 """
 
 import argparse
+import json
 import random
 import re
 import sys
@@ -29,6 +31,7 @@ from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
 
 ENDED = ("done", "held")
+BAD = ("RAW", "HARD", "HANGS")
 REACTIONS = ("hold", "stop", "fail", "leave")
 ABOVE = 1.1
 """The largest impulse beside the expected one: the distance is controlled, to a few percent."""
@@ -197,21 +200,27 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    kinds, bad = Counter[str](), 0
+    seeds = range(options.seed, options.seed + options.count)
+    lines = options.out.read_text().splitlines() if options.out and options.out.exists() else []
+    ended = {seed: found for seed, found in map(json.loads, lines) if seed in seeds}
     with tempfile.TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
-        for seed in range(options.seed, options.seed + options.count):
+        for seed in (seed for seed in seeds if seed not in ended):
             began = time.perf_counter()
-            found = outcome(*random_task(random.Random(seed)), Path(folder))
-            bad += (is_bad := found.startswith(("RAW", "HARD", "HANGS")))
-            kinds[re.sub(r"[-+]?\d[\d.e+-]*", "#", found)[:100]] += 1
-            if is_bad or time.perf_counter() - began > 60.0:
+            ended[seed] = found = outcome(*random_task(random.Random(seed)), Path(folder))
+            if options.out:
+                with options.out.open("a") as file:
+                    print(json.dumps([seed, found]), file=file)
+            if found.startswith(BAD) or time.perf_counter() - began > 60.0:
                 print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)
+    kinds = Counter(re.sub(r"[-+]?\d[\d.e+-]*", "#", found)[:100] for found in ended.values())
     for kind, count in kinds.most_common():
         print(f"{count:6} {kind}")
-    print(f"{kinds.total():6} tasks, {bad} of them ended as none may")
-    return int(bad > 0)
+    bad = [seed for seed, found in sorted(ended.items()) if found.startswith(BAD)]
+    print(f"{len(ended):6} tasks, {len(bad)} of them ended as none may: {bad}")
+    return int(bool(bad))
 
 
 if __name__ == "__main__":

@@ -84,9 +84,9 @@ def test_live_view_draws_a_task(file):
 
 @pytest.mark.slow
 def test_shipped_task_touches_as_designed_and_is_as_predicted():
-    """Friction 0.3 at 0.03 m/s: the speed to 1e-5, outputs to 5e-5 of N and m, with 1e-6 a step.
+    """Friction 0.3 at 0.05 m/s: the touch to 1e-4, outputs to 5e-5 of N and m, with 1e-6 a step.
 
-    The approach takes 1 s and half a ramp of 0.5 s, after 2.1 s on the way.
+    The approach takes 0.6 s and half a ramp of 0.5 s, after 2.1 s on the way.
     """
     loop, context, record = run_scenario(
         scenario("wall_polish", "duration=3.5", "integrator.accuracy=1e-6")
@@ -94,9 +94,9 @@ def test_shipped_task_touches_as_designed_and_is_as_predicted():
     assert loop.generator is None
     touch = loop.changes(context)[2]
     assert touch.phase == "Press"
-    assert_allclose(touch.time, 2.1 + 1.0 + 0.25, atol=1e-5)
+    assert_allclose(touch.time, 2.1 + 0.6 + 0.25, atol=1e-4)
     before = record.time < touch.time - 1e-6
-    assert_allclose(record["distance"][before][-1, 1], -0.03, atol=1e-5)
+    assert_allclose(record["distance"][before][-1, 1], -0.05, atol=1e-4)
     assert np.abs(record["tracking_error"] - loop.predicted_error(record)).max() < 5e-5
 
 
@@ -177,20 +177,11 @@ def test_several_integrals_serve_a_task_whose_contact_opens(file):
 def test_polishing_with_friction_on_drakes_contact_keeps_the_contact_and_the_path():
     """Within 0.02 mm and 0.05 N two seconds after the transition; the touch does not bounce.
 
-    It touches at 0.015 m/s and presses within 0.1 s: 20 N stop the rebound of 33 kg. The law does
-    not know the friction of 0.3; the equations of Drake's contact are those of its plant.
+    As shipped, with another plant, whose equations are those of Drake's contact. The law does not
+    know the friction of 0.3.
     """
-    found = scenario(
-        "wall_polish",
-        "plant=!CompliantContact {radius: 1.0e-5, friction: 0.3}",
-        "constraints.0.friction=0",
-        "gains=null",
-        "constraint_damping=null",
-        "task.gains=null",
-        "task.phases.1.speed=0.015",
-        "task.phases.2.over=0.1",
-        "duration=10",
-    )
+    plant = "plant=!CompliantContact {radius: 1.0e-5, friction: 0.3}"
+    found = scenario("wall_polish", plant, "constraints.0.friction=0", "duration=10")
     completed, loop = build_completed(found)
     context = start_scenario(completed.scenario, loop)
     rolled = roll_scenario(completed.scenario, loop, context)
@@ -203,6 +194,39 @@ def test_polishing_with_friction_on_drakes_contact_keeps_the_contact_and_the_pat
     assert record.time[late][0] < 7.0
     assert np.linalg.norm(errors[late][:, :2], axis=1).max() < 2e-5
     assert np.abs(errors[late, 6]).max() < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", [None, 5.0])
+def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
+    """The speed, without a bounce, is within 25 % of that at which the contact opens again.
+
+    A touch that falls between samples is felt with a force of up to k v T, which helps to keep the
+    contact; so the computed speed may be below the largest one, and is not above it.
+    """
+    settings = ["plant=!CompliantContact {radius: 1.0e-5, stiffness: 1.0e5}", "gains=null"]
+    settings += ["task.gains=null", "task.phases.0.speed=null", "duration=1.5"]
+    settings.append("constraints.0.surface.point=[1.183, 0, 0]")  # 3 mm before it
+    if mass:
+        settings.append(f"robot.payloads=[{{frame: tool, mass: {mass}}}]")
+    computed = build_completed(load_scenario(file, settings))[0].scenario.task.phases[0].speed
+    assert 1e-3 < computed < 0.049  # Less than the default.
+
+    def least_force(speed):
+        completed, loop = build_completed(
+            load_scenario(file, [*settings, f"task.phases.0.speed={speed}", "task.retries=0"])
+        )
+        if speed > computed * 1.01:
+            assert "the tool may bounce: Press keeps the contact up to" in completed.notes[-1]
+        context = start_scenario(completed.scenario, loop)
+        rolled = roll_scenario(completed.scenario, loop, context)
+        changes = loop.changes(rolled.context)
+        touched = changes[1].time
+        near = (rolled.record.time >= touched) & (rolled.record.time < touched + 0.4)
+        return rolled.record["constraint_force"][near, 0].min()
+
+    assert least_force(computed) > 0.0
+    assert least_force(1.25 * computed + 0.004) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,10 @@ def test_rollouts_diverge_as_simulations_do(fixed, compiled):
 @pytest.mark.thorough
 def test_tasks_diverge_by_their_own_outputs():
     """By simulate; rollouts, which are looked at before they have a row, end at least."""
-    settings = ("wall_polish", "gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004))
+    free = 'task.gains=!Poles {outputs: {wall.distance: [-5.0], "*": [-25.0]}}'
+    touch = ("task.phases.1.speed=0.03", "task.phases.2.over=0.5")
+    gains = ("gains=!Poles {all: [-400.0]}", free)
+    settings = ("wall_polish", *gains, *touch, LATE % (0.004, 0.004))
     with pytest.raises(SimulationError, match=r"the error of wall.force .* has grown") as caught:
         run(*settings)
     assert 3.0 < caught.value.time < 4.0

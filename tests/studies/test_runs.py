@@ -177,7 +177,9 @@ def test_what_no_rollout_has_is_reported_with_a_remedy():
 @pytest.mark.slow
 def test_tasks_vary_as_references_do():
     """Their gains are built in, also for rollouts, which give the same figures."""
-    base = scenario_data(scenario("wall_polish", "duration=0.1", "compiled=false"))
+    base = scenario_data(
+        scenario("wall_polish", "duration=0.1", "compiled=false", "gains=!Poles {all: [-25.0]}")
+    )
     slower = {"gains.all": [-20.0]}
     assert structure_key(varied_data(base, slower), base) != structure_key(base, base)
     (found,) = Runner(base).run_all([(0, slower)])

@@ -18,6 +18,7 @@ from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
@@ -133,8 +134,8 @@ class Constraint(ABC):
         them as well.
     13. `friction_parameter` is the name of its coefficient of friction, if it has one, and
         `sliding` is the sliding velocity.
-    14. `solids` are the geometry for Drake's own contact: objects in the world that act on frame B
-        of its first application at the point there.
+    14. `solids` and `layer` are the geometry for Drake's own contact: objects in the world that act
+        on frame B of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
         clearance of that point, except beyond the ends of a body that the law does not know.
     16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
@@ -277,6 +278,22 @@ class Constraint(ABC):
             f"'{self.name}': Drake has no constraint for a {type(self).__name__}; use a "
             "WeldedFrames, a CoincidentPoints with three axes, or ideal constraints"
         )
+
+    def layer(
+        self, values: FloatArray, point: FloatArray, size: float, depth: float
+    ) -> Layer | None:
+        """A mesh below a piece of the surface, for hydroelastic contact; None without a surface.
+
+        Args:
+            values: The values of its parameters in one vector.
+            point: The middle of the piece, in the world, m, shape (3,).
+            size: The length of its sides if the surface is unbounded, m.
+            depth: The thickness of the layer, m.
+
+        Raises:
+            ModelError: The surface does not have such a piece.
+        """
+        return None
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         """The visible object in contact, or None.

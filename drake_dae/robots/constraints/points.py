@@ -1,6 +1,6 @@
 """Points on a surface, coincident points, and points at a fixed distance."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import casadi as ca
@@ -18,6 +18,7 @@ from drake_dae.robots.constraints.friction import Friction, bristles_of, frictio
 from drake_dae.robots.constraints.presliding import Bristles, FrictionState, Presliding
 from drake_dae.robots.links.frames import body_with_frame
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
 from drake_dae.trace.smoothness import length_of
@@ -232,13 +233,21 @@ class PointOnSurface(Constraint):
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
         stands = self.placement(values)
-        surface = self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
-        picture = surface.picture(stands.inverse() @ point, size)
+        picture = self._shaped(values).picture(stands.inverse() @ point, size)
         return None if picture is None else picture.moved(stands)
+
+    def _shaped(self, values: FloatArray) -> Surface:
+        """The surface with the values of its shape numbers."""
+        return self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
 
     def solids(self, values: FloatArray) -> tuple[PosedShape, ...]:
         pose = self.placement(values)
         return tuple(solid.moved(pose) for solid in self.surface.solids())
+
+    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> Layer:
+        pose = self.placement(values)
+        layer = self._shaped(values).layer(pose.inverse() @ point, size, depth)
+        return replace(layer, solid=layer.solid.moved(pose))
 
 
 @checked(ModelError)

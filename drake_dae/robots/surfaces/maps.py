@@ -67,12 +67,23 @@ class _Map(Surface):
         """The deviation from its data, as text."""
 
     def picture(self, center: ArrayLike, size: float) -> PosedShape:
-        sides = self.relief.x, self.relief.y
-        x, y = (np.linspace(side[0], side[1], 3 * CELLS + 1) for side in sides)
+        even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
+        grid = self._piece(np.zeros(3), size, (even, even))
+        return PosedShape(mesh_of_grid(grid.swapaxes(0, 1)), RigidTransform())
+
+    def _lengths(self, size: float) -> Pair:
+        return float(np.ptp(self.relief.x)), float(np.ptp(self.relief.y))
+
+    def _piece(
+        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        x, y = (
+            side.mean() + np.ptp(side) * part
+            for side, part in zip((self.relief.x, self.relief.y), places, strict=True)
+        )
         along, across = tangents(self.normal)
-        places = x[:, None] * along + y[:, None, None] * across
-        points = places + self.relief.heights(x, y)[..., None] * np.array(self.normal)
-        return PosedShape(mesh_of_grid(points), RigidTransform())
+        level = x[:, None, None] * along + y[:, None] * across
+        return level + self.relief.heights(x, y).T[..., None] * np.array(self.normal)
 
     def _remark_of(self, source: str) -> str:
         width = max(bells.width for bells in self.relief.bells)

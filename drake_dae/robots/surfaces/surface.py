@@ -15,6 +15,7 @@ from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.layer import Layer, facets_needed, layer_below, sides
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -23,8 +24,8 @@ from drake_dae.trace.smoothness import length_of
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
 
-CELLS = 24
-"""The number of cells of a mesh along each side."""
+EVEN = np.linspace(-0.5, 0.5, 25)
+"""The places of the points of a mesh along each side."""
 
 
 @checked(ModelError)
@@ -46,9 +47,10 @@ class Surface(ABC):
     6. `shape` are named numbers of its form that may vary; most surfaces have none. `shaped` is the
        same surface with other values, numbers or symbols.
     7. `solids` are Drake shapes that together fill the side opposite to the free one, for Drake's
-       own contact; convex if there are several. A surface may have none. `clearance` is the signed
-       distance from the body that compliant plants use. It differs from `distance` where a body
-       ends, which laws do not know.
+       own contact; convex if there are several. A surface may have none. `layer` is a mesh below a
+       piece of any smooth surface, for hydroelastic contact. `clearance` is the signed distance
+       from the body that compliant plants use. It differs from `distance` where a body ends, which
+       laws do not know.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
        which it is defined, if that is bounded.
     """
@@ -113,7 +115,7 @@ class Surface(ABC):
             center: A point of interest, relative to the reference point, m, shape (3,).
             size: The size of the piece to draw if it is unbounded, m.
         """
-        grid = self._patch(np.asarray(center, float), size)
+        grid = self._patch(np.asarray(center, float), size, (EVEN, EVEN))
         if np.all(np.isfinite(grid), axis=2).sum() < 3:
             warnings.warn(
                 f"{type(self).__name__}: no point of it is found within {size:.3g} m of "
@@ -127,6 +129,26 @@ class Surface(ABC):
         """The solids below the surface, with its reference point at the origin; () for none."""
         return ()
 
+    def layer(self, center: ArrayLike, size: float, depth: float) -> Layer:
+        """A layer of a mesh below a piece, with the reference point of the surface at the origin.
+
+        Args:
+            center: The middle of the piece, relative to the reference point, m, shape (3,).
+            size: The length of each side of the piece if the surface is unbounded, m.
+            depth: The thickness of the layer, m.
+
+        Raises:
+            ModelError: The piece is not on the surface everywhere, or too curved.
+        """
+        place = np.asarray(center, float)
+        lengths = self._lengths(size)
+        facets = facets_needed(self._piece(place, size, (EVEN, EVEN)))
+        along, across = (
+            sides(count, length, depth) for count, length in zip(facets, lengths, strict=True)
+        )
+        grid = self._piece(place, size, (along, across))
+        return layer_below(grid, self._linear(), depth, lengths)
+
     def clearance(self, offset: ca.SX) -> ca.SX:
         """The signed distance of a point from the body in m; the `distance` if it does not end.
 
@@ -135,16 +157,36 @@ class Surface(ABC):
         """
         return self.distance(offset)
 
-    def _patch(self, center: FloatArray, size: float) -> FloatArray:
-        """A grid of points on the surface, shape (k, k, 3); NaN where there is none.
+    def _lengths(self, size: float) -> Pair:
+        """The lengths of the sides of a piece in m: `size`, if the surface is unbounded."""
+        return size, size
 
-        A grid of the tangent plane below `center`, projected onto the surface by Newton's method.
-        """
+    def _piece(
+        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        """The grid of a `layer`, as of `_patch`: of all of a bounded surface."""
+        return self._patch(center, size, places)
+
+    def _linear(self) -> TracedFunction:
+        """The distance of a point and its gradient."""
         p = ca.SX.sym("p", 3)
         distance = self.distance(p)
-        function = TracedFunction(
+        return TracedFunction(
             "distance", {"offset": p}, {"distance": distance, "gradient": ca.gradient(distance, p)}
         )
+
+    def _patch(
+        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        """A grid of points on the surface, shape (r, c, 3); NaN where there is none.
+
+        A grid of the tangent plane below `center`, projected onto the surface by Newton's method.
+
+        Args:
+            center, size: As for `picture`.
+            places: The places of rows and columns along the sides, from -1/2 to 1/2.
+        """
+        function = self._linear()
 
         def linearize(point: FloatArray) -> NewtonModel | None:
             gradient = function(point)[1]
@@ -165,8 +207,8 @@ class Surface(ABC):
         if not (np.all(np.isfinite(normal)) and normal.any()):
             return np.full((1, 1, 3), np.nan)
         first, second = tangents(normal / np.linalg.norm(normal))
-        steps = size * np.linspace(-0.5, 0.5, CELLS + 1)
-        return np.array([[foot(middle + a * first + b * second) for b in steps] for a in steps])
+        rows, columns = (size * part for part in places)
+        return np.array([[foot(middle + a * first + b * second) for b in columns] for a in rows])
 
 
 def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Parameter, ...]]:

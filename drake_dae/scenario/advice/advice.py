@@ -8,6 +8,7 @@ from drake_dae.dae.beyond.contact_advice import advised_gains
 from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
 from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.tracking.constraint_damping import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.sensed import (
@@ -17,14 +18,13 @@ from drake_dae.scenario.advice.sensed import (
     sensed_contact,
 )
 from drake_dae.scenario.advice.springs import NOISE, loop_note, rounded, velocity_noise, with_loop
+from drake_dae.scenario.advice.touch import Touching, reaction_time
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.control.sampling import Sampling
 
 _SOFTER = 5.0
 """The ratio of the poles of positions to those of the distance, of a robot without contact."""
@@ -44,47 +44,12 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
     )
 
 
-def touch_peak(felt: float, speed: float, stiffness: float, mobility: float, late: float) -> float:
-    """The largest expected force in N when contact is made, F + v (sqrt(k / A) + k t).
-
-    The contact of stiffness k stops the effective mass 1 / A of the tool from the speed v, and in
-    the time t until the law reacts the tool moves on by v t.
-
-    Args:
-        felt: F, the force that ends the phase, in N.
-        speed: v, in m/s.
-        stiffness: k, in N/m.
-        mobility: A, in 1/kg.
-        late: t, in s.
-    """
-    return felt + speed * ((stiffness / mobility) ** 0.5 + stiffness * late)
-
-
-def reaction_time(sampling: Sampling | None, step: float) -> float:
-    """The longest time in s until a law reacts, with lost controls.
-
-    Args:
-        sampling: The sampling of the law; None where it acts at each step of the plant.
-        step: The step of the plant, in s.
-    """
-    if sampling is None:
-        return step
-    lost = sampling.burst if sampling.loss else 0
-    return sampling.period * (1 + sampling.late_samples + lost)
-
-
-def _touch_note(task: ScenarioTask | None, stiffness: float, mobility: float, late: float) -> str:
-    """A note on the largest `touch_peak` of a task."""
-    peaks = []
-    for phase in () if task is None else task.make().phases:
-        if task is not None and (speed := phase.speed_of_approach):
-            felt = phase.felt(task.contact_force)
-            peaks.append((touch_peak(felt, speed, stiffness, mobility, late), speed, phase.name))
-    if not peaks:
-        return ""
-    peak, speed, name = max(peaks)
-    which = f" by {name}" if len(peaks) > 1 else ""
-    return f". A touch{which} at {speed:g} m/s is expected to stay below {peak:.3g} N"
+def _least(
+    structure: Structure, damping: parts.Poles | parts.Coefficients | parts.Matrices
+) -> float:
+    """The least damping of a constraint, in 1/s."""
+    with at("constraint_damping"):
+        return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
@@ -190,6 +155,18 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     task = scenario.task
     if task is not None and task.gains is None:
         task = replace(task, gains=_free_gains(scenario, model, contact))
+    touch_note = ""
+    if task is not None:
+        touching = Touching(
+            stiffness,
+            mobility,
+            contact.constraint_damping if damping is None else _least(structure, damping),
+            contact.force_gain,
+            period,
+            reaction_time(sampling, period),
+        )
+        task = touching.slowed(task)
+        touch_note = touching.note(task)
     chosen = replace(
         scenario,
         task=task,
@@ -210,6 +187,6 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {identified}{estimated}"
         f"{loop_note(scenario)}{outlook}"
-        f"{_touch_note(task, stiffness, mobility, reaction_time(sampling, period))}"
+        f"{touch_note}"
     )
     return Completed(chosen, (note,))

@@ -16,7 +16,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import SimulationError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.advice.advice import reaction_time, touch_peak
+from drake_dae.scenario.advice.touch import reaction_time, touch_peak
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
 from drake_dae.scenario.plants import IdealConstraints

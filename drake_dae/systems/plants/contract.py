@@ -100,6 +100,7 @@ class Plant(System):
     projects: bool = False
     is_ideal: bool = True
     pushes: System | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:

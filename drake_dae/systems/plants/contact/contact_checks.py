@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, Cylinder
+from pydrake.geometry import Box, HalfSpace, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
-from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.arrays import FloatArray, numbers, show, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 
 
@@ -33,18 +35,20 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
     check_without_bristles(model)
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
-        if not (solids := constraint.solids(values)):
+        solids = constraint.solids(values)
+        if material.contact_model == "hydroelastic":
+            # A ball meets the edges of a box, and a mesh is smooth.
+            if any(isinstance(solid.form, Box) for solid in solids):
+                raise ModelError(
+                    f"hydroelastic contact has no edges, as '{constraint.name}' has; use point "
+                    "contact (contact_model: point)"
+                )
+        elif not solids:
             raise ModelError(
-                f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
-                "Plane or Plate, or on the outside of a Sphere or a Cylinder, or an ideal plant"
-            )
-        if material.contact_model == "hydroelastic" and any(
-            isinstance(solid.form, Box | Cylinder) for solid in solids
-        ):
-            # Drake meshes a long cylinder too coarsely: 2 N of ripple in a force of 20 N.
-            raise ModelError(
-                f"hydroelastic contact needs a Plane or a Sphere as surface of "
-                f"'{constraint.name}'; use point contact (contact_model: point)"
+                f"'{constraint.name}' has no solid for Drake's point contact, as a "
+                "PointOnSurface has on a Plane or Plate, or on the outside of a Sphere or a "
+                "Cylinder. Use hydroelastic contact (contact_model: hydroelastic), which meshes "
+                "any smooth surface, or `plant: !CompliantContact`"
             )
     check_pegs(model, material)
 
@@ -73,6 +77,34 @@ def check_without_bristles(model: RobotModel) -> None:
             "bristles: its steps are too long for them. Use `plant: !CompliantContact {time_step: "
             "0}` or `plant: !IdealConstraints`"
         )
+
+
+def solids_of(
+    constraint: Constraint, values: FloatArray, point: FloatArray, material: ContactMaterial
+) -> tuple[tuple[PosedShape, ...], str]:
+    """The solids of a constraint in the world, and a remark on their deviation from its surface.
+
+    Args:
+        constraint: The contact.
+        values: The values of its parameters.
+        point: Its nominal contact point in the world, m, shape (3,).
+        material: The contact material.
+
+    Raises:
+        ModelError: There are none.
+    """
+    solids = constraint.solids(values)
+    exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
+    if material.contact_model == "point" or exact:
+        return solids, ""
+    # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
+    try:
+        layer = constraint.layer(values, point, material.piece, material.thickness)
+    except ModelError as error:
+        raise ModelError(f"{constraint.name}: {error}") from None
+    if layer is None:
+        raise ModelError(f"'{constraint.name}' is no contact with a surface: use an ideal plant")
+    return (layer.solid,), f"{constraint.name} around {show(point)} m is {layer}"
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:

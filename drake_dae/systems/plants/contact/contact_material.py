@@ -185,8 +185,8 @@ class ContactMaterial(PointMaterial):
 
     The robot touches with a ball; the surfaces are those of its constraints. With point contact the
     force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness. Where the robot tilts, the ball rolls: see
-    `PointMaterial`.
+    the pressure modulus times depth / thickness; curved surfaces are meshes, see `Layer`. Where the
+    robot tilts, the ball rolls: see `PointMaterial`.
 
     Attributes:
         time_step: The step of the plant, s, positive.
@@ -194,6 +194,8 @@ class ContactMaterial(PointMaterial):
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer of a plane, m; hydroelastic contact only. A
             sphere is compliant to its center.
+        piece: The length of the sides of the piece of an unbounded curved surface that is a solid
+            in hydroelastic contact, around the nominal contact point, m.
 
     Raises:
         ModelError: A number is not valid.
@@ -202,10 +204,11 @@ class ContactMaterial(PointMaterial):
     contact_model: Literal["point", "hydroelastic"] = "point"
     modulus: float = 1e7
     thickness: float = 0.01
+    piece: float = 0.4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("time_step", "modulus", "thickness"):
+        for name in ("time_step", "modulus", "thickness", "piece"):
             positive(name, getattr(self, name))
 
     def stiffness_at(self, force: float, sphere: float | None = None) -> float:

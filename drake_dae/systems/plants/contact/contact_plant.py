@@ -37,6 +37,7 @@ from drake_dae.systems.plants.contact.contact_checks import (
     check_model,
     check_same,
     point_mass,
+    solids_of,
 )
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contact.contact_material import (
@@ -92,7 +93,8 @@ class ContactPlant(Diagram, Plant):
         query_object: Drake's, of the scene with the contact geometry.
 
     Args:
-        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with `solids`.
+        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with `solids`, or
+            on any smooth one in hydroelastic contact.
         add_robot: Adds the robot to a plant, as it was added to the plant of the model.
         material: The contact material.
         structure: The structure of the model's system.
@@ -105,6 +107,7 @@ class ContactPlant(Diagram, Plant):
         dae, model, structure, time_step: As for `Plant`.
         multibody: Drake's plant.
         contact_force_signals: Names and units of `contact_force`.
+        remarks: As for `Plant`: the deviations of meshes from their surfaces.
 
     Raises:
         ModelError: The robot's contacts cannot be represented, or the step is too long for its
@@ -201,10 +204,13 @@ class ContactPlant(Diagram, Plant):
     ) -> list[tuple[list[GeometryId], list[GeometryId]]]:
         """Balls on the robot and solids in the world for each constraint, and nothing else."""
         pairs = []
-        for constraint, (frame, centers) in zip(
+        remarks = []
+        for constraint, (frame, centers, point) in zip(
             self.model.constraints, self._balls(plant, material), strict=True
         ):
-            solids = constraint.solids(own_values(constraint, self.dae, self._values))
+            values = own_values(constraint, self.dae, self._values)
+            solids, remark = solids_of(constraint, values, point, material)
+            remarks.append(remark)
             friction, name = material.friction, constraint.friction_parameter
             if friction is None:
                 friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
@@ -229,6 +235,7 @@ class ContactPlant(Diagram, Plant):
                 for number, solid in enumerate(solids)
             ]
             pairs.append((balls, touched))
+        self.remarks = tuple(filter(None, remarks))
         # The robot's own shapes do not collide, and a ball collides only with its own surface.
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()
@@ -239,8 +246,8 @@ class ContactPlant(Diagram, Plant):
 
     def _balls(
         self, plant: MultibodyPlant, material: ContactMaterial
-    ) -> list[tuple[Frame, list[FloatArray]]]:
-        """The frame of each constraint on the robot, and the centers of its balls in it."""
+    ) -> list[tuple[Frame, list[FloatArray], FloatArray]]:
+        """For each constraint its frame, the centers of its balls in it, and its contact point."""
         model, values, drawn = self.model, self._values, self.model.links.plant
         assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
@@ -259,7 +266,7 @@ class ContactPlant(Diagram, Plant):
             centers = [pose.inverse() @ (point + material.radius * normal)]
             if peg := pegs.get(constraint.name):
                 centers = list(pose.inverse() @ point + peg.centers(material.radius))
-            balls.append((GetScopedFrameByName(plant, name), centers))
+            balls.append((GetScopedFrameByName(plant, name), centers, point))
         return balls
 
     def _other_masses(self) -> list[tuple[RigidBody, float, FloatArray | None]]:

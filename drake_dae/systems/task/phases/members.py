@@ -13,6 +13,9 @@ from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
+_SPEED = 0.05
+"""The default speed of an Approach, in m/s."""
+
 _AWAY = 0.02
 """The distance in m from its start at which a Release has left the contact."""
 
@@ -24,7 +27,8 @@ class Approach(Phase):
 
     Attributes:
         speed: The speed of the touch, in m/s; less if it touches during the transition, such as
-            after a start at rest nearer than speed * over / 2.
+            after a start at rest nearer than speed * over / 2. None for 0.05 m/s, and for less
+            where a scenario computes the gains for a compliant contact: see `lasting_speed`.
         behind: The largest distance behind the surface of the model, in m; farther behind it is
             late.
         over: The duration of the transition from the previous references, in s.
@@ -32,7 +36,7 @@ class Approach(Phase):
         if_late: The successor if it lasts longer; on_failure if left out.
     """
 
-    speed: float = 0.05
+    speed: float | None = None
     behind: float = 0.05
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
@@ -40,7 +44,7 @@ class Approach(Phase):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive("Approach: speed", self.speed)
+        positive("Approach: speed", self.speed_of_approach)
         positive("Approach: behind", self.behind)
         for key in ("if_late", "on_failure"):
             if getattr(self, key) == "approach":
@@ -51,7 +55,7 @@ class Approach(Phase):
 
     @property
     def speed_of_approach(self) -> float:
-        return self.speed
+        return _SPEED if self.speed is None else self.speed
 
     def remaining(self, now: Moment) -> float:
         remaining: float = ca.fmin(super().remaining(now), now.distance + self.behind)

@@ -1,5 +1,6 @@
 """Drake's own contact as the plant, against the ideal constraint and Drake's own numbers."""
 
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -232,6 +233,44 @@ def test_the_stiffness_of_a_hydroelastic_contact_is_drakes(sphere):
     assert material.stiffness_at(force, sphere) == pytest.approx(2.0 * force / depth, rel=0.08)
 
 
+NEAR = (
+    "references={tool.z: !Sinusoids {offset: 0.4, amplitudes: [0.1], frequencies: [1.0]}, "
+    "wall.force: 20}"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "surface",
+    [
+        '!ImplicitSurface {function: "1.2 + 0.01*sin(20*z) - x"}',
+        pytest.param(
+            "!Cylinder {point: [1.5, 0, 0.3], axis: [0, 1, 0], radius: 0.3}",
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(
+            "!Ellipsoid {center: [1.6, 0, 0.3], semi_axes: [0.4, 0.4, 0.6]}",
+            marks=pytest.mark.thorough,
+        ),
+    ],
+)
+def test_a_curved_surface_is_a_mesh_in_hydroelastic_contact(surface):
+    """Within 0.2 mm and 1 N of 20 N, by a law without integrals whose ball rolls by 10 mm.
+
+    In point contact of `CompliantPlant` it is 0.1 mm and 0.5 N.
+    """
+    settings = ("plant.contact_model=hydroelastic", "plant.modulus=1.0e8", "plant.radius=0.01")
+    loop, _, record = run_scenario(
+        two_link(f"constraints.0.surface={surface}", *settings, "plant.piece=0.6", NEAR)
+    )
+    (remark,) = loop.plant.remarks
+    assert remark.startswith("wall around [1.")
+    assert re.search(r"off by up to [0-9.]+ um and 0\.[0-9]+ degrees", remark)
+    late = record["tracking_error"][record.time > 0.8]
+    assert np.abs(late[:, 0]).max() < 1e-3
+    assert np.abs(late[:, 1]).max() < 1.0
+
+
 @pytest.mark.slow
 def test_sphere_is_a_sphere():
     """The dome of the ideal plant in point contact: measured 0.04 N rms."""
@@ -276,11 +315,13 @@ def test_analysis_and_pictures_stay(tmp_path):
         (["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"], "solid"),
         (
             [
-                "constraints.0.surface=!Cylinder {point: [1, 0, 0], axis: [0, 0, 1], radius: 0.4}",
+                "constraints.0.surface=!Cylinder {point: [1, 0, 0], axis: [0, 0, 1], radius: 0.2}",
                 "plant.contact_model=hydroelastic",
+                "plant.piece=0.02",
             ],
-            "hydroelastic contact needs a Plane or a Sphere",
+            "wall: a piece of 0.02 m is too short for a layer of 0.01 m",
         ),
+        (["plant.contact_model=hydroelastic", "plant.piece=-1"], "piece must be positive"),
     ],
 )
 def test_what_drakes_contact_cannot_be_is_refused(settings, message):
