@@ -80,6 +80,10 @@ def simulate(
 
     If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
 
+    If Drake steps the plant and other blocks are sampled and traced, as on a `ContactPlant`, one
+    call computes these blocks at a sample, in runs of 500 steps or more. `after_step`, a view or a
+    real-time rate need each step; then the blocks run one by one.
+
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
 
