@@ -162,7 +162,7 @@ def _step(run: _CommandRun) -> RunStatistics:
         run.scenario.duration,
         run.scenario.integrator,
         progress=True,
-        after_step=run.writer.update if run.scenario.write.record else None,
+        look=run.writer.update if run.scenario.write.record else None,
         may_diverge=run.scenario.may_diverge,
     )
 

@@ -32,7 +32,7 @@ from drake_dae.systems.blocks.traced import (
 @checked(ModelError)
 def compile_diagram(
     diagram: Diagram,
-    outputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | Mapping[str, OutputPort] | None = None,
     *,
     context: Context | None = None,
 ) -> CompiledDiagram:
@@ -45,7 +45,8 @@ def compile_diagram(
 
     Args:
         diagram: The diagram.
-        outputs: The names of output ports of the diagram; all vector-valued ones if None.
+        outputs: The names of output ports of the diagram, or name -> output port of a system in it;
+            all vector-valued output ports of the diagram if None.
         context: A context of the diagram, in which unconnected input ports have fixed values; these
             values become parameters. The default context if None.
 
@@ -53,7 +54,10 @@ def compile_diagram(
         ModelError: An output does not exist, an input port has neither a connection nor a value,
             the diagram has an algebraic loop, or a block cannot be traced.
     """
-    return _compiled(Wires.of(diagram), outputs, context)
+    wires = Wires.of(diagram)
+    if isinstance(outputs, Mapping):
+        wires = replace(wires, outputs={name: leaf_port(port) for name, port in outputs.items()})
+    return _compiled(wires, None if outputs is None else list(outputs), context)
 
 
 def compile_part(

@@ -138,8 +138,8 @@ class CompiledDiagram:
                 scales[part] = scale
         return scales
 
-    def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
-        """The continuous and the discrete state in a context; NaN where `Block.begins` is True."""
+    def start(self, context: Context, has_begun: bool = False) -> tuple[FloatArray, FloatArray]:
+        """The states in a context; discrete ones are NaN where a block `begins` and has not."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
             local = system.GetMyContextFromRoot(context)
@@ -147,7 +147,7 @@ class CompiledDiagram:
         for system, part in self.held:
             local, block = system.GetMyContextFromRoot(context), self.blocks[system]
             groups = [block.stepped.held(local)] if block.stepped else discrete_states(local)
-            held[part] = np.nan if block.begins else np.concatenate(groups)
+            held[part] = np.nan if block.begins and not has_begun else np.concatenate(groups)
         return state, held
 
     def set_context(

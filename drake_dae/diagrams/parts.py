@@ -20,6 +20,7 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
+from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.governing.feasible_control import FeasibleControl
@@ -267,5 +268,7 @@ def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> Vector
     plant belongs to a time that the run has not reached.
     """
     if plant.time_step:
-        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
+        log = builder.AddSystem(SampleLog(port.size(), plant.time_step))
+        builder.Connect(port, log.get_input_port())
+        return log
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})

@@ -60,17 +60,18 @@ class DivergenceWatch:
         """Whether there is a plant to check."""
         return bool(self._states)
 
-    def look(self, context: Context, *, always: bool = False) -> None:
+    def look(self, context: Context, steps: int = 1, *, always: bool = False) -> None:
         """Checks an accepted step; of consecutive steps only every 32nd is checked.
 
         Args:
             context: The context of the diagram.
+            steps: The number of steps since the last call.
             always: Whether this step is checked in any case, since it is the last.
 
         Raises:
             SimulationError: The run diverges.
         """
-        self._steps += 1
+        self._steps += steps
         if self._steps % EVERY and not always:
             return
         self.look_at_states(context)

@@ -26,9 +26,11 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.compiler.stepped import NO_EVENTS
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
+from drake_dae.simulation.sampled import SampledRun
 from drake_dae.systems.blocks.failures import cannot_go_on
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
@@ -72,10 +74,15 @@ def simulate(
     progress: bool = False,
     after_step: Callable[[Context], None] | None = None,
     may_diverge: bool = False,
+    look: Callable[[Context], None] | None = None,
 ) -> RunStatistics:
     """Runs a diagram from a context; afterwards the context has the final state, on the manifold.
 
     If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
+
+    If Drake steps the plant and other blocks are sampled and traced, as on a `ContactPlant`, one
+    call computes these blocks at a sample, in runs of 500 steps or more. `after_step`, a view or a
+    real-time rate need each step; then the blocks run one by one.
 
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
@@ -89,9 +96,10 @@ def simulate(
         duration: The duration to simulate, in s.
         config: Drake's integrator settings; its defaults if None. The run starts at its start_time.
         progress: Shows simulated time and speed on stderr.
-        after_step: A function that is called with the context after each step, such as
-            `RecordWriter.update`.
+        after_step: A function that is called with the context after each step.
         may_diverge: Whether a diverging run continues.
+        look: A function that is called with the context after some steps, at least after every
+            32nd, such as `RecordWriter.update`.
 
     Warns:
         UserWarning: The largest step allowed is so small that the run takes hours.
@@ -112,6 +120,7 @@ def simulate(
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
+    followers = [function for function in (after_step, look) if function is not None]
     ending = Interruption()
     began: float | None = None
     watch: DivergenceWatch | None = None
@@ -123,16 +132,19 @@ def simulate(
 
     with ending_signals(stop), _StepMonitor(duration, progress) as shown:
 
-        def monitor(current: Context) -> EventStatus:
+        def seen(current: Context, steps: int) -> bool:
             if progress:
                 shown.update(current.get_time() - start)
-            if after_step is not None:
-                after_step(current)
+            for function in followers:
+                function(current)
             if watch is not None:
-                watch.look(current)
-            if ending.signal is not None:
-                return EventStatus.ReachedTermination(diagram, "interrupted")
-            return going_on
+                watch.look(current, steps)
+            return ending.signal is None
+
+        def monitor(current: Context) -> EventStatus:
+            if seen(current, 1):
+                return going_on
+            return EventStatus.ReachedTermination(diagram, "interrupted")
 
         try:
             simulator.Initialize()
@@ -140,13 +152,21 @@ def simulate(
             if not may_diverge:
                 watch = DivergenceWatch(diagram, context, duration)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            is_needed = progress or after_step is not None or (watch is not None and watch.sees)
+            is_needed = progress or followers or (watch is not None and watch.sees)
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
-            simulator.AdvanceTo(start + duration)
+            sampled = None
+            if after_step is None and not config.target_realtime_rate:
+                sampled = SampledRun.of(diagram, context, duration)
+            steps = 0
+            if sampled is None or not sampled.run(start + duration, seen):
+                if sampled is not None:  # To the failure, whose message the blocks know.
+                    simulator.Initialize(NO_EVENTS)
+                simulator.AdvanceTo(start + duration)
+                steps = simulator.get_num_steps_taken()
+                simulator.AdvancePendingEvents()
+            steps += 0 if sampled is None else sampled.steps
             elapsed = time.perf_counter() - began
-            steps = simulator.get_num_steps_taken()
-            simulator.AdvancePendingEvents()
             if watch is not None:
                 watch.look(context, always=True)
         except (DrakeDaeError, RuntimeError) as error:

@@ -92,7 +92,7 @@ class _DrakeSteps:
         context: Context = system.CreateDefaultContext()
         context.SetTime(float(problem.times[0]))
         stepped.put(context, problem.held[dict(compiled.held)[block.system]])
-        self._outputs = [system.GetOutputPort(name) for name in stepped.ports]
+        self._read = stepped.read
         self._port, self._context = system.GetInputPort(stepped.into), context
         self.input = np.zeros(self._port.size())
         self._port.FixValue(context, self.input)
@@ -104,7 +104,7 @@ class _DrakeSteps:
         self._port.FixValue(self._context, self.input)
         # Up to the next step, which Drake then makes first.
         self._simulator.AdvanceTo((round(time / self._period) + 1) * self._period)
-        return np.concatenate([port.Eval(self._context) for port in self._outputs])
+        return self._read(self._context)
 
 
 def _updates(

@@ -30,7 +30,7 @@ class RecordWriter:
     """Appends the record of a run to a file, about once a second, while the run goes on:
 
         with RecordWriter("run.part", loop.record) as writer:
-            simulate(loop.diagram, context, 10.0, config, after_step=writer.update)
+            simulate(loop.diagram, context, 10.0, config, look=writer.update)
 
     `Record.load` reads the file up to the last append, however the process ends. The file consists
     of a line of JSON with names and units, and rows of numbers (little-endian float64): the time in

@@ -149,6 +149,7 @@ class DrakeStepped:
             output of one of its computations.
         held: The context of the block -> HELD, shape (size,).
         put: (context of the system, HELD) -> None; sets the state before a step.
+        read: The context of the system -> the values of these output ports, stacked.
         size: The number of entries of HELD.
     """
 
@@ -159,6 +160,7 @@ class DrakeStepped:
     reads: str
     held: Callable[[Context], FloatArray]
     put: Callable[[Context, FloatArray], None]
+    read: Callable[[Context], FloatArray]
     size: int
 
 

@@ -58,10 +58,14 @@ class ContactForces(LeafSystem):
         super().__init__()
         self.set_name("contact_forces")
         dae = model.dae
-        self._owners = [
-            {geometry: number for number, pair in enumerate(pairs) for geometry in pair[side]}
-            for side in (0, 1)
-        ]
+        # Geometry -> its constraint, and the sign of a force on it as one on the robot. A geometry
+        # of the robot collides only with the surface of its own constraint.
+        self._owners = {
+            geometry: (number, sign)
+            for number, pair in enumerate(pairs)
+            for sign, geometries in zip((1.0, -1.0), pair, strict=True)
+            for geometry in geometries
+        }
         self.contact_force_signals = contact_force_signals(model)
         self._manifold, self._parameters = structure.manifold, parameters
         self._normals = contact_normals(model)
@@ -83,29 +87,22 @@ class ContactForces(LeafSystem):
             )
         )
 
-    def _contact_force(self, context: Context) -> FloatArray:
-        results: ContactResults = self._results.Eval(context)
+    def contact_force(self, results: ContactResults) -> FloatArray:
+        """The contact forces of Drake's contact results, N, shape (3 m,)."""
         total = np.zeros((len(self.contact_force_signals) // 3, 3))
         for i in range(results.num_point_pair_contacts()):
             point = results.point_pair_contact_info(i)
-            pair = point.point_pair()
-            # The force is that on B.
-            self._add(total, pair.id_B, pair.id_A, point.contact_force())
+            number, sign = self._owners[point.point_pair().id_B]  # The force is that on B.
+            total[number] += sign * point.contact_force()
         for i in range(results.num_hydroelastic_contacts()):
             patch = results.hydroelastic_contact_info(i)
-            surface = patch.contact_surface()
             # The force is that on the body of M.
-            self._add(total, surface.id_M(), surface.id_N(), patch.F_Ac_W().translational())
+            number, sign = self._owners[patch.contact_surface().id_M()]
+            total[number] += sign * patch.F_Ac_W().translational()
         return total.ravel()
 
-    def _add(
-        self, total: FloatArray, felt_by: GeometryId, other: GeometryId, force: FloatArray
-    ) -> None:
-        of_robot, of_surfaces = self._owners
-        if felt_by in of_robot and other in of_surfaces:
-            total[of_robot[felt_by]] += force
-        elif other in of_robot and felt_by in of_surfaces:
-            total[of_robot[other]] -= force
+    def _contact_force(self, context: Context) -> FloatArray:
+        return self.contact_force(self._results.Eval(context))
 
     def _force(self, context: Context) -> FloatArray:
         contact = self._contact.Eval(context).reshape(-1, 3)

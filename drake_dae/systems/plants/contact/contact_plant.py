@@ -31,7 +31,7 @@ from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.traced import Block, DrakeStepped
+from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
@@ -164,7 +164,8 @@ class ContactPlant(Diagram, Plant):
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
             applied = inner.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             inner.Connect(applied.get_output_port(), port)
-        forces = inner.AddSystem(ContactForces(model, structure, pairs, self._values))
+        forces = ContactForces(model, structure, pairs, self._values)
+        self._forces = inner.AddSystem(forces)
         self.contact_force_signals = forces.contact_force_signals
         results = plant.get_contact_results_output_port()
         inner.Connect(results, forces.GetInputPort("contact_results"))
@@ -326,8 +327,9 @@ class ContactPlant(Diagram, Plant):
         if self._stages is not None:
             self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
 
-    def _set_links(self, context: Context, links: FloatArray) -> None:
-        """Sets (q, v) and changed masses in a context of the scene."""
+    def _set_links(self, context: Context, values: FloatArray) -> None:
+        """Sets (q, v), the first of some values, and changed masses in a context of the scene."""
+        links = values[: self.multibody.num_multibody_states()]
         multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(multibody_context, links)
         for body, mass, center in self._masses:
@@ -337,18 +339,8 @@ class ContactPlant(Diagram, Plant):
                 body.SetSpatialInertiaInBodyFrame(multibody_context, point_mass(mass, center))
 
     def traced(self) -> Block:
-        count = self.multibody.num_multibody_states()
-        stepped = DrakeStepped(
-            self._scene,
-            self.time_step,
-            ("link_state", "contact_force"),
-            "joint_torque",
-            "control" if self._stages is None else "joint_torque",
-            self._held,
-            lambda context, values: self._set_links(context, values[:count]),
-            self.dae.num_states + len(self.contact_force_signals),
-        )
-        return traced_contact(self, self.contact_force_signals, stepped, self._stages, self._values)
+        parts = self._scene, self._forces, self._stages
+        return traced_contact(self, *parts, self._held, self._set_links, self._values)
 
     def _held(self, context: Context) -> FloatArray:
         """(q, v), the contact forces, and the states of the stages."""

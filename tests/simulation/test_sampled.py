@@ -1,0 +1,191 @@
+"""Runs in which one call computes all blocks around a plant that Drake steps."""
+
+import os
+import signal
+from copy import deepcopy
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pydrake.systems.analysis import Simulator
+from runs import first_quick, scenario, some
+
+from drake_dae import build_scenario, simulate
+from drake_dae.compiler import stepped
+from drake_dae.errors import SimulationError
+from drake_dae.simulation import sampled
+from drake_dae.simulation.sampled import SampledRun
+
+NOISE = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
+
+LOOPS = {
+    "observer and integrals": ("wall_point_contact",),
+    "hydroelastic contact": ("wall_hydroelastic",),
+    "springs that step at half the period": ("wall_flexible_contact",),
+    "encoders": (
+        "wall_point_contact",
+        "encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",
+    ),
+    "noise": ("wall_point_contact", NOISE),
+    "a link that is late and loses": (
+        "wall_point_contact",
+        "sampling={period: 2.0e-3, delay: 3.0e-3, jitter: 1.0e-3, loss: 0.02, seed: 5}",
+    ),
+    "drives with limits": ("wall_point_contact", "saturation=true"),
+    "a start between two samples": ("wall_point_contact", "integrator.start_time=0.0104"),
+}
+
+DEAR = (
+    "hydroelastic contact",
+    "encoders",
+    "noise",
+    "drives with limits",
+    "a start between two samples",
+)
+"""What has no other rates than the others."""
+
+
+@pytest.fixture
+def short_runs(monkeypatch):
+    """Short runs are computed in this way, too."""
+    monkeypatch.setattr(sampled, "WORTH", 1)
+
+
+@cache
+def loop_of(name):
+    robot, *settings = LOOPS[name]
+    chosen = scenario(robot, *settings)
+    return chosen, *build_scenario(chosen)
+
+
+def built(name):
+    chosen, loop, context = loop_of(name)
+    return chosen, loop, context.Clone()
+
+
+def logs(loop, context):
+    return {
+        name: (log.sample_times().copy(), log.data().copy())
+        for name, (sink, _) in loop.loggers.items()
+        for log in [sink.FindLog(context)]
+    }
+
+
+def discrete(context):
+    groups = range(context.num_discrete_state_groups())
+    return np.concatenate([context.get_discrete_state(i).value() for i in groups])
+
+
+@pytest.mark.parametrize("name", some(first_quick(LOOPS), dear=DEAR))
+def test_logs_and_context_are_those_of_drakes_simulator(name, short_runs):
+    """75 samples, no multiple of those after which the context is set.
+
+    Only round-off differs, and contact multiplies it: by 1e5 N/m, and by some 10 in 75 steps.
+    """
+    duration = 0.075
+    chosen, loop, context = built(name)
+    expected = context.Clone()
+    simulator = Simulator(loop.diagram, expected)
+    simulator.Initialize()
+    end = expected.get_time() + duration
+    simulator.AdvanceTo(end)
+    steps = simulator.get_num_steps_taken()
+    simulator.AdvancePendingEvents()
+
+    seen = []
+    statistics = simulate(
+        loop.diagram, context, duration, chosen.integrator, look=lambda c: seen.append(c.get_time())
+    )
+    # Called once for many samples, so that these were not made by Drake's Simulator.
+    assert 3 <= len(seen) <= 6
+    assert statistics.steps == steps
+    assert context.get_time() == end
+    found, right = discrete(context), discrete(expected)
+    assert_allclose(found, right, rtol=0, atol=1e-9 * np.abs(right).max())
+    pairs = zip(logs(loop, context).items(), logs(loop, expected).values(), strict=True)
+    for (signal_name, (times, data)), (right_times, right_data) in pairs:
+        assert_array_equal(times, right_times, err_msg=signal_name)
+        size = np.abs(right_data).max(initial=1e-6)
+        assert_allclose(data, right_data, rtol=0, atol=1e-9 * size, err_msg=signal_name)
+
+
+@pytest.mark.slow
+def test_a_run_that_goes_on_is_that_of_drakes_simulator(short_runs):
+    """All states of Drake's plant and of the source of noise are in the context in between."""
+    chosen, loop, context = built("noise")
+    chosen, expected = deepcopy(chosen), context.Clone()
+    for start in (0.0, 0.04):
+        chosen.integrator.start_time = start
+        simulate(loop.diagram, context, 0.04, chosen.integrator)
+        block_by_block = {"after_step": lambda now: None}
+        simulate(loop.diagram, expected, 0.04, chosen.integrator, **block_by_block)
+    found, right = loop.record(context), loop.record(expected)
+    assert_array_equal(found.time, right.time)
+    for name in right.signals:
+        size = np.abs(right[name]).max(initial=1e-6)
+        assert_allclose(found[name], right[name], rtol=0, atol=1e-9 * size, err_msg=name)
+
+
+def test_a_fixed_value_at_a_connected_port_counts(short_runs):
+    """Drake lets it replace the connection; so the blocks run one by one."""
+    chosen, loop, context = built("observer and integrals")
+    assert SampledRun.of(loop.diagram, context.Clone(), 0.01) is not None
+    port = loop.plant.GetInputPort("control")
+    port.FixValue(loop.plant.GetMyMutableContextFromRoot(context), np.zeros(7))
+    simulate(loop.diagram, context, 0.01, chosen.integrator)
+    assert SampledRun.of(loop.diagram, context, 0.01) is None
+
+
+def test_each_step_is_seen_where_that_is_asked_for(short_runs):
+    chosen, loop, context = built("observer and integrals")
+    times = []
+    see = lambda now: times.append(now.get_time())  # noqa: E731
+    simulate(loop.diagram, context, 0.01, chosen.integrator, after_step=see)
+    assert_allclose(times[:10], 1e-3 * np.arange(1, 11), rtol=1e-12)
+
+
+def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
+    """So a failure is that of Drake's Simulator; here it finds a step after all."""
+    chosen, loop, context = built("observer and integrals")
+
+    class Failing(Simulator):
+        def AdvanceTo(self, time):
+            if time > 0.0455:
+                raise RuntimeError("no convergence.")
+            return super().AdvanceTo(time)
+
+    monkeypatch.setattr(stepped, "Simulator", Failing)
+    expected, seen = context.Clone(), []
+    statistics = simulate(
+        loop.diagram, context, 0.06, chosen.integrator, look=lambda now: seen.append(now.get_time())
+    )
+    simulate(loop.diagram, expected, 0.06, chosen.integrator, after_step=lambda now: None)
+    assert statistics.steps == 60
+    assert seen[0] == pytest.approx(0.032)
+    found, right = loop.record(context), loop.record(expected)
+    assert_array_equal(found.time, right.time)
+    assert_allclose(found["state"], right["state"], rtol=0, atol=1e-9)
+
+
+def test_a_step_that_fails_has_its_time_and_reason(short_runs):
+    """As without the call for a sample: the block that fails says so."""
+    chosen, loop, context = built("observer and integrals")
+    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    state[7:] = 1e9  # rad/s
+    loop.set_state(context, state)
+    with pytest.raises(SimulationError, match=r"at t = 0.* s"):
+        simulate(loop.diagram, context, 0.06, chosen.integrator)
+
+
+def test_a_signal_ends_it_and_keeps_what_it_recorded(short_runs):
+    chosen, loop, context = built("observer and integrals")
+
+    def interrupt(now):
+        if now.get_time() > 0.1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run = simulate(loop.diagram, context, 5.0, chosen.integrator, look=interrupt)
+    assert run.interrupted is signal.SIGINT
+    assert 0.1 < context.get_time() < 0.2
+    assert loop.record(context).time[-1] == context.get_time()
