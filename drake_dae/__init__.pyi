@@ -74,7 +74,6 @@ from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSur
 from .robots.constraints.couplers import JointCoupler as JointCoupler
 from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
-from .robots.constraints.points import CoincidentPoints as CoincidentPoints
 from .robots.constraints.points import FixedDistance as FixedDistance
 from .robots.constraints.points import PointOnSurface as PointOnSurface
 from .robots.constraints.presliding import Presliding as Presliding
@@ -82,6 +81,7 @@ from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel
 from .robots.constraints.screws import ScrewHead as ScrewHead
+from .robots.constraints.welds import CoincidentPoints as CoincidentPoints
 from .robots.constraints.welds import WeldedFrames as WeldedFrames
 from .robots.force_outputs import FaceForces as FaceForces
 from .robots.force_outputs import ForceCombination as ForceCombination

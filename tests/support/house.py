@@ -69,7 +69,6 @@ MOST_FILES, MOST_LINES = 12, 350
 LONG = {
     "drake_dae.commands.simulate": "one command: what it runs, writes and says",
     "drake_dae.dae.system.system": "one class: the fields of (1)-(3), and the same with others",
-    "drake_dae.systems.plants.contact.contact_plant": "one class: scene, contacts, steps, context",
     "drake_dae.systems.plants.dae_plant": "one class: ports, steps, projection",
 }
 

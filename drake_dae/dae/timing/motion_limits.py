@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
+from typing import Literal
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
+
+Kind = Literal["controls", "states", "rates", "forces"]
 
 Range = tuple[float | None, float | None]
 """The lowest and the highest value of a signal; None without a limit."""
@@ -102,7 +105,7 @@ class MotionLimits:
                         f"{low:g} and {high:g}"
                     )
 
-    def bounds(self, kind: str, signals: Sequence[Signal]) -> tuple[FloatArray, FloatArray]:
+    def bounds(self, kind: Kind, signals: Sequence[Signal]) -> tuple[FloatArray, FloatArray]:
         """Returns the lowest and highest values of all signals of a kind; infinite without a limit.
 
         Args:

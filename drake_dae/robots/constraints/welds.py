@@ -1,19 +1,82 @@
-"""Frames with a fixed relative pose."""
+"""Points that coincide, and frames with a fixed relative pose."""
 
 from dataclasses import dataclass, field
 
 import casadi as ca
+import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import check_axes
 from drake_dae.dae.system.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.frames import body_with_frame
 from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.kinematics import Frames, Kinematics
+from drake_dae.robots.surfaces.surface import Vector
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class CoincidentPoints(Constraint):
+    """A point of frame B coincides with a point of frame A: phi(q) = p_WB(q) - p_WA(q).
+
+    A ball joint that closes a loop; in a planar mechanism, with the axes of the plane, a pin. The
+    constraint force is the force in N, in world axes, that A exerts on B at the point; B exerts the
+    opposite on A.
+
+    Attributes:
+        frame_a: Name of frame A, for example "world".
+        point_a: The point in frame A, m, shape (3,).
+        frame_b: Name of frame B, on another body.
+        point_b: The point in frame B, m, shape (3,).
+        axes: The axes of the world along which they coincide, for example "xz".
+        name: The name of the constraint, the prefix of its forces.
+    """
+
+    frame_a: str
+    point_a: Vector
+    frame_b: str
+    point_b: Vector
+    axes: str = "xyz"
+    name: str = "pin"
+
+    def __post_init__(self) -> None:
+        check_axes("axes", self.axes)
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.f{axis}" for axis in self.axes], "N")
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.{axis}" for axis in self.axes], "m")
+
+    def residual(self, frames: Frames) -> ca.SX:
+        point_b = frames.position(self.frame_b, self.point_b)
+        apart = point_b - frames.position(self.frame_a, self.point_a)
+        return apart[self._rows]
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        point = kinematics.position(self.frame_b, self.point_b)
+        axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
+        return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        if len(self.axes) < 3:
+            return super().add_to(plant)
+        (a, pose_a), (b, pose_b) = (
+            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
+        )
+        points = pose_a @ np.array(self.point_a), pose_b @ np.array(self.point_b)
+        return plant.AddBallConstraint(a, points[0], b, points[1])
+
+    @property
+    def _rows(self) -> list[int]:
+        return ["xyz".index(axis) for axis in self.axes]
 
 
 @checked(ModelError)

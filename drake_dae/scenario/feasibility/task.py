@@ -41,8 +41,7 @@ class PhaseNeeds:
     Attributes:
         name: The phase.
         begin, end: Its start and end, in s.
-        drive, share: The drive that is closest to its limit, and the largest share of the limit;
-            "" and 0 without limits.
+        drive, share: The drive closest to its limit, and the largest share; "" and 0 without.
         joint, room: The joint that is closest to a limit, and the smallest distance, in its unit;
             "" and infinity without limits.
         force: The largest force of the contact, in N.

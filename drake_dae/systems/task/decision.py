@@ -124,8 +124,10 @@ def moment_of(
     contact_force: float,
     work: float,
     signal: float,
+    controls: FloatArray,
+    measured: int | None,
 ) -> Moment:
-    """The measurements that decide when the phase of a segment ends, without those of controls.
+    """The measurements that decide when the phase of a segment ends.
 
     Args:
         segment: The current references.
@@ -135,6 +137,8 @@ def moment_of(
         forces: The measured forces of the contact.
         contact_force: Forces below this, in N, count as zero.
         work, signal: As of `Moment`.
+        controls: |u|, shape (p,); 0 if nothing watches it.
+        measured: The index of the control that the phase measures; None for none.
     """
     (distance, rate, moved, rates), change = motion, segment.change
     wanted = [contact.main] if change.in_contact else list(contact.places)
@@ -148,6 +152,8 @@ def moment_of(
         speed=float(np.linalg.norm(rates)),
         travel=float(np.linalg.norm(moved - segment.origin)),
         work=work,
+        control=float(controls.max()),
+        torque=0.0 if measured is None else float(controls[measured]),
         eccentricity=float(eccentricity(forces, contact_force)),
         signal=signal,
     )

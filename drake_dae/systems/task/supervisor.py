@@ -1,7 +1,6 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -185,10 +184,8 @@ class TaskSupervisor(LeafSystem):
         forces = self._traced.filter.forces(self._filtered(context), segment.law)
         contact, least = self._pairs[segment.law // 2].contact, self.task.contact_force
         motion, time = self._plan.motion(self._now(context), segment.law), context.get_time()
-        moment = moment_of(segment, contact, time, motion, forces, least, work, signal)
-        measured = self._plan.controls[place]
-        torque = 0.0 if measured is None else float(controls[measured])
-        return replace(moment, control=float(controls.max()), torque=torque)
+        watched = controls, self._plan.controls[place]
+        return moment_of(segment, contact, time, motion, forces, least, work, signal, *watched)
 
     def _filtered(self, context: Context) -> FloatArray:
         """The state of the force filter after the present sample; see `TracedTask`."""

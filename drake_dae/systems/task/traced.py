@@ -45,8 +45,7 @@ NAMES = (
     "ending",
 )
 """The first numbers of a task in a context: the current segment, the number of times that it went
-back by "approach", and one of `ENDINGS`. The force filter, then base, rate and fade of the segment
-follow."""
+back by "approach", and one of `ENDINGS`. The force filter, then base, rate and fade follow."""
 
 ENDINGS = {NEXT: 1.0, DONE: 1.0, STOP: 2.0, LEAVE: 2.0, HOLD: 3.0, FAIL: 4.0}
 """Key word after which the robot rests -> the number of this ending; 0 while the task goes on."""

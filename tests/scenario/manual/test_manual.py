@@ -59,6 +59,7 @@ PURE = {
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),
+    ("Presliding", "static_ratio"),
     ("ScenarioTask", "pace"),
     ("TimeOptimal", "efforts"),
     ("WithinLimits", "efforts"),

@@ -53,6 +53,9 @@ class Approach(Phase):
                     "name, hold, leave, stop or fail"
                 )
 
+    def at_pace(self, pace: float) -> Self:
+        return replace(self, over=self.over / pace, speed=self.speed_of_approach * pace)
+
     @property
     def speed_of_approach(self) -> float:
         return _SPEED if self.speed is None else self.speed
@@ -168,6 +171,9 @@ class Close(Phase):
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: 0.0}
+
+    def at_pace(self, pace: float) -> Self:
+        return replace(super().at_pace(pace), speed=self.speed)  # It is a tolerance.
 
     def needed(self, contact_force: float) -> Mapping[str, float]:
         return {"time": self.over}
