@@ -21,6 +21,8 @@ STYLES = {
     "impedance + force ahead": ("^", "tab:green"),
     "admittance": ("v", "tab:purple"),
     "least squares (as TSID)": ("P", "tab:orange"),
+    "hybrid, PI + momentum observer": ("h", "tab:cyan"),
+    "impedance + momentum observer": ("<", "tab:pink"),
     OURS: ("*", "tab:red"),
 }
 """Law -> marker and colour."""
@@ -89,7 +91,7 @@ def _legend(axes: Axes) -> None:
         Line2D([], [], marker=marker, color=color, linestyle="", markersize=13 if n == OURS else 8)
         for n, (marker, color) in STYLES.items()
     ]
-    labels = [name.split(" + ")[0] for name in STYLES]
+    labels = [name.removesuffix(" + J^T lambda").removesuffix(" + force ahead") for name in STYLES]
     for face, label in (("0.3", "friction known"), ("white", "friction unknown")):
         handles.append(
             Line2D(
@@ -99,4 +101,4 @@ def _legend(axes: Axes) -> None:
         labels.append(label)
     handles.append(Rectangle((0, 0), 1, 1, color="tab:green", alpha=0.1))
     labels.append("asked for")
-    axes.legend(handles, labels, loc="center left", fontsize=9, frameon=False, labelspacing=0.7)
+    axes.legend(handles, labels, loc="lower left", fontsize=9, frameon=False, labelspacing=0.4)

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from contact_peers.laws import LAWS
 from contact_peers.measure import Figures, run_law, run_ours
 from contact_peers.plants import CONDITIONS, DURATION, FRICTION, Condition
-from contact_peers.search import DESCENT, GAINS, NOISY, QUIET, SPREAD, load_gains
+from contact_peers.search import DESCENT, FIRST_RATE, GAINS, NOISY, QUIET, SPREAD, load_gains
 
 FIGURES = Path(__file__).with_name("figures.json")
 
@@ -150,6 +150,7 @@ def page(rows: list[Row]) -> str:
         "TABLE": table(rows),
         "BETTER": "\n".join(better(rows)) or "Nowhere.",
         "GAINS": gains_table(),
+        "RATE": f"{FIRST_RATE:g}",
         "DURATION": f"{DURATION:.2f}",
         "POINTS": f"{SPREAD} + {DESCENT}",
         "RUNS": f"{QUIET[0]:g} s without noise and {NOISY[0]:g} s with it",

@@ -14,6 +14,7 @@ from contact_peers.search import load_gains
 from contact_peers.table import FIGURES, OURS, ROWS, Row, better, load_rows, page, short, table
 from contact_peers.task_laws import (
     Hybrid,
+    ImpedanceWithObserver,
     LeastSquares,
     least_squares,
     modal_damping,
@@ -168,6 +169,32 @@ def test_table_reports_what_is_lost_and_what_is_better():
     assert line.startswith("- hybrid, friction known, force: point 1e5 N/m (0.004 against 0.02)")
     assert [short(value) for value in (31.94, 9.96, 0.0123, 7.1)] == ["32", "10", "0.012", "7.1"]
     assert replace(good, open=0.2).is_lost
+
+
+def test_a_momentum_observer_finds_a_torque_that_nothing_explains(robot):
+    """Controls are late by a sample. The velocity moves in one configuration.
+
+    200 samples at 50 1/s leave 5e-5 of the torque, and so small a one no Coriolis forces.
+    """
+    gains = {name: low for name, (low, _) in ImpedanceWithObserver.LIMITS.items()}
+    start = np.concatenate([HELD, np.zeros(7)])
+    goals = Goals(robot, HELD, 0.0)
+    law = ImpedanceWithObserver(robot, goals, gains | {"observer": 50.0}, start)
+    rows = np.zeros((6, 3))
+    rows[:, 0] = [*robot.at(start).position[1:], *HELD[[2, 6]]]
+    goal, d = (
+        goals.at(np.append(rows.ravel(), 20.0)),
+        0.01 * np.array([3.0, -2.0, 1.0, 0.5, -0.5, 0.2, 0.1]),
+    )
+    memory, v, controls, force = np.zeros(29), np.zeros(7), [np.zeros(7)] * 2, goal.force
+    for _ in range(200):
+        now = robot.at(np.concatenate([HELD, v]))
+        controls.append(law.control(now, goal, force, memory))
+        memory = law.next_memory(now, goal, force, memory)
+        push = now.jacobian[:3].T @ (NORMAL * force)
+        rate = np.linalg.solve(now.mass, controls[-2] + push + d - now.bias)
+        v = v + 1e-3 * rate
+    assert_allclose(memory[21:28], d, atol=1e-4)
 
 
 def test_committed_table_is_that_of_the_committed_figures():

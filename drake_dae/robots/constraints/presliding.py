@@ -41,7 +41,7 @@ class Presliding:
     Attributes:
         distance: delta in m (rad), positive: the deflection at which the linear spring would reach
             the Coulomb force.
-        static_ratio: rho, static over dynamic friction, at least 1.
+        static_ratio: rho, static over dynamic friction, a pure number, at least 1.
         stribeck_speed: v_s in m/s (rad/s), positive.
         damping_time: T in s, positive.
 

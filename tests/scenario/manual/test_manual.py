@@ -68,6 +68,7 @@ PURE = {
     ("TimeOptimal", "joint_accelerations"),
     ("TimeOptimal", "largest_rate"),
     ("FrictionCone", "friction"),
+    ("Presliding", "static_ratio"),
     ("SimulatorConfig", "accuracy"),
     ("SimulatorConfig", "target_realtime_rate"),
 }

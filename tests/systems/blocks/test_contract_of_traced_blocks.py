@@ -182,7 +182,7 @@ BLOCKS = {
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
     "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),
     "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
-    "LawSwitch": lambda: LawSwitch(2),
+    "LawSwitch": lambda: LawSwitch(2, ["free", "contact"]),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
     "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
