@@ -41,7 +41,8 @@ class ConstraintWrenches:
         constraints: The constraints that act at a point.
         frames: The frame that each of these acts on.
         with_moment: Whether each of these has a moment besides its force.
-        function: (q, v, lambda, parameters) -> points, forces and moments, shapes (3, k).
+        function: (q, v, states of bristles, lambda, parameters) -> points, forces and moments,
+            shapes (3, k).
     """
 
     def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
@@ -58,14 +59,21 @@ class ConstraintWrenches:
         }
         self.function = TracedFunction(
             "constraint loads",
-            {"q": links.q, "v": links.v, "force": force, "parameters": model.dae.parameter_symbol},
+            {
+                "q": links.q,
+                "v": links.v,
+                "bristles": model.friction.state,
+                "force": force,
+                "parameters": model.dae.parameter_symbol,
+            },
             {
                 name: kinematics.value(ca.horzcat(ca.SX(3, 0), *column))
                 for name, column in columns.items()
             },
         )
         self._parameters = model.dae.parameter_vector(parameters).copy()
-        self._sizes = links.q.numel(), links.v.numel()
+        self._parts = np.cumsum([links.q.numel(), links.v.numel()])
+        self._bristles = model.friction.state.numel()
 
     def __call__(
         self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
@@ -73,14 +81,14 @@ class ConstraintWrenches:
         """The wrenches at one time.
 
         Args:
-            state: x, or only its first part, the link state (q, v).
+            state: x, or only its first part, the link state (q, v), for bristles at rest.
             constraint_force: lambda, shape (m,).
             parameters: Values of all parameters at that time, if some are exogenous.
         """
-        nq, nv = self._sizes
-        q, v = state[:nq], state[nq : nq + nv]
+        q, v, further = np.split(state, self._parts)
+        bristles = further[: self._bristles] if further.size else np.zeros(self._bristles)
         values = self._parameters if parameters is None else parameters
-        tables = self.function(q, v, constraint_force, values)
+        tables = self.function(q, v, bristles, constraint_force, values)
         return Wrenches(*(table.reshape(3, -1, order="F").T for table in tables))
 
 
@@ -99,5 +107,6 @@ def contact_normals(model: RobotModel) -> TracedFunction:
     links = model.links
     kinematics = links.kinematics()
     axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
-    normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
+    moving = ca.vertcat(links.v, model.friction.state)
+    normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), moving, 0 * moving)
     return model.dae.trace("normals", {"normals": ca.densify(normals)})

@@ -176,9 +176,10 @@ def _function(
     targets: Sequence[PointCoordinates],
 ) -> ca.Function:
     links, dae = model.links, model.dae
-    force = ca.SX.sym("force", wrenches.function.sizes[2])
-    parameters = dae.parameter_symbol
-    wrench_columns = wrenches.function.function.call([links.q, links.v, force, parameters])[:3]
+    force = ca.SX.sym("force", dae.num_constraints)
+    bristles, parameters = model.friction.state, dae.parameter_symbol
+    inputs = [links.q, links.v, bristles, force, parameters]
+    wrench_columns = wrenches.function.function.call(inputs)[:3]
     surface_poses = list[ca.SX]()
     for constraint in surfaces:
         symbols = {parameter.name: parameter.symbol for parameter in constraint.parameters}
@@ -194,7 +195,7 @@ def _function(
     value = [
         ca.vertcat(ca.SX(0, 1), *(ca.vec(ca.densify(part)) for part in parts)) for parts in columns
     ]
-    arguments = [ca.vertcat(links.q, links.v), force, parameters]
+    arguments = [ca.vertcat(links.q, links.v, bristles), force, parameters]
     return ca.Function("scene", arguments, ca.cse(value))
 
 
