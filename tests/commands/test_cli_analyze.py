@@ -316,7 +316,13 @@ def test_help_reports_the_exit_codes(capsys):
     "name",
     some(
         each_scenario(lambda name: name == "wall_bounce"),
-        dear=("wall_flexible_contact", "wall_hydroelastic"),
+        dear=(
+            "wall_flexible_contact",
+            "wall_hydroelastic",
+            "flat_press",
+            "hand_over",
+            "tool_change",
+        ),
     ),
 )
 def test_shipped_scenarios_have_no_problems(name):

@@ -78,7 +78,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         needs = task_needs(chosen, model, structure)
         behind = _in_the_way(needs, model, scene_graph)
         return Feasibility(
-            analyze(model.dae), scenario.duration, *_ranges(needs, model), behind=behind, task=needs
+            analyze(structure.system),
+            scenario.duration,
+            *_ranges(needs, model),
+            behind=behind,
+            task=needs,
         )
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
