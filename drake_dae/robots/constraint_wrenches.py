@@ -86,7 +86,10 @@ class ConstraintWrenches:
             parameters: Values of all parameters at that time, if some are exogenous.
         """
         q, v, further = np.split(state, self._parts)
-        bristles = further[: self._bristles] if further.size else np.zeros(self._bristles)
+        # They are the last states, after those of the stages.
+        bristles = (
+            further[further.size - self._bristles :] if further.size else np.zeros(self._bristles)
+        )
         values = self._parameters if parameters is None else parameters
         tables = self.function(q, v, bristles, constraint_force, values)
         return Wrenches(*(table.reshape(3, -1, order="F").T for table in tables))

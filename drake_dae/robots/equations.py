@@ -40,7 +40,7 @@ def robot_equations(
     driven: ActuationChain,
     loop_joints: LoopState,
     known_forces: Sequence[Load],
-    rubbing: FrictionState,
+    bristles: FrictionState,
     outputs: Outputs,
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
@@ -49,7 +49,7 @@ def robot_equations(
 
     Args:
         name: The robot's name in messages.
-        links, bound, driven, loop_joints, known_forces, rubbing, outputs: The parts of the robot,
+        links, bound, driven, loop_joints, known_forces, bristles, outputs: The parts of the robot,
             with the states of its friction.
         choice: The parameters of the choice of the control, if any; see `control_choice`.
         nominal: A configuration of the robot at work, shape (nq,).
@@ -66,7 +66,7 @@ def robot_equations(
     torque += loop_joints.force
     motors = loop_joints.motors
     rotors = _moved_rotors(links, driven)
-    c = rubbing.state.numel()
+    c = bristles.state.numel()
 
     def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
         acceleration = rate[nq : nq + nv]
@@ -78,7 +78,7 @@ def robot_equations(
             constraint_rate += ca.jtimes(motion, links.q, slip)
         balance = inertial - ca.mtimes(rotors, acceleration) - torque  # (37)
         stages = ca.mtimes(driven.mass, rate[nq + nv : nq + nv + k]) - driven.drift
-        friction = rate[nq + nv + k :] - rubbing.rate
+        friction = rate[nq + nv + k :] - bristles.rate
         return ca.vertcat(rate[:nq] - velocity, balance, stages, friction), constraint_rate
 
     def factorize(rows: Sequence[int]) -> Factors | None:
@@ -93,11 +93,11 @@ def robot_equations(
         return BlockFactors([before, (bodies, nv), after])
 
     return DaeSystem(
-        state=ca.vertcat(links.q, links.v, driven.state, rubbing.state),
+        state=ca.vertcat(links.q, links.v, driven.state, bristles.state),
         mass_matrix=ca.diagcat(
             ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass, ca.SX.eye(c)
         ),
-        f=ca.vertcat(velocity, torque - links.bias, driven.drift, rubbing.rate),  # (43)
+        f=ca.vertcat(velocity, torque - links.bias, driven.drift, bristles.rate),  # (43)
         g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k + c, m)),
         h=ca.vertcat(
             ca.SX(nq, nu),
@@ -119,7 +119,7 @@ def robot_equations(
             *links.position_signals,
             *links.velocity_signals,
             *driven.state_signals,
-            *rubbing.signals,
+            *bristles.signals,
         ),
         constraint_input_signals=bound.force_signals,
         constraint_output_signals=bound.residual_signals,

@@ -4,6 +4,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
+from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.scenario.advice.advice import advised
@@ -57,7 +58,7 @@ def build_completed(
     notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
     if (bound := in_time.scenario.error_bound) is not None:
         with at("error_bound"):
-            bound.places(model.dae.output_signals)
+            outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
     completed = Completed(in_time.scenario, notes)
     return completed, build_loop(

@@ -10,6 +10,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.signals import outputs_named
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
@@ -232,7 +233,7 @@ def _check_parts(settings: LoopSettings, plant: Plant) -> None:
             make_sensor(plant, settings.encoders, settings.period(plant.time_step))
     if settings.tolerances is not None:
         with at("tolerances"):
-            settings.tolerances.places(plant.dae.output_signals)
+            outputs_named(settings.tolerances.outputs, plant.dae.output_signals)
 
 
 @at("saturation")

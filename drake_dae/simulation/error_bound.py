@@ -1,13 +1,13 @@
 """A declared bound of the errors of a run: whether it held, from when not, and by how much."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import number, positive, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.arrays import number, positive
+from drake_dae.dae.system.signals import Signal, outputs_named
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 
@@ -74,21 +74,6 @@ class ErrorBound:
         each = ", ".join(f"{name} {value:.3g}" for name, value in self.outputs.items())
         return f"error bound from {self.after:g} s on, in units of the outputs: {each}"
 
-    def places(self, signals: Sequence[Signal]) -> list[int]:
-        """Returns the indices of the bounded outputs.
-
-        Args:
-            signals: Names and units of all outputs.
-
-        Raises:
-            ModelError: There is no such output.
-        """
-        names = [signal.name for signal in signals]
-        for name in self.outputs:
-            if name not in names:
-                raise ModelError(unknown_name("output", name, names))
-        return [names.index(name) for name in self.outputs]
-
     def check(self, record: Record) -> list[BoundedOutput]:
         """Compares the errors of a run with the bound.
 
@@ -104,8 +89,8 @@ class ErrorBound:
         signals = record.signals["tracking_error"].signals
         begin = int(np.searchsorted(record.time, self.after - 1e-9))
         times, errors = record.time[begin:], np.abs(record["tracking_error"][begin:])
-        found = []
-        for index, bound in zip(self.places(signals), self.outputs.values(), strict=True):
+        found, places = [], outputs_named(self.outputs, signals)
+        for index, bound in zip(places, self.outputs.values(), strict=True):
             if not times.size:
                 continue
             error = errors[:, index]

@@ -1,6 +1,6 @@
 """Names, units and numbers of the scalars that a system is made of."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, check_writable, numbers
+from drake_dae.arrays import FloatArray, brief, check_writable, numbers, unknown_name
 from drake_dae.errors import ModelError
 
 
@@ -170,6 +170,19 @@ class Parameter:
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
     """Returns signals of the given names that share a unit."""
     return tuple(Signal(name, unit) for name in names)
+
+
+def outputs_named(names: Collection[str], outputs: Sequence[Signal]) -> list[int]:
+    """Returns the indices of outputs by their names.
+
+    Raises:
+        ModelError: There is no output of such a name.
+    """
+    known = [signal.name for signal in outputs]
+    for name in names:
+        if name not in known:
+            raise ModelError(unknown_name("output", name, known))
+    return [known.index(name) for name in names]
 
 
 def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Parameter, ...]:

@@ -251,8 +251,9 @@ def shown_function(bench: Bench, columns: Mapping[str, ca.SX], values: ca.SX) ->
     for robot in bench.scene.robots:
         plant, model = robot.plant, robot.plant.robot("a bench")
         prefix = f"{plant.get_name()}." if isinstance(loop, Diagram) else ""
-        parts_of_state = model.links.q, model.links.v, model.friction.state
-        state = columns[f"{prefix}state"][: sum(part.numel() for part in parts_of_state)]
+        state, links = columns[f"{prefix}state"], model.links.q.numel() + model.links.v.numel()
+        bristles = state[state.numel() - model.friction.state.numel() :]
+        state = ca.vertcat(state[:links], bristles)
         size = model.dae.parameter_symbol.numel()
         parameters = parameters_of(plant, size, f"{prefix}exogenous")
         parts.append(robot.function(state, columns[f"{prefix}constraint_force"], parameters))

@@ -49,8 +49,8 @@ def bound_errors(
     number on an end of its range has three times the variance of one within it. The
     largest of c corners is near q sigma, with Phi(q) = 1 - 1 / c, so that a plant exceeds it with
     probability 2 (1 - Phi(q sqrt(3))): 3e-5 for c = 128, where q = 2.4. The bound is the
-    largest |e| of all runs. It is none for all plants: the worst of all corners, the sum of all
-    causes, is larger, and hardly ever met.
+    largest |e| of all runs. A few plants may exceed it: the largest error of all 2^n corners, the
+    sum of all causes, is larger, but hardly any plant comes near it.
 
     The simulated runs are: the middle of all ranges; one run for each end of each range, with all
     others in the middle, which show the share of each cause; and the corners, where half

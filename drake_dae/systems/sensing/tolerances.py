@@ -9,9 +9,9 @@ import numpy as np
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, number, positive, unknown_name
+from drake_dae.arrays import FloatArray, brief, number, positive
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.signals import Signal, outputs_named
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
@@ -51,21 +51,6 @@ class Tolerances:
         number("after", self.after)
         positive("window", self.window)
 
-    def places(self, signals: Sequence[Signal]) -> Indices:
-        """The indices of the outputs.
-
-        Args:
-            signals: Names and units of the controlled outputs.
-
-        Raises:
-            ModelError: There is no such output.
-        """
-        names = [signal.name for signal in signals]
-        for name in self.outputs:
-            if name not in names:
-                raise ModelError(unknown_name("output", name, names))
-        return np.array([names.index(name) for name in self.outputs], dtype=np.intp)
-
 
 class ToleranceWatch(LeafSystem):
     """Ends a run that exceeds its `Tolerances`.
@@ -104,7 +89,8 @@ class ToleranceWatch(LeafSystem):
         super().__init__()
         self.set_name("tolerance_watch")
         self._tolerances, self._outputs, self._forces = tolerances, outputs, forces
-        self._places, self._lowest = tolerances.places(outputs), lowest
+        self._places: Indices = np.array(outputs_named(tolerances.outputs, outputs), dtype=np.intp)
+        self._lowest = lowest
         self._largest = np.array(list(tolerances.outputs.values()), dtype=float)
         self._period = period
         input_sizes = {

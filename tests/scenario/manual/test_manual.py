@@ -59,7 +59,6 @@ PURE = {
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),
-    ("Presliding", "static_ratio"),
     ("ScenarioTask", "pace"),
     ("TimeOptimal", "efforts"),
     ("WithinLimits", "efforts"),

@@ -127,7 +127,10 @@ def phases(*changed):
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ([dd.Press(20.0)], "phase 4 of the task, Press: it is not for the latch 'left_hand'"),
+        (
+            [dd.Press(20.0)],
+            "phase 4 of the task, Press: it serves a contact that pushes, and 'left_hand' is",
+        ),
         (
             [dd.Close(contact="left_hand"), dd.Release(contact="left_hand", on_failure="leave")],
             "leave does not say which latch",

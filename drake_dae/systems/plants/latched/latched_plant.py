@@ -38,7 +38,7 @@ class LatchedPlant(LeafSystem, Plant):
 
     At t_n = n time_step it steps to t_(n+1) with the control, and with those latches active that
     are commanded to be closed at t_n. Drake's solver makes these constraints stiff: a load opens
-    them by micrometers. Closing conserves momentum.
+    them by micrometers. Closing conserves momentum. Nothing of the robot collides.
 
     Drake has no port with the forces of its constraints. `constraint_force` is that of the step to
     t_n, by its momentum balance,

@@ -205,7 +205,7 @@ class PhasePlan:
             if self.latches and not name:
                 text = f"contact: needed, since later phases name {', '.join(self.latches)}"
             elif name and not phase.for_latch:
-                text = f"it is not for the latch '{name}', but for a contact that pushes"
+                text = f"it serves a contact that pushes, and '{name}' is a latch"
             elif not name and not phase.for_contact:
                 text = "contact: needed, the name of a latch"
             words = {phase.chosen(outcome) for outcome in OUTCOMES} | {phase.if_spent}
