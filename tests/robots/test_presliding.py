@@ -354,18 +354,9 @@ def test_what_cannot_be_combined_is_refused_in_one_sentence():
 
 
 def test_the_force_that_is_drawn_has_the_traction_of_the_bristles():
-    """-mu lambda (z + T z'), by NumPy; with (q, v) alone the bristles are at rest.
-
-    The axes of the floor are y and -x of the world.
-    """
-    axes = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    model, velocity, z = block(), np.array([2e-3, 0.0]), np.array([0.4, 0.1])
-    names = [signal.name for signal in model.dae.state_signals]
-    state = np.zeros(len(names))
-    state[2] = velocity[0]
-    state[-2:] = z
-    wrenches = ConstraintWrenches(model)
-    for given, bristles in ((state, z), (state[:4], np.zeros(2))):
-        drawn = wrenches(given, [5.0]).forces[0]
-        traction = bent(axes @ velocity, bristles)[1] @ axes
-        assert_allclose(drawn, [*(-MU * 5.0 * traction), 5.0], rtol=1e-12)
+    """-mu lambda (z + T z'), by NumPy; with (q, v) alone the bristles are at rest."""
+    wrenches, velocity, z = ConstraintWrenches(block()), np.array([2e-3, 0.0]), np.array([0.4, 0.1])
+    rigid = [0.0, 0.0, velocity[0], 0.0]
+    for state, bristles in (([*rigid, *z, 0.0], z), (rigid, np.zeros(2))):
+        drawn = wrenches(np.array(state), [5.0]).forces[0]
+        assert_allclose(drawn, [*(-MU * 5.0 * bent(velocity, bristles)[1]), 5.0], rtol=1e-12)
