@@ -142,7 +142,7 @@ class BoundedErrors:
         rows += [(name, self.shares[name]) for name in order[:MOST_CAUSES]]
         if rest := order[MOST_CAUSES:]:
             text = f"{len(rest)} others, each at most"
-            rows.append((text, np.max([self.shares[name] for name in rest], axis=0)))
+            rows.append((text, np.array([self.shares[name] for name in rest]).max(axis=0)))
         worst = f"the worst of {self.runs - len(self.failed)} runs"
         rows.append((worst if self.failed else f"bound: {worst}", self.worst))
         table = Table(head, [[name, *(f"{v:.2g}" for v in values)] for name, values in rows])
