@@ -18,7 +18,7 @@ import numpy as np
 import drake_dae
 from drake_dae.commands import play, plot, simulate
 from drake_dae.commands.options import parse_options
-from drake_dae.commands.run_folder import RECORD
+from drake_dae.commands.run.folder import RECORD
 from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drake_dae.arrays import number_in
-from drake_dae.commands.run_folder import MARK, load_run, stage
+from drake_dae.commands.run.folder import MARK, load_run, stage
 from drake_dae.errors import ModelError
 from drake_dae.files import read_text
 from drake_dae.scenario.files import load_scenario, save_scenario

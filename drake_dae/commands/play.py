@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drake_dae.commands.run_folder import ANIMATION, load_run, runs_by_name, stage
+from drake_dae.commands.run.folder import ANIMATION, load_run, runs_by_name, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.side_by_side import side_by_side
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from drake_dae.commands.run_folder import FILM, SCENARIO, load_run, runs_by_name, stage
+from drake_dae.commands.run.folder import FILM, SCENARIO, load_run, runs_by_name, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.diagram import save_diagram
 from drake_dae.pictures.film import save_film

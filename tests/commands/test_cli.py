@@ -15,7 +15,7 @@ import drake_dae
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
 from drake_dae.commands import new, simulate
-from drake_dae.commands.run_folder import FILES, PART
+from drake_dae.commands.run.folder import FILES, PART
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures.plots import PATHS, PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios

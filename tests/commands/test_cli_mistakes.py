@@ -15,6 +15,7 @@ import drake_dae
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands import simulate
+from drake_dae.commands.run import files
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.scene import view
 from drake_dae.scenario.shipped import find_scenario
@@ -140,7 +141,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(os, "pwrite", write)
     monkeypatch.setattr(np, "savez_compressed", fill)
     monkeypatch.setattr(Figure, "savefig", fill)
-    monkeypatch.setattr(simulate, "animate", fill)
+    monkeypatch.setattr(files, "animate", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
     assert main(arguments) == 1
     out, err = capsys.readouterr()

@@ -15,7 +15,7 @@ from runs import run_scenario, scenario, some
 
 from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.commands.run_folder import FILES, PART
+from drake_dae.commands.run.folder import FILES, PART
 from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_dae.commands.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
+from drake_dae.commands.run.folder import FILES, MARK, PART, SCENARIO, run_folder, stage
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.interruption import end_at_once, ending_signals
 

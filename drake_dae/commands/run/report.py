@@ -1,0 +1,165 @@
+"""What a run achieved, as text and as data."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.clearances import links_in_the_way, nearness
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.simulation.error_bound import bound_words, exceeds
+from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.remarks import (
+    ball_remarks,
+    departure_remarks,
+    limit_remarks,
+    reference_remarks,
+    stop_remarks,
+    surface_remarks,
+    touch_remarks,
+)
+from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.simulation.summary import Limits, shortfalls, summary
+from drake_dae.simulation.verdict import TrackingResult, as_data, judge
+from drake_dae.systems.control.phase_change import PhaseChange
+
+
+@dataclass(frozen=True, eq=False)
+class RunReport:
+    """The figures and verdicts of a run.
+
+    Attributes:
+        record: The record of the run.
+        predicted: The tracking error by theory, shape (k, p).
+        limits: The limits of the robot.
+        accuracy: The accuracy of error control; None with fixed steps.
+        job: Whether the run succeeded, and why.
+        text: The summary, in lines for the screen.
+        data: The results as plain data; "missed" says whether a wish or the prediction was missed.
+    """
+
+    record: Record
+    predicted: FloatArray
+    limits: Limits
+    accuracy: float | None
+    job: JobVerdict
+    text: str
+    data: dict[str, Any]
+
+
+def report_run(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    record: Record,
+    statistics: RunStatistics | None,
+    failure: str = "",
+) -> RunReport:
+    """Judges a run by its record.
+
+    Args:
+        scenario: The completed scenario.
+        loop: The loop that ran.
+        context: The context of the loop at the end of the run.
+        record: The record of the run, of at least one time.
+        statistics: The statistics of the run; None for a failed run.
+        failure: The reason of the failure.
+    """
+    model, config = loop.plant.model, scenario.integrator
+    predicted = loop.predicted_error(record)
+    limits = Limits() if model is None else Limits.of(model)
+    fixed = loop.plant.time_step or not config.use_error_control
+    accuracy = None if fixed else config.accuracy
+    reasons = _reasons(scenario, loop, record)
+    near = nearness(loop, record, context)
+    changes = loop.changes(context)
+    is_interrupted = statistics is not None and statistics.interrupted is not None
+    job = judge_job(
+        record,
+        predicted,
+        {} if scenario.tolerances is None else scenario.tolerances.outputs,
+        [*shortfalls(record, limits), *map(str, links_in_the_way(loop, record, context))],
+        limits.pushing,
+        changes,
+        is_cut_short=bool(failure) or is_interrupted,
+        notes=limit_remarks(record, limits),
+    )
+    verdict = judge(record, predicted, accuracy)
+    bounded = None if scenario.error_bound is None else scenario.error_bound.check(record)
+    added = None
+    if loop.generator is not None:
+        goal, state = loop.generator.reference, record["state"][0]
+        added = loop.controller.error_bound(goal, record.time, state)
+    lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
+    if bounded is not None:
+        lines += ["", *bound_words(bounded), ""]
+    lines += _contact_remarks(scenario, loop, record)
+    lines += map(str, (*near.distances, *near.speeds))
+    lines += departure_remarks(record, limits.control)
+    lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
+    lines += _task_remarks(scenario, changes, statistics)
+    is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
+    data = {
+        "missed": job.outcome is JobOutcome.BAD or is_unexplained or exceeds(bounded),
+        "error_bound": None if bounded is None else list(map(asdict, bounded)),
+        "job": job.to_dict(),
+        "phases": [asdict(change) for change in changes],
+        **asdict(near),
+        **as_data(verdict, reasons),
+        "interrupted": is_interrupted,
+        **{
+            name: getattr(statistics, name, None)
+            for name in ("simulated_time", "steps", "wall_time")
+        },
+    }
+    return RunReport(record, predicted, limits, accuracy, job, "\n".join(lines), data)
+
+
+def _contact_remarks(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
+    """Remarks on the surfaces of a robot and on its plant."""
+    if loop.plant.model is None:
+        return []
+    material = None if loop.plant.latches else scenario.plant.material
+    return [
+        *surface_remarks(loop.plant.model, record),
+        *loop.plant.remarks,
+        *ball_remarks(None if material is None else material.radius),
+    ]
+
+
+def _task_remarks(
+    scenario: Scenario, changes: Sequence[PhaseChange], statistics: RunStatistics | None
+) -> list[str]:
+    """The phases of a task, and remarks on its end and its touches."""
+    if not changes:
+        return []
+    stopped = stop_remarks(statistics, scenario.duration)
+    return ["", *map(str, changes), *stopped, *touch_remarks(changes)]
+
+
+def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
+    """Reasons for deviations from the prediction for an ideal run."""
+    reasons = {
+        "the drives were saturated": "excess" in record and bool(record["excess"].any()),
+        "parameters of the plant differ from those of the law (plant_parameters)": bool(
+            scenario.plant_parameters
+        ),
+        "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
+        "disturbance forces act on the plant, unknown to the law": bool(
+            scenario.plant_disturbances
+        ),
+        "the contact is compliant": not loop.plant.is_ideal,
+        "a contact was open": "mode" in record and not record["mode"].all(),
+        "the force is measured by a sensor": scenario.force_feedback.is_measured,
+        "the state is measured by encoders": scenario.encoders is not None,
+        "the law is sampled": scenario.sampling is not None,
+        "controls are late or lost on their way (sampling)": not (
+            scenario.sampling is None or scenario.sampling.is_exact
+        ),
+        "the law is a cascade around springs": scenario.is_cascade,
+    }
+    return [reason for reason, holds in reasons.items() if holds]
