@@ -23,10 +23,13 @@ def run_command(options: argparse.Namespace) -> int:
         print(_explained(options.code))
         return 0
     # The keys take most of a second to load.
-    from drake_dae.scenario.manual.page import keys_page
+    from drake_dae.scenario.manual.page import keys_page, named_keys
     from drake_dae.scenario.manual.schema import editor_schema
 
-    print(json.dumps(editor_schema(), indent=1) if options.command == "schema" else keys_page())
+    if options.command == "schema":
+        print(json.dumps(editor_schema(), indent=1))
+    else:
+        print(named_keys(options.key) if options.key else keys_page())
     return 0
 
 

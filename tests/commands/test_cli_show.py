@@ -39,6 +39,21 @@ def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_the_keys_of_one_form_and_one_key_in_all_forms(capsys):
+    for name in ("Plane", "!Plane"):
+        assert main(["keys", name]) == 0
+        text = capsys.readouterr().out.rstrip("\n")
+        assert text.startswith("## !Plane\n")
+        assert text in keys_page()
+    assert main(["keys", "gains"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("#")] == ["## Scenario", "## ScenarioTask"]
+    assert [line.split("`")[1] for line in lines if line.startswith("| `")] == ["gains", "gains"]
+    assert main(["keys", "gainz"]) == 1
+    assert "no key 'gainz'; did you mean 'gain' or 'gains'?" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_the_page_and_the_schema_are_printed(capsys):
     assert main(["keys"]) == 0
     assert capsys.readouterr().out == keys_page() + "\n"

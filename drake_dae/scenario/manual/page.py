@@ -1,8 +1,11 @@
 """The page of all keys of a scenario, in Markdown."""
 
 import re
+from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any
 
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.forms.typed_yaml import dump_yaml
 from drake_dae.scenario.manual.entries import NOTHING, OWN, ManualEntry, ManualKey, entries
 from drake_dae.scenario.manual.schema import custom_tags
@@ -29,6 +32,28 @@ def keys_page() -> str:
     return "\n".join([_HEAD.replace("{tags}", tags), *map(_section, entries())])
 
 
+def named_keys(name: str) -> str:
+    """The section of a form, such as "Plane"; or the row of a key, such as "gains", in each form.
+
+    Raises:
+        ScenarioError: No form and no key has that name.
+    """
+    forms = {entry.title.removeprefix("!"): entry for entry in entries()}
+    if (wanted := name.removeprefix("!")) in forms:
+        return _section(forms[wanted])
+    keys = [
+        replace(entry, keys=tuple(key for key in entry.keys if key.name == name), examples=())
+        for entry in entries()
+        if any(key.name == name for key in entry.keys)
+    ]
+    if not keys:
+        known = {*forms, *(key.name for entry in entries() for key in entry.keys)}
+        near = get_close_matches(wanted, sorted(known), n=3)
+        hint = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
+        raise ScenarioError(("", f"no key '{name}'; {hint}`drake-dae keys` prints all"))
+    return "\n".join(map(_section, keys))
+
+
 def _section(entry: ManualEntry) -> str:
     where = f"At `{entry.where}`. " if entry.where else ""
     paragraphs = entry.text.split("\n\n")
@@ -43,7 +68,8 @@ def _section(entry: ManualEntry) -> str:
     rows = ["| Key | Takes | Unit | Default | Meaning |", "|---|---|---|---|---|"]
     rows += [_row(key) for key in entry.keys]
     shown = "---\n".join(dump_yaml(dict(example)) for example in entry.examples)
-    return "\n".join([f"## {entry.title}\n\n{where}{text}\n", *rows, f"\n```yaml\n{shown}```\n"])
+    example = [f"\n```yaml\n{shown}```"] if shown else []
+    return "\n".join([f"## {entry.title}\n\n{where}{text}\n", *rows, *example, ""])
 
 
 def _row(key: ManualKey) -> str:
