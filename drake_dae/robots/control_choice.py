@@ -60,8 +60,8 @@ def check_outputs(
     if forces > nu:
         raise ModelError(
             f"{name}: {forces} constraint forces are outputs, but {nu} actuators can steer {nu} "
-            "outputs; name in `forces` those that are outputs, remove constraints, or add "
-            "actuators"
+            "outputs; name in `forces` those to be steered ([] is none), remove constraints, or "
+            "add actuators"
         )
     if count + forces and count + forces != nu:  # A robot that is only simulated needs no outputs.
         names = ", ".join(signal.name for signal in positions) or "none"
