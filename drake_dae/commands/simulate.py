@@ -111,7 +111,7 @@ def _unused(name: str) -> Path:
 
 @dataclass
 class _CommandRun:
-    """A run of the command: its loop and scenario, its folder, and its results."""
+    """A run of the command: its loop, context and scenario, and what it has recorded."""
 
     loop: ClosedLoop
     context: Context
