@@ -58,8 +58,8 @@ class ContactForces(LeafSystem):
         super().__init__()
         self.set_name("contact_forces")
         dae = model.dae
-        # Geometry -> the first entry of its constraint's force, and the sign of a force on it as one
-        # on the robot. A geometry of the robot collides only with its own constraint's surface.
+        # Geometry -> the first entry of its constraint's force, and the sign of a force on it as
+        # one on the robot. A geometry of the robot collides only with its constraint's surface.
         self._owners = {
             geometry: (3 * number, sign)
             for number, pair in enumerate(pairs)
