@@ -9,6 +9,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.presliding import FrictionState
@@ -16,6 +17,7 @@ from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.trace.factorization import BlockFactors, Factors, PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +148,34 @@ def friction_state(
     states += [load.friction_state(kinematics) for load in known_forces]
     together = FrictionState.of([state for state in states if state is not None])
     return replace(together, rate=kinematics.value(together.rate))
+
+
+def check_mass_matrix(dae: DaeSystem, links: Links, nominal: FloatArray) -> None:
+    """Refuses an M, without rotors that move with a stage, that is not positive definite.
+
+    Args:
+        dae: The robot's system.
+        links: The links, with nq positions and nv velocities.
+        nominal: The positions at which M is examined, shape (nq,).
+
+    Raises:
+        ModelError: M is not symmetric, or not positive definite.
+    """
+    nq, nv = links.q.numel(), links.v.numel()
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+    expression = dae.mass_matrix[nq : nq + nv, nq : nq + nv]
+    function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
+    mass = np.atleast_2d(function(nominal, dae.parameter_values)[0])
+    asymmetry = np.abs(mass - mass.T).max()
+    if asymmetry > 1e-9 * np.abs(mass).max():
+        raise ModelError(f"{dae.name}: M(q) is not symmetric, by {asymmetry:.2g}")
+    smallest = float(np.linalg.eigvalsh(mass)[0])
+    if smallest <= 0.0:
+        raise ModelError(
+            f"{dae.name}: M(q) is not positive definite at the nominal configuration: smallest "
+            f"eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a force; give "
+            "it mass, or weld it"
+        )
 
 
 def _known_force(links: Links, known_forces: Sequence[Load]) -> ca.SX:

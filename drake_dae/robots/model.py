@@ -21,7 +21,12 @@ from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
-from drake_dae.robots.equations import Outputs, friction_state, robot_equations
+from drake_dae.robots.equations import (
+    Outputs,
+    check_mass_matrix,
+    friction_state,
+    robot_equations,
+)
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
@@ -30,7 +35,6 @@ from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
-from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
@@ -164,7 +168,7 @@ class RobotModel:
         self._check_exogenous()
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
-        self._check_mass_matrix(nominal)
+        check_mass_matrix(self.dae, links, nominal)
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
@@ -227,7 +231,11 @@ class RobotModel:
         return self.dae.output_signals[: self.dae.num_outputs - self._num_forces]
 
     def configuration(
-        self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
+        self,
+        outputs: ArrayLike | None,
+        guess: ArrayLike,
+        parameters: ArrayLike | None = None,
+        output_parameters: ArrayLike | None = None,
     ) -> FloatArray:
         """q = psi(z_1) of (58): the consistent configuration with given position outputs.
 
@@ -235,6 +243,8 @@ class RobotModel:
             outputs: z_1, shape (nu - k,) where k forces are outputs; None leaves them free.
             guess: Where Newton's method starts, shape (nq,).
             parameters: Values of all parameters; the defaults if None.
+            output_parameters: Values of all parameters for z_1, such as those that a law assumes
+                for a wall that its constraint has elsewhere; `parameters` if None.
 
         Returns:
             q, shape (nq,); if the outputs do not determine it, the one next to the guess.
@@ -247,7 +257,10 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        solution, residual = self._placing.solve(wanted, q, values)
+        of_outputs = values
+        if output_parameters is not None:
+            of_outputs = self.dae.parameter_vector(output_parameters)
+        solution, residual = self._placing.solve(wanted, q, values, of_outputs)
         size = float(np.max(np.abs(residual), initial=0.0))
         if size < 1e-10:
             return solution
@@ -330,21 +343,3 @@ class RobotModel:
             nominal = self.configuration(None, nominal)
         forces = np.zeros(self._num_forces)
         return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
-
-    def _check_mass_matrix(self, nominal: FloatArray) -> None:
-        """Refuses an M, without rotors that move with a stage, that is not positive definite."""
-        nq, nv = self.links.q.numel(), self.links.v.numel()
-        inputs = {"q": self.links.q, "parameters": self.dae.parameter_symbol}
-        expression = self.dae.mass_matrix[nq : nq + nv, nq : nq + nv]
-        function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
-        mass = np.atleast_2d(function(nominal, self.dae.parameter_values)[0])
-        asymmetry = np.abs(mass - mass.T).max()
-        if asymmetry > 1e-9 * np.abs(mass).max():
-            raise ModelError(f"{self.name}: M(q) is not symmetric, by {asymmetry:.2g}")
-        smallest = float(np.linalg.eigvalsh(mass)[0])
-        if smallest <= 0.0:
-            raise ModelError(
-                f"{self.name}: M(q) is not positive definite at the nominal configuration: "
-                f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
-                "force; give it mass, or weld it"
-            )

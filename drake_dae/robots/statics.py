@@ -21,23 +21,31 @@ class StaticPlacement:
     """
 
     def __init__(self, dae: DaeSystem, q: ca.SX, phi: ca.SX, h_1: ca.SX) -> None:
+        of_outputs = ca.SX.sym("of outputs", dae.parameter_symbol.numel())
+        h_1 = ca.substitute(h_1, dae.parameter_symbol, of_outputs)
         self._function = TracedFunction(
             f"{dae.name} positions",
-            {"q": q, "parameters": dae.parameter_symbol},
+            {"q": q, "parameters": dae.parameter_symbol, "parameters of outputs": of_outputs},
             {"phi": phi, "h_1": h_1, "J": ca.jacobian(phi, q), "P": ca.jacobian(h_1, q)},
         )
 
     def solve(
-        self, outputs: FloatArray, guess: FloatArray, parameters: FloatArray
+        self,
+        outputs: FloatArray,
+        guess: FloatArray,
+        parameters: FloatArray,
+        of_outputs: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """A solution near a guess, and the remaining residual.
 
         Args:
             outputs: The first components of z_1; the others are free.
             guess: Where to start, shape (nq,).
-            parameters: Values of all parameters.
+            parameters: Values of all parameters, for phi.
+            of_outputs: The same for h_1.
         """
-        count, evaluated = outputs.size, once(lambda q: self._function(q, parameters))
+        count = outputs.size
+        evaluated = once(lambda q: self._function(q, parameters, of_outputs))
 
         def residual(q: FloatArray) -> FloatArray:
             phi, h_1, _, _ = evaluated(q)

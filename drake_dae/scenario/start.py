@@ -1,5 +1,6 @@
 """The start of the runs of a scenario."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import cast
 
@@ -30,7 +31,9 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """A new context of a closed loop at a scenario's start.
 
     The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors; a task at start.positions, in contact if its first phase needs it.
+    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
+    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
+    it.
 
     Args:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
@@ -120,12 +123,27 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     with at("start"):
         # By default near the start of the completion, which is not reported elsewhere.
         guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
-        q = _configuration(model, positions, guess, parameters)
+        q = _configuration(model, positions, guess, parameters, _of_law(loop, parameters))
         state = model.rest_state(q, forces, parameters)
         if scenario.exogenous:
             state = _in_motion(loop, context, outputs, state)
         plant.set_consistent_state(at_plant, state)
     _begin_sensor(loop, context, q, forces)
+
+
+def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
+    """The parameters of the plant's system as the law assumes them, shape (k,).
+
+    Exogenous ones are measured: law and plant have the same.
+    """
+    dae, system = loop.plant.dae, loop.controller.law.system
+    moving = {p.name for p in dae.exogenous.moving}
+    sizes = {p.name: p.value.size for p in system.parameters}
+    values, assumed = parameters.copy(), system.parameter_values
+    for p in dae.parameters:
+        if p.name not in moving and sizes.get(p.name) == p.value.size:
+            values[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
+    return values
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
@@ -168,12 +186,22 @@ def _outputs_at_start(errors: dict[str, float], loop: ClosedLoop, time: float) -
 
 
 def _configuration(
-    model: RobotModel, positions: FloatArray, guess: FloatArray, parameters: FloatArray
+    model: RobotModel,
+    positions: FloatArray,
+    guess: FloatArray,
+    parameters: FloatArray,
+    of_law: FloatArray,
 ) -> FloatArray:
-    """q with given position outputs, on the constraints, without whole turns and within limits."""
+    """q with the position outputs of the law, on the plant's constraints, within limits.
+
+    Whole turns are removed.
+    """
+
+    def solve(start: FloatArray) -> FloatArray:
+        return model.configuration(positions, start, parameters, of_law)
+
     try:
-        solution = model.configuration(positions, guess, parameters)
-        q = _unwound(model, positions, solution, guess, parameters)
+        q = _unwound(model, solve, solve(guess), guess)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -206,14 +234,13 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
 
 def _unwound(
     model: RobotModel,
-    positions: FloatArray,
+    solve: Callable[[FloatArray], FloatArray],
     solution: FloatArray,
     guess: FloatArray,
-    parameters: FloatArray,
 ) -> FloatArray:
     """Removes whole turns of joints from a configuration, as far as limits and outputs permit.
 
-    Newton's method may add whole turns to a joint.
+    Newton's method may add whole turns to a joint. `solve` returns a configuration near a guess.
     """
     q, turn = solution, 2 * np.pi
     limits = model.links.position_limits
@@ -230,6 +257,6 @@ def _unwound(
         trial = q.copy()
         trial[index] = nearest
         with suppress(InconsistentStateError):
-            settled = model.configuration(positions, trial, parameters)
+            settled = solve(trial)
             q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
     return q

@@ -137,6 +137,7 @@ Phase = Annotated[
     | phases.Wait
     | phases.GuardedMove
     | phases.Search
+    | phases.Follow
     | phases.Insert
     | phases.Screw
     | phases.Release

@@ -283,7 +283,9 @@ class Impedance:
 class Start:
     """A start at rest, on the constraints, with given errors of the outputs.
 
-    If a scenario has `exogenous` signals, the robot starts in motion with its references.
+    The constraints are those of the plant, and the outputs those of the law's model, which may
+    assume another wall (`plant_parameters`): the law sees no other errors than these. If a scenario
+    has `exogenous` signals, the robot starts in motion with its references.
 
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; by default that
