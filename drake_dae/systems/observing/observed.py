@@ -112,16 +112,21 @@ class Observed:
 
     def contact(self, state: ca.SX, parameters: ca.SX) -> ContactTerms:
         """The directions of friction and constraints at a state."""
-        observation, size = self.observation, len(self.observation.rows)
+        observation = self.observation
         friction = observation.friction.function(self._faster(state), self._force, parameters)
         directions = observation.directions.function(state, self._force, parameters)
         metric, free, planes = directions[:3]
         is_slow = friction[1] < _SHARP * self._observing.least_speed
         sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
-        held = planes * ca.repmat(ca.vec(ca.repmat(sticks.T, size, 1)).T, size, 1)
+        held = planes * self._repeated(sticks)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
         velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
         return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
+
+    def _repeated(self, of_contacts: ca.SX) -> ca.SX:
+        """Values of contacts for the entries of the planes side by side."""
+        size = len(self.observation.rows)
+        return ca.repmat(ca.vec(ca.repmat(of_contacts.T, size, 1)).T, size, 1)
 
     def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
         """The change of the estimate mu at a sample, by the part of r that friction explains."""
