@@ -55,9 +55,12 @@ from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
 from .dae.tracking.gains import gain_matrices as gain_matrices
 from .dae.tracking.gains import poles as poles
+from .dae.tracking.impedance import impedance_gains as impedance_gains
 from .dae.tracking.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
+from .diagrams.followed import FollowedLine as FollowedLine
+from .diagrams.followed import followed_lines as followed_lines
 from .diagrams.settings import LoopSettings as LoopSettings
 from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
@@ -199,6 +202,7 @@ from .systems.task.controller import TaskController as TaskController
 from .systems.task.phases import Approach as Approach
 from .systems.task.phases import Close as Close
 from .systems.task.phases import Dwell as Dwell
+from .systems.task.phases import Follow as Follow
 from .systems.task.phases import GuardedMove as GuardedMove
 from .systems.task.phases import Insert as Insert
 from .systems.task.phases import Move as Move

@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
+from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
 
@@ -45,7 +46,6 @@ class SteppedDiagram:
         choice: Whether the functions become machine code.
 
     Attributes:
-        context: The context of the system that Drake steps.
         before: The discrete states of all blocks before the updates of the next sample.
     """
 
@@ -62,15 +62,9 @@ class SteppedDiagram:
         self._functions: dict[tuple[int, int], tuple[list[int], list[int], TracedFunction]] = {}
         rate, block = compiled.stepped
         assert block.stepped is not None
-        system = block.stepped.system
-        self._bit, self._read = 1 << compiled.rates.index(rate), block.stepped.read
+        self._bit, self._steps = 1 << compiled.rates.index(rate), DrakeSteps(block.stepped, start)
         self._places = slice(rate.places[0], rate.places[-1] + 1)
-        self._period, self.context = rate.period, start
-        self._held, self.before = held.copy(), held.copy()
-        port = system.GetInputPort(block.stepped.into)
-        self._input = port.FixValue(start, np.zeros(port.size()))
-        self._simulator = Simulator(system, start)
-        self._simulator.Initialize(NO_EVENTS)
+        self._held, self.before, self._input = held.copy(), held.copy(), np.zeros(0)
 
     def begin(self, sample: Sample) -> bool:
         """Makes the unrestricted updates of a sample; returns whether all values are valid."""
@@ -85,9 +79,7 @@ class SteppedDiagram:
             RuntimeError: Drake's step fails.
         """
         if sample.due & self._bit:
-            # Up to the next step, which Drake then makes first.
-            self._simulator.AdvanceTo((round(sample.time / self._period) + 1) * self._period)
-            self._held[self._places] = self._read(self.context)
+            self._held[self._places] = self._steps.after(sample.time, self._input)
         return self._call(sample, following)
 
     def _call(self, sample: Sample, following: Sample) -> bool:
@@ -107,7 +99,7 @@ class SteppedDiagram:
         self.before[:] = held
         held[unrestricted] = begun
         if given.size:
-            self._input.GetMutableData().get_mutable_value().SetFromVector(given)
+            self._input = given
         return True
 
     def _traced(self, due: int, following: int) -> tuple[list[int], list[int], TracedFunction]:

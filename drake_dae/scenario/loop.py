@@ -213,7 +213,7 @@ def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
         assert scenario.gains is not None  # advised.
         return TrackingLaw(
             structure.system,
-            scenario.gains.design(),
+            scenario.gains.design(structure),
             structure=structure,
             measured_force=force.is_measured,
             force_gain=force.gain,

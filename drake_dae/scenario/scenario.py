@@ -23,6 +23,7 @@ from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
+    Damping,
     DisturbanceForce,
     Encoders,
     ErrorBound,
@@ -180,7 +181,7 @@ class Scenario:
     law: Law | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
-    constraint_damping: Gains | None = None
+    constraint_damping: Damping | None = None
     observer: Observer | None = None
     identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None

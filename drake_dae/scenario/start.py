@@ -150,7 +150,8 @@ def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     """The gains of a scenario; those of the last run are reused if the design is the same."""
     key, (last_key, design) = repr(gains), loop.memory.get("gains", ("", None))
     if last_key != key:
-        design = loop.controller.law.design(gains.design())
+        law = loop.controller.law
+        design = law.design(gains.design(law.structure))
         loop.memory["gains"] = key, design
     return cast(FeedbackGains, design)
 

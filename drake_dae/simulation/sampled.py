@@ -82,6 +82,7 @@ class SampledRun:
         held = compiled.start(context, has_begun=True)[1]
         held = compiled.initialized(start, np.zeros(0), held, self._parameters)
         choice = block.system.dae.compiled if isinstance(block.system, Plant) else "auto"
+        self._own = own
         self._diagram = SteppedDiagram(compiled, own, held, self._parameters, choice)
         self._noise = np.zeros(compiled.sizes["noise"])
         self._sources = [_Noise(source, part, compiled, context) for source, part in compiled.noise]
@@ -207,7 +208,7 @@ class SampledRun:
         context.SetTime(self._time)
         for source in self._sources:
             source.set_context(context)
-        _copy_state(self._diagram.context, system.GetMyMutableContextFromRoot(context))
+        _copy_state(self._own, system.GetMyMutableContextFromRoot(context))
         for block, part in self._compiled.held:
             values = self._diagram.before[part]
             if block is not self._block.system:

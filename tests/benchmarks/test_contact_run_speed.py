@@ -13,7 +13,7 @@ from runs import scenario
 from timing import has_compiler
 
 from drake_dae import build_scenario, simulate
-from drake_dae.scenario.build import make_plant
+from drake_dae.scenario.loop import make_plant
 from drake_dae.scenario.model import completed_model, scenario_structure
 
 DURATION, ROUNDS = 4.0, 3

@@ -322,6 +322,7 @@ def test_help_reports_the_exit_codes(capsys):
             "flat_press",
             "hand_over",
             "tool_change",
+            "edge_follow",
         ),
     ),
 )

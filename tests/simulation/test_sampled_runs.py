@@ -13,6 +13,7 @@ from runs import first_quick, scenario, some
 
 from drake_dae import build_scenario, simulate
 from drake_dae.compiler import stepped
+from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import SimulationError
 from drake_dae.simulation import sampled
 from drake_dae.simulation.sampled import SampledRun
@@ -149,13 +150,13 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     """So a failure is that of Drake's Simulator; here it finds a step after all."""
     chosen, loop, context = built("observer and integrals")
 
-    class Failing(Simulator):
-        def AdvanceTo(self, time):
-            if time > 0.0455:
+    class Failing(DrakeSteps):
+        def after(self, time, given):
+            if time > 0.0445:
                 raise RuntimeError("no convergence.")
-            return super().AdvanceTo(time)
+            return super().after(time, given)
 
-    monkeypatch.setattr(stepped, "Simulator", Failing)
+    monkeypatch.setattr(stepped, "DrakeSteps", Failing)
     expected, seen = context.Clone(), []
     statistics = simulate(
         loop.diagram, context, 0.06, chosen.integrator, look=lambda now: seen.append(now.get_time())

@@ -112,15 +112,18 @@ def standing_on_right(angle):
     return np.array([x, z, angle, 0.0, 0.0, 0.0])
 
 
-def simulator_of(plant, state, step=0.01, accuracy=1e-8, scheme="runge_kutta5"):
-    """Fixed steps, and events to a hundredth of `accuracy` in steps; no controls."""
+def simulator_of(
+    plant, state, step=0.01, accuracy=1e-8, scheme="runge_kutta5", control: np.ndarray | None = None
+):
+    """Fixed steps, and events to a hundredth of `accuracy` in steps; zero controls by default."""
     simulator = Simulator(plant)
     ResetIntegratorFromFlags(simulator, scheme, step)
     simulator.get_mutable_integrator().set_fixed_step_mode(True)
     context = simulator.get_mutable_context()
     controls = plant.GetInputPort("control").size()
     if controls:
-        plant.GetInputPort("control").FixValue(context, np.zeros(controls))
+        given = np.zeros(controls) if control is None else control
+        plant.GetInputPort("control").FixValue(context, given)
     plant.set_state(context, state)
     context.SetAccuracy(accuracy)
     simulator.Initialize()

@@ -1,6 +1,7 @@
 """CUDA without a GPU: threads one after the other, and the part of CuPy that rollouts use."""
 
 import ctypes
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,11 +58,25 @@ class RawModule:
         )
 
 
+class Event:
+    """A moment, since all is done at once."""
+
+    def record(self):
+        self.time = time.perf_counter()
+
+    def synchronize(self):
+        pass
+
+
 def fake_cupy(devices=1):
     """CuPy with some devices, each of which is this processor."""
     runtime = SimpleNamespace(getDeviceCount=lambda: devices)
     return SimpleNamespace(
-        cuda=SimpleNamespace(runtime=runtime),
+        cuda=SimpleNamespace(
+            runtime=runtime,
+            Event=Event,
+            get_elapsed_time=lambda begin, end: 1e3 * (end.time - begin.time),
+        ),
         asarray=lambda array: np.array(array).view(Array),
         RawModule=RawModule,
     )

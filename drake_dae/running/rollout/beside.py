@@ -4,10 +4,11 @@ import ctypes
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.compiled import CompiledDiagram
+from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings
 from drake_dae.running.rollout.stepping.called import BufferedFunction
@@ -31,7 +32,10 @@ def run_beside(
         problem: The run.
         settings: Its `look` decides whether to stop.
     """
-    plant = _DrakeSteps(functions, problem)
+    compiled = functions.program.compiled
+    rate, _ = compiled.stepped
+    bit, places = 1 << compiled.rates.index(rate), list(rate.places)
+    steps, given = _steps(compiled, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
     held_of_rows = np.empty((times.size, held.size))
     rows = count = 0
@@ -54,15 +58,15 @@ def run_beside(
             break
         moment, due = float(at), int(problem.due[count])
         try:
-            is_valid = update(moment, count, due, True, plant.input)
-            if is_valid and due & plant.bit:
-                held[plant.places] = plant.after(moment)
-            is_valid = is_valid and update(moment, count, due, False, plant.input)
+            is_valid = update(moment, count, due, True, given)
+            if is_valid and due & bit:
+                held[places] = steps.after(moment, given)
+            is_valid = is_valid and update(moment, count, due, False, given)
         except SimulationError as failure:
             ending, error = RunEnding.STUCK, failure
             break
         except RuntimeError as failure:  # Of Drake, as where its contact solver finds no step.
-            state = held[plant.places]
+            state = held[places]
             ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(failure))
             break
         if not is_valid:
@@ -73,38 +77,16 @@ def run_beside(
     return Run(record(), ending, moment, none, held, *counts, 0.0, none, error=error)
 
 
-class _DrakeSteps:
-    """The block that Drake steps, in a Simulator of its own.
-
-    Attributes:
-        bit: Its rate, as a bit of `due`.
-        places: The places of its outputs among the held values.
-        input: The value of its input port, shape (n,).
-    """
-
-    def __init__(self, functions: DiagramFunctions, problem: RunProblem) -> None:
-        compiled = functions.program.compiled
-        rate, block = compiled.stepped
-        assert block.stepped is not None
-        stepped, system = block.stepped, block.stepped.system
-        self.bit, self.places = 1 << compiled.rates.index(rate), list(rate.places)
-        self._period = rate.period
-        context: Context = system.CreateDefaultContext()
-        context.SetTime(float(problem.times[0]))
-        stepped.put(context, problem.held[dict(compiled.held)[block.system]])
-        self._read = stepped.read
-        self._port, self._context = system.GetInputPort(stepped.into), context
-        self.input = np.zeros(self._port.size())
-        self._port.FixValue(context, self.input)
-        self._simulator = Simulator(system, context)
-        self._simulator.Initialize()
-
-    def after(self, time: float) -> FloatArray:
-        """Returns its outputs after the step at a time in s, with `input`."""
-        self._port.FixValue(self._context, self.input)
-        # Up to the next step, which Drake then makes first.
-        self._simulator.AdvanceTo((round(time / self._period) + 1) * self._period)
-        return self._read(self._context)
+def _steps(compiled: CompiledDiagram, problem: RunProblem) -> tuple[DrakeSteps, FloatArray]:
+    """Returns the steps of what Drake steps, and an array for its input."""
+    _, block = compiled.stepped
+    assert block.stepped is not None
+    stepped, system = block.stepped, block.stepped.system
+    context: Context = system.CreateDefaultContext()
+    context.SetTime(float(problem.times[0]))
+    stepped.put(context, problem.held[dict(compiled.held)[block.system]])
+    system.ExecuteInitializationEvents(context)
+    return DrakeSteps(stepped, context), np.zeros(system.GetInputPort(stepped.into).size())
 
 
 def _updates(

@@ -2,11 +2,13 @@
 
 import numpy as np
 
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.parts.parts import Impedance
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.contacts.laws import laws_of_latches
 from drake_dae.systems.task.contacts.open_contact import open_contact
@@ -26,6 +28,10 @@ def check_task(scenario: Scenario) -> None:
     if (task := scenario.task) is not None:
         names = [name for name in task.make().signals if name not in task.signals]
         problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
+        gains = {"gains": scenario.gains, "task.gains": task.gains}
+        text = "an !Impedance is not for a task with latches; give !Poles or !Coefficients"
+        if task.make().plan.latches:
+            problems += [(key, text) for key, own in gains.items() if isinstance(own, Impedance)]
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
@@ -69,7 +75,9 @@ def task_controller(
     with at("task"):
         free_system = open_contact(law.system, forces)
     with at("task.gains" if task.gains else "gains"):
-        free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
+        structure = find_structure(free_system)
+        gains = (task.gains or scenario.gains).design(structure)
+        free_law = TrackingLaw(free_system, gains, structure=structure)
     with at("task"):
         # The noise of the sum over the points.
         return TaskController(
@@ -82,6 +90,8 @@ def _latched(scenario: Scenario, model: RobotModel, period: float) -> TaskContro
     task = scenario.task
     assert task is not None
     assert scenario.gains is not None
+    assert not isinstance(scenario.gains, Impedance)
+    assert not isinstance(task.gains, Impedance)
     if task.contact:
         text = "its phases name the latches that they open and close; leave it out"
         raise ScenarioError(("task.contact", text))

@@ -137,6 +137,7 @@ Phase = Annotated[
     | phases.Wait
     | phases.GuardedMove
     | phases.Search
+    | phases.Follow
     | phases.Insert
     | phases.Screw
     | phases.Release
@@ -145,4 +146,5 @@ Phase = Annotated[
     Choice(_PHASE_DATA),
 ]
 Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]
-Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices | parts.Impedance, Choice()]
+Damping = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

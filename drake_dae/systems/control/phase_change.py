@@ -25,6 +25,8 @@ class PhaseChange:
             "approach", "hold", "leave" or "stop"; empty at the start.
         failed: Whether the phase before failed.
         law: The number of the law that is active from then on; see `TaskSupervisor`.
+        followed: The names of the contacts whose points draw a line that the phase finds; empty if
+            it finds none.
     """
 
     time: float
@@ -38,6 +40,7 @@ class PhaseChange:
     chosen: str = ""
     failed: bool = False
     law: int = 0
+    followed: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return (

@@ -1,5 +1,6 @@
 """The first break-away of a contact as encoders show it, whose friction is not known yet."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -81,7 +82,7 @@ class Contacts:
         is_unused: 1 for each contact that is lost, or all where drives are limited.
     """
 
-    planes: ca.SX
+    planes: Sequence[ca.SX]
     forces: ca.SX
     accelerations: ca.SX
     towards: ca.SX
@@ -212,9 +213,9 @@ class BreakAway:
         deviation = ca.sqrt(self._noise(contacts.towards, contacts.pressing))
         as_wanted = ca.logic_and(is_moved, ahead > _CLEAR * deviation)
         squares = [
-            ca.fabs(ca.dot(error, ca.mtimes(plane, error)))
-            > _CLEAR**2 * ca.fabs(ca.dot(ca.diag(plane), self._squares))
-            for plane in ca.horzsplit(contacts.planes, error.numel())
+            ca.sumsqr(ca.mtimes(plane.T, error))
+            > _CLEAR**2 * ca.dot(ca.sum2(plane**2), self._squares)
+            for plane in contacts.planes
         ]
         is_far = distance > self._least * self._period
         return ca.logic_or(as_wanted, ca.logic_and(ca.vertcat(*squares), is_far))

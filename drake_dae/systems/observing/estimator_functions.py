@@ -5,7 +5,8 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.beyond.chain_filter import ChainFilter
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside, shares
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
+from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.break_away import BreakAway, Contacts, Slides
@@ -113,8 +114,8 @@ class EstimatorFunctions(Observed):
         moved += self._rubbed(q, moved, stepping, through, none)
         is_unused, slides = ca.logic_or(self._is_lost, hold), Slides.of(old.slides)
         if self._breaks_away:
-            stuck = contact.planes * self._repeated(self._first.is_stuck(slides, is_unused))
-            metric = factors.solve(through) if self.measures else contact.metric
+            stuck = self._side_by_side(contact.planes, self._first.is_stuck(slides, is_unused))
+            metric = factors.solve if self.measures else contact.metric
             momentum = ca.mtimes(mass, moved)
             stopped = momentum - beside(stuck, metric, momentum)
             moved -= factors.solve(ca.mtimes(through, stopped))

@@ -211,6 +211,7 @@ class TaskPlanner:
             chosen=cause.chosen,
             failed=cause.failed,
             law=number,
+            followed=self._followed(place, number),
         )
         origin = self.motion(now, number)[2]
         return ReferenceSegment.begin(
@@ -236,6 +237,13 @@ class TaskPlanner:
             else:
                 reference[law.layout.lowest[contact.main]] = moment.force
         return reference
+
+    def _followed(self, place: int, number: int) -> tuple[str, ...]:
+        """The names of the contacts whose points draw the line that a phase finds."""
+        if place >= len(self._phases) or not self._phases[place].finds_line:
+            return ()
+        signals = self._laws[number].system.force_signals
+        return tuple(signals[i].name.split(".")[0] for i in self._pairs[number // 2].contact.forces)
 
     def _name(self, place: int) -> str:
         return self._phases[place].name if place < len(self._phases) else DONE

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydrake.systems.analysis import Simulator
 from runs import first_quick, mostly_compiled, run_scenario, scenario, some
 
 from drake_dae import build_scenario, rollout, start_values
+from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.rollout import beside
@@ -137,13 +137,13 @@ def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported():
 def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch):
     """Its contact solver may find no step; what was recorded is kept."""
 
-    class Failing(Simulator):
-        def AdvanceTo(self, time):
-            if time > 0.0105:
+    class Failing(DrakeSteps):
+        def after(self, time, given):
+            if time > 0.0095:
                 raise RuntimeError("no convergence.")
-            return super().AdvanceTo(time)
+            return super().after(time, given)
 
-    monkeypatch.setattr(beside, "Simulator", Failing)
+    monkeypatch.setattr(beside, "DrakeSteps", Failing)
     found = chosen("a law with observer and integrals")
     rolled = roll_scenario(found, *build_scenario(found))
     assert isinstance(rolled.failure, SimulationError)

@@ -53,6 +53,7 @@ PURE = {
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),
     ("!SpringCascade", "damping"),
+    ("!Impedance", "damping_ratio"),
     ("!Adaptive", "parameters"),  # In the unit of each, squared, per J.
     ("!MeasuredForce", "gain"),
     ("Sampling", "loss"),

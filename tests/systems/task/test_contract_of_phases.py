@@ -11,6 +11,7 @@ from drake_dae import (
     Close,
     ConstantReference,
     Dwell,
+    Follow,
     GuardedMove,
     Insert,
     Move,
@@ -72,6 +73,11 @@ MEMBERS = {
         Search("tool.yz", 0.1, pattern="line", heading=1.0),
         Moment(1.0, 5.0, -0.0019, 0.0, 5.0, away=-0.0019),
         Moment(1.0, 5.0, -0.0021, 0.0, 5.0, away=-0.0021),
+    ),
+    "Follow": (
+        Follow("tool.z", -0.1, speed=0.05),  # 2 s at its speed, 0.1 s for the ramps, 0.5 s over.
+        Moment(2.5, 10.0, 0.0, 0.0, 10.0),
+        Moment(2.8, 10.0, 0.0, 0.0, 10.0),
     ),
     "Insert": (
         Insert(0.02, lag=0.005),

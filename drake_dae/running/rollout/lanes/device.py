@@ -13,7 +13,11 @@ from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Settings
 
 BLOCK = 64
-"""The number of threads of a block: each has some hundred live numbers."""
+"""The number of threads of a block; larger blocks are no faster, and leave processors without work
+where there are few runs."""
+
+OPTIONS = ("-std=c++17", "--fmad=true")
+"""Of NVRTC."""
 
 THREADS = 1 << 16
 """The largest number of threads under error control; each makes one run after the other."""
@@ -57,9 +61,8 @@ def run_on_device(program: RolloutProgram, problems: Problems, settings: Setting
             f'{program.name} does not run with device="cuda": a block in it changes at times that '
             "a run locates, or Drake steps it, or it has an operation that lanes do not support"
         )
-    options = ("-std=c++17", "--fmad=true")
     kernel = program.kept(
-        "device", lambda: cupy.RawModule(code=source(program), options=options)
+        "device", lambda: cupy.RawModule(code=source(program), options=OPTIONS)
     ).get_function("run_on_device")
     batch = RunBatch(program, problems, settings, ENDLESS)
     on_device = {name: cupy.asarray(array) for name, array in batch.arrays.items()}

@@ -58,10 +58,10 @@ class ContactForces(LeafSystem):
         super().__init__()
         self.set_name("contact_forces")
         dae = model.dae
-        # Geometry -> its constraint, and the sign of a force on it as one on the robot. A geometry
-        # of the robot collides only with the surface of its own constraint.
+        # Geometry -> the first entry of its constraint's force, and the sign of a force on it as
+        # one on the robot. A geometry of the robot collides only with its constraint's surface.
         self._owners = {
-            geometry: (number, sign)
+            geometry: (3 * number, sign)
             for number, pair in enumerate(pairs)
             for sign, geometries in zip((1.0, -1.0), pair, strict=True)
             for geometry in geometries
@@ -89,17 +89,25 @@ class ContactForces(LeafSystem):
 
     def contact_force(self, results: ContactResults) -> FloatArray:
         """The contact forces of Drake's contact results, N, shape (3 m,)."""
-        total = np.zeros((len(self.contact_force_signals) // 3, 3))
+        # Plain numbers: this runs at each step, and arrays of three numbers take twice the time.
+        total = [0.0] * len(self.contact_force_signals)
         for i in range(results.num_point_pair_contacts()):
             point = results.point_pair_contact_info(i)
-            number, sign = self._owners[point.point_pair().id_B]  # The force is that on B.
-            total[number] += sign * point.contact_force()
+            # The force is that on B.
+            self._add(total, point.point_pair().id_B, point.contact_force())
         for i in range(results.num_hydroelastic_contacts()):
             patch = results.hydroelastic_contact_info(i)
             # The force is that on the body of M.
-            number, sign = self._owners[patch.contact_surface().id_M()]
-            total[number] += sign * patch.F_Ac_W().translational()
-        return total.ravel()
+            self._add(total, patch.contact_surface().id_M(), patch.F_Ac_W().translational())
+        return np.array(total)
+
+    def _add(self, total: list[float], geometry: GeometryId, force: FloatArray) -> None:
+        """Adds the force of a contact on a geometry to the forces on the robot."""
+        first, sign = self._owners[geometry]
+        x, y, z = force.tolist()
+        total[first] += sign * x
+        total[first + 1] += sign * y
+        total[first + 2] += sign * z
 
     def _contact_force(self, context: Context) -> FloatArray:
         return self.contact_force(self._results.Eval(context))

@@ -53,6 +53,7 @@ def clearance(log: RunLog, time: float, gaps: FloatArray, rates: FloatArray) -> 
         return clearances
     pierced = gaps < np.minimum(log.gaps, 0.0) - TOUCHING
     clearances[pierced] = gaps[pierced]
-    dips = lowest(time - log.time, log.gaps, log.rates, gaps, rates)
+    before, after = (np.where(np.abs(each) < MARGIN, 0.0, each) for each in (log.rates, rates))
+    dips = lowest(time - log.time, log.gaps, before, gaps, after)
     clearances[dips < -TOUCHING] = dips[dips < -TOUCHING]
     return clearances

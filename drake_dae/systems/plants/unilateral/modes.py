@@ -16,6 +16,9 @@ from drake_dae.trace.functions import TracedFunction
 
 Closed = tuple[bool, ...]
 
+ROUND_OFF = 1e-12
+"""A force between zero and minus this, relative to the terms that it is made of, is round-off."""
+
 
 @dataclass(frozen=True, eq=False)
 class Mode:
@@ -27,6 +30,7 @@ class Mode:
         rows: The indices of its constraints among all; of sticking contacts, the independent ones.
         dynamics: x', a function of state, control if there is one, and parameters.
         force: All constraint forces, zero where open; it takes the control if that enters them.
+        grip: The same forces plus their round-off: positive where a closed contact does not pull.
         output: The controlled outputs, likewise.
         holds: For each entry of the constraint residual 1, or 0 if its contact is open.
     """
@@ -36,6 +40,7 @@ class Mode:
     rows: tuple[int, ...]
     dynamics: TracedFunction
     force: TracedFunction
+    grip: TracedFunction
     output: TracedFunction
     holds: FloatArray
 
@@ -94,8 +99,12 @@ class Modes:
             raise ModelError(f"{system.name}: a contact that opens and closes has degree 2 at most")
         derivatives = structure.derivatives
         constraint_input = derivatives.expand(derivatives.constraint_input)
-        force = ca.SX(dae.num_constraints, 1)
+        force, grip = ca.SX(dae.num_constraints, 1), ca.SX(dae.num_constraints, 1)
         force[rows] = constraint_input
+        # A force that the law cancels is a difference of alpha and the terms of beta u (25).
+        by_law = ca.mtimes(ca.fabs(structure.elimination.beta), ca.fabs(derivatives.control))
+        terms = ca.fabs(structure.elimination.alpha) + by_law
+        grip[rows] = constraint_input + ROUND_OFF * terms
         output = system.outputs(constraint_input)
         by_control = [ca.depends_on(value, derivatives.control) for value in (force, output)]
         rate = derivatives.expand(derivatives.rate)
@@ -105,6 +114,7 @@ class Modes:
             rows=tuple(rows),
             dynamics=structure.trace("dynamics", rate, dae.num_controls > 0),
             force=structure.trace("constraint force", ca.densify(force), by_control[0]),
+            grip=structure.trace("grip of contacts", ca.densify(grip), by_control[0]),
             output=structure.trace("controlled output", output, by_control[1]),
             holds=contacts.holds(closed),
         )

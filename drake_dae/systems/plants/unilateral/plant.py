@@ -44,7 +44,8 @@ class UnilateralRobotPlant(ModalPorts):
       restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
       that is exact in its limit; see `Resets`. Velocities jump; positions and the states of stages
       do not. Friction also acts in impacts.
-    - It opens when lambda falls through zero, or when a jump of the control makes it negative.
+    - It opens when lambda falls through zero, or when a jump of the control makes it negative. A
+      force that is zero except for round-off, as under a law that leaves none, keeps it closed.
     - With dependent contacts, such as four feet of a table, as few as possible carry the force, and
       the others touch without force. If friction leaves no motion or two, the run ends with a
       PainleveError.
@@ -186,7 +187,7 @@ class UnilateralRobotPlant(ModalPorts):
         return margin if margin > 0.0 else 1.0
 
     def _margins(self, context: Context) -> FloatArray:
-        """For each contact its force if closed; otherwise positive until it penetrates.
+        """For each contact its `grip` if closed; otherwise positive until it penetrates.
 
         For each latch positive while it is as it is commanded.
         """
@@ -203,7 +204,8 @@ class UnilateralRobotPlant(ModalPorts):
             log = self._log(context)
             margins[:] = clearance(log, context.get_time(), gaps, rates)
         if closed.any():
-            margins[closed] = self._mode_force(context)[self._contacts.normals][closed]
+            grip = self._evaluate(self._mode(context).grip, context)
+            margins[closed] = grip[self._contacts.normals][closed]
         as_commanded = latched == np.array(self._commanded(context), dtype=bool)
         value.set_value(np.concatenate([margins, np.where(as_commanded, 1.0, -1.0)]))
 

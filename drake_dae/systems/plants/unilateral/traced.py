@@ -128,6 +128,7 @@ class TracedContacts:
         modes = [mode for _, mode in self._all_modes if mode is not None]
         for name, size, port in (
             ("force", dae.num_constraints, "acting_force"),
+            ("grip", dae.num_constraints, "grip"),
             ("output", dae.num_outputs, "controlled_output"),
         ):
             needs = any("control" in getattr(mode, name).input_names for mode in modes)
@@ -167,23 +168,24 @@ class TracedContacts:
 
     def guard(self) -> Computation:
         """The margins of the plant: forces or clearances of contacts, and commands of latches."""
-        acting, contacts = ca.SX.sym("force", self._dae.num_constraints), self._contacts
+        grip, contacts = ca.SX.sym("grip", self._dae.num_constraints), self._contacts
         gaps, rates = contacts.gaps.function.call([self._state, self._parameters])[:2]
         clear = ca.if_else(gaps < -TOUCHING, gaps, ca.fmax(gaps, rates + MARGIN))
         is_closed, latched = ca.vertsplit(
             self._held > 0.5, [0, len(contacts.names), self._held.numel()]
         )
-        margins = ca.if_else(is_closed, acting[contacts.normals], clear)
+        margins = ca.if_else(is_closed, grip[contacts.normals], clear)
         inputs, sources = (
-            [self._state, self._held, acting, self._all],
-            [STATE, HELD, "acting_force", PARAMETERS],
+            [self._state, self._held, grip, self._all],
+            [STATE, HELD, "grip", PARAMETERS],
         )
         if contacts.latches:
             latch = ca.SX.sym("latch", len(contacts.latches))
             inputs, sources = [*inputs, latch], [*sources, "latch"]
             margins = ca.vertcat(margins, ca.if_else((latch > 0.5) == latched, 1, -1))
-        # The gap of a closed contact does not fall.
-        values = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_closed, 0, rates))]
+        # The gap of a closed contact does not fall, and that of one that has just opened neither.
+        is_still = ca.logic_or(is_closed, ca.fabs(rates) < MARGIN)
+        values = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_still, 0, rates))]
         function = ca.Function("guard", inputs, values)
         return Computation(function, tuple(sources), (MARGINS, GAPS, RATES))
 

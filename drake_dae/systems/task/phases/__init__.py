@@ -1,5 +1,6 @@
 """The phases of a task, with their goals and their ends."""
 
+from drake_dae.systems.task.phases.follow import Follow
 from drake_dae.systems.task.phases.guarded import GuardedMove, Wait
 from drake_dae.systems.task.phases.guards import PhaseGuard
 from drake_dae.systems.task.phases.insert import Insert
@@ -20,6 +21,7 @@ __all__ = [
     "Approach",
     "Close",
     "Dwell",
+    "Follow",
     "GuardedMove",
     "Insert",
     "Moment",

@@ -88,6 +88,8 @@ class Phase(ABC):
     6. `for_contact` and `for_latch` say whether it is for a contact that pushes, and for a latch: a
        constraint that commands open and close, with forces of any sign. Of a latch, `Moment` has
        the largest force, distance and rate of its directions.
+    7. With `finds_line` the paths of its contact points are straight, and `followed_lines` fits a
+       line to them.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -119,6 +121,7 @@ class Phase(ABC):
     is_relative: ClassVar[bool] = False
     for_contact: ClassVar[bool] = True
     for_latch: ClassVar[bool] = False
+    finds_line: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING

@@ -27,6 +27,7 @@ from drake_dae import (
     UnilateralRobotPlant,
 )
 from drake_dae.systems.plants.contact_events import ContactChange
+from drake_dae.systems.plants.unilateral.log import RunLog, clearance
 
 WALL = -0.5
 
@@ -213,6 +214,43 @@ def test_a_control_that_jumps_opens_a_contact_at_once(hold):
     assert event.kind is ContactChange.OPENING
     assert event.contacts == ("left",)
     assert abs(event.time - 0.03) < 1e-11
+
+
+@pytest.mark.parametrize("pull", [0.0, -1e-15, 1e-15, 1e-7])
+def test_a_contact_without_force_keeps_its_mode_whatever_the_sign_of_round_off(pull):
+    """Torques take the weight of a resting arm off its wall; those that pull as well open it.
+
+    A pull of 1e-15 of the weight changes the last bits of the torques; one of 1e-7 is a million
+    times the round-off of a force.
+    """
+    model = touching("two_link")
+    plant = UnilateralRobotPlant(model, {"wall": 0.0})
+    q = model.configuration(None, [1.2, -1.6])
+    found = numbers("two_link", q, np.zeros(2))
+    (jacobian,) = found.constraint_jacobian  # At rest the bias is the weight.
+    simulator, context = simulator_of(
+        plant, np.concatenate([q, np.zeros(2)]), control=found.bias - 5.0 * jacobian
+    )
+    simulator.AdvanceTo(0.01)
+    assert_allclose(plant.GetOutputPort("constraint_force").Eval(context), [5.0], rtol=1e-9)
+    weight = np.linalg.norm(found.bias)
+    plant.GetInputPort("control").FixValue(context, found.bias + pull * weight * jacobian)
+    simulator.AdvanceTo(0.05)
+    assert [event.kind for event in plant.events(context)] == [ContactChange.OPENING] * (
+        pull > 1e-10
+    )
+    assert plant.closed(context) == (() if pull > 1e-10 else ("wall",))
+
+
+def test_a_gap_that_opens_at_rest_has_no_dip_by_the_sign_of_round_off():
+    """A gap of t^4 from rest: the cubic through its ends falls, but a gap at rest does not."""
+    step, growth = 1e-3, 1e7
+    after, rate = np.array([growth * step**4]), np.array([4.0 * growth * step**3])
+    for still in (-1e-16, 0.0, 1e-16):
+        log = RunLog(time=0.0, gaps=np.zeros(1), rates=np.array([still]))
+        assert clearance(log, step, after, rate) > 0.0
+    falling = RunLog(time=0.0, gaps=np.zeros(1), rates=np.array([-1e-3]))
+    assert clearance(falling, step, after, rate) < 0.0
 
 
 def test_a_table_that_falls_away_faster_than_g_leaves_the_ball():
