@@ -222,6 +222,7 @@ def _ideal(scenario: Scenario) -> Scenario:
         sampling=sampling,
         encoders=None,
         observer=None,
+        identified=[],
         saturation=False,
         may_diverge=True,
     )
