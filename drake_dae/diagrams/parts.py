@@ -23,6 +23,7 @@ from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
@@ -143,6 +144,19 @@ def check_parts(
         )
     if not controller.HasInputPort("measured_force"):
         raise WiringError("the law takes no measured force; make it with measured_force=True")
+
+
+def can_be_fed_back(
+    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
+) -> bool:
+    """Whether a plant can evaluate the law itself instead of an input `control`; see `DaePlant`.
+
+    The law must be continuous, without control limits, and depend on state and references only.
+    The arguments are those of `LoopSettings`.
+    """
+    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
+    is_direct = sampling is None and control_limits is None
+    return is_direct and law.system.num_controls > 0 and not takes_more
 
 
 def add_feasible(

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence, Set
 
-from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import VectorLogSink
@@ -21,6 +20,7 @@ from drake_dae.diagrams.parts import (
     add_hold,
     add_signals,
     add_watch,
+    can_be_fed_back,
     check_parts,
     contact_reference,
     log_steps,
@@ -28,7 +28,12 @@ from drake_dae.diagrams.parts import (
 )
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import add_exogenous, make_generator
-from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
+from drake_dae.diagrams.state_feedback import (
+    MeasuredState,
+    PacketsWithNoise,
+    add_encoders,
+    add_packets,
+)
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
@@ -36,7 +41,6 @@ from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.drake_references import SystemReference
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
@@ -151,11 +155,15 @@ def wire_loop(
             add_block(builder, block)
     goal = contact_reference(controller, reference)
 
-    # The state goes to the controller, through encoders.
+    # The state goes to the controller, through encoders, and in packets that may be lost.
     state, measured = plant.GetOutputPort("state"), None
     if parts.encoders is not None:
         measured = add_encoders(builder, plant, parts.encoders, parts.period(plant.time_step))
         state = measured.output
+    forces = plant.dae.num_constraints if controller.HasInputPort("measured_force") else 0
+    packets = add_packets(builder, state, forces, parts.sampling)
+    if packets is not None:
+        state = packets.state
     observing = parts.observer if goal is not None else None
     if observing is None:
         builder.Connect(state, controller.GetInputPort("estimated_state"))
@@ -191,6 +199,8 @@ def wire_loop(
     if observing is not None and goal is not None:
         ports = state, sampling, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
+        if packets is not None:
+            builder.Connect(packets.missed, observer.GetInputPort("missed"))
         holds.append(observer.GetOutputPort("hold"))
     for block in (limits if observer is None else None, feasible):
         if block is not None:
@@ -203,15 +213,15 @@ def wire_loop(
     if controller.HasInputPort("measured_force"):
         if parts.sensor is not None:
             add_block(builder, parts.sensor)
-        others = [] if observer is None else [observer]
-        noise = add_force_feedback(builder, plant, controller, parts.sensor, parts.sampling, others)
+        ways = parts.sensor, parts.sampling, packets, [] if observer is None else [observer]
+        noise = add_force_feedback(builder, plant, controller, *ways)
     if parts.tolerances is not None and reference is not None:
         add_watch(builder, plant, reference, law, parts.tolerances)
 
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {
         **_of_plant(plant, moving, reference, law, control),
-        **_of_parts(plant, controller, measured, link, limits, observer, parts.sensor),
+        **_of_parts(plant, controller, measured, packets, link, limits, observer, parts.sensor),
     }
     if feasible is not None:
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
@@ -244,20 +254,8 @@ def wire_loop(
         measured,
         observer,
         link,
+        packets,
     )
-
-
-def can_be_fed_back(
-    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
-) -> bool:
-    """Whether a plant can evaluate the law itself instead of an input `control`; see `DaePlant`.
-
-    The law must be continuous, without control limits, and depend on state and references only.
-    The arguments are those of `LoopSettings`.
-    """
-    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
-    is_direct = sampling is None and control_limits is None
-    return is_direct and law.system.num_controls > 0 and not takes_more
 
 
 def _logged(
@@ -317,6 +315,7 @@ def _of_parts(
     plant: Plant,
     controller: Controller,
     measured: MeasuredState | None,
+    packets: PacketsWithNoise | None,
     link: LinkWithNoise | None,
     limits: ControlLimits | None,
     observer: Observer | None,
@@ -325,9 +324,13 @@ def _of_parts(
     """The further signals of controller, parts and plant that a record contains."""
     dae, named = plant.dae, Named()
     estimates = observer is not None and observer.HasOutputPort("estimated_state")
-    if measured is not None:
+    arriving = None if measured is None else measured.output
+    if packets is not None:
+        arriving = packets.state
+        named["lost_measurements"] = (packets.missed, packets.block.signals)
+    if arriving is not None:
         name = "measured_state" if estimates else "estimated_state"
-        named[name] = (measured.output, dae.state_signals)
+        named[name] = (arriving, dae.state_signals)
     if observer is not None and estimates:
         named["estimated_state"] = (observer.GetOutputPort("estimated_state"), dae.state_signals)
     if link is not None:

@@ -63,11 +63,12 @@ class EstimatorFunctions(Observed):
     Attributes:
         estimate: The symbols of an estimate.
         size: The number of entries of an estimate.
-        now: (xm, held, u, v, hold, time, parameters) -> the estimate of the present sample; held
-            is the estimate of a sample before, with u and v of that sample. It has no argument u
-            where the plant uses the previous control alone, and no v if the law measures no force.
+        now: (xm, held, u, v, hold, missed, time, parameters) -> the estimate of the present sample;
+            held is the estimate of a sample before, with u and v of that sample. It has no argument
+            u where the plant uses the previous control alone, and no v if the law measures no
+            force.
         measures: Whether the constraint force is measured, or there is none.
-        reads: The names of the ports of its arguments u, v and hold.
+        reads: The names of the ports of its arguments u, v, hold and missed.
         exogenous: (x, estimate, v, R, parameters) -> the disturbance to compensate, mu, and their
             derivatives.
 
@@ -107,7 +108,8 @@ class EstimatorFunctions(Observed):
         self.size = self.estimate.column.numel()
         elimination = law.structure.elimination
         self._model_force = elimination.alpha, elimination.beta
-        named = {"control": lag < 1.0, "measured_force": self.measures, "hold": True}
+        named = {"control": lag < 1.0, "measured_force": self.measures}
+        named |= {"hold": True, "missed": True}
         self.reads = tuple(name for name, is_read in named.items() if is_read)
         self.now = self._estimated()
         self.exogenous = self.compensated(law, delay, self.estimate.column, self.estimate)
@@ -117,7 +119,7 @@ class EstimatorFunctions(Observed):
         system, old, period = self._system, self.estimate, self._period
         measured, v, count = system.state, self._force, len(self.observation.rows)
         u = ca.SX.sym("control", system.num_controls)
-        time, hold = ca.SX.sym("time"), ca.SX.sym("hold", 1)
+        time, hold, missed = ca.SX.sym("time"), ca.SX.sym("hold", 1), ca.SX.sym("missed", 1)
         last_u, last_v = (ca.SX.sym("before", symbol.numel()) for symbol in (u, v))
         acted = self._lag * last_u + (1.0 - self._lag) * u
         share = (1.0 + self._step / period) / 2.0  # A discrete plant's force is that of its step.
@@ -142,8 +144,10 @@ class EstimatorFunctions(Observed):
         ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
 
         # Correction by the measurements, along the free and the constrained directions.
+        is_new = missed < 0.5
         steps = [
-            by_position * (measured[:count] - ahead) + by_velocity * (measured[count:] - moved)
+            is_new
+            * (by_position * (measured[:count] - ahead) + by_velocity * (measured[count:] - moved))
             for by_position, by_velocity in self._gains()
         ]
         free, constrained = steps[:3], steps[3:]
@@ -156,7 +160,7 @@ class EstimatorFunctions(Observed):
         new_r = r + beside(contact.held, contact.metric, jump)
 
         # Friction takes its share of the disturbance.
-        change = self.change(contact, mu, new_r, hold)
+        change = self.change(contact, mu, new_r, ca.logic_or(hold, ca.logic_not(is_new)))
         new_r -= ca.mtimes(contact.friction, change)
         corrected = ca.vertcat(new_q, new_v, new_r, mu + change)
         first, valid = ca.vertcat(measured, r, mu), contact.valid
@@ -171,7 +175,7 @@ class EstimatorFunctions(Observed):
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
         fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, corrected, first))
         estimate = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
-        symbols = {"control": u, "measured_force": v, "hold": hold}
+        symbols = {"control": u, "measured_force": v, "hold": hold, "missed": missed}
         inputs = {name: symbols[name] for name in self.reads} | {"time": time}
         return system.trace(
             "estimate of the state",
