@@ -56,7 +56,10 @@ def mark_events(axes: Sequence[Axes], record: Record, events: Sequence[RunEvent]
 
 def mark_phases(figure: Figure, record: Record) -> None:
     """Shades every second phase of a task in all axes of a figure, and writes the phases' names."""
+    from matplotlib.patheffects import withStroke
+
     spans = phase_spans(record)
+    halo = withStroke(linewidth=2.0, foreground="white")
     for axis in figure.axes:
         axis.margins(x=0.01)
         width = axis.get_position().width * figure.get_figwidth()
@@ -78,5 +81,6 @@ def mark_phases(figure: Figure, record: Record) -> None:
                 va="top",
                 fontsize=6,
                 color="0.45",
-                zorder=0.5,
+                path_effects=[halo],
+                zorder=0.7,  # Above the lines of impacts, below the curves.
             )

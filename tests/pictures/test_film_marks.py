@@ -10,7 +10,7 @@ from runs import run, scenario
 
 from drake_dae import build_scenario
 from drake_dae.pictures.moments import RunEvent, RunEventKind
-from drake_dae.pictures.scene.film_marks import FilmMarks
+from drake_dae.pictures.scene.film_marks import FilmMarks, told
 from drake_dae.pictures.scene.run_motion import follow
 
 QUICK = SimulatorConfig(
@@ -78,3 +78,19 @@ def test_events_and_phases_stand_on_the_time_of_the_run(course):
         # One cone while there is a force.
         assert len(axis.patches) == 1
     assert said == ["", *["wall: touch"] * 4]
+
+
+def test_contacts_that_strike_together_are_told_together():
+    """The last two kinds, the latest at the end; each contact once."""
+
+    def event(time, kind, names):
+        return RunEvent(time, kind, f"{names}: {kind.label}")
+
+    hits = [event(0.1 * k, RunEventKind.IMPACT, f"pad{1 + k % 3}, pad2") for k in range(5)]
+    opens = event(0.6, RunEventKind.OPENING, "pad1")
+    limit = RunEvent(0.05, RunEventKind.LIMIT, "joint1 is at its limit")
+    assert told(hits) == "pad1, pad2, pad3: impact"
+    assert told([limit, *hits]) == "joint1 is at its limit; pad1, pad2, pad3: impact"
+    assert told([limit, *hits, opens]) == "pad1, pad2, pad3: impact; pad1: contact opens"
+    assert told([opens, hits[0]]) == "pad1: contact opens; pad1, pad2: impact"
+    assert told([]) == ""

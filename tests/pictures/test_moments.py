@@ -89,14 +89,18 @@ def test_marks_stand_at_their_times_with_one_entry_in_the_legend():
     assert [text.get_text() for text in legend.get_texts()] == ["impact", "limit reached"]
 
 
-def test_names_of_short_phases_stand_apart():
+def test_names_of_short_phases_stand_apart_and_above_impacts():
     phase = np.zeros((101, 4))
     for k, begin in enumerate((0, 50, 52, 54)):
         phase[begin:, k], phase[begin:, :k] = 1.0, 0.0
     one = record(phase=phase)
-    figure = plot_controls(one)
+    figure = plot_controls(one, None, [RunEvent(5.2, RunEventKind.IMPACT, "pad: impact")])
     mark_phases(figure, one)
     (axis,) = figure.axes
+    (line,) = (
+        one for one in axis.lines if one.get_linestyle() == "-" and set(one.get_xdata()) == {5.2}
+    )
+    assert all(text.get_zorder() > line.get_zorder() for text in axis.texts)
     figure.draw_without_rendering()
     boxes = [text.get_window_extent() for text in axis.texts]
     assert len(boxes) == 4

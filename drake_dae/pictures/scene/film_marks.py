@@ -30,6 +30,20 @@ EVENT_DURATION = 1.0
 _RIM = 24  # The number of points on the rim of a drawn cone.
 
 
+def told(events: Sequence[RunEvent]) -> str:
+    """The last two different texts of events, with the contacts of one kind together.
+
+    A face of several points strikes many times in a second: "pad1, pad3: impact" and "pad2:
+    impact" are "pad1, pad2, pad3: impact".
+    """
+    names: dict[str, set[str]] = {}
+    for event in events:
+        contacts, colon, what = event.text.rpartition(": ")
+        known = names.pop(colon + what, set())  # Once more at the end: the latest is the last.
+        names[colon + what] = known | set(filter(None, contacts.split(", ")))
+    return "; ".join(", ".join(sorted(own)) + what for what, own in list(names.items())[-2:])
+
+
 class FilmMarks:
     """Draws the friction cones, moments and events of a run into the pictures of a film.
 
@@ -96,8 +110,7 @@ class FilmMarks:
                     axis.annotate("", pixels[1], pixels[0], arrowprops=shape)
         time = course.start_time + course.times[number]
         self._draw_time(axis, float(time), width, height)
-        recent = [e.text for e in self._events if 0.0 <= time - e.time < EVENT_DURATION]
-        return ", ".join(recent[-2:])
+        return told([e for e in self._events if 0.0 <= time - e.time < EVENT_DURATION])
 
     def cone(self, point: FloatArray, normal: FloatArray, coefficient: float) -> FloatArray:
         """Returns the tip and points on the rim of a cone that opens against the normal, (k, 3)."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.beyond.chain_filter import ChainFilter
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
+from drake_dae.dae.beyond.friction_share import beside
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observed import Observed, disturbance_degree
