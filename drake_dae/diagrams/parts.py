@@ -5,14 +5,8 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
-from pydrake.systems.primitives import (
-    Adder,
-    AffineSystem,
-    LogVectorOutput,
-    MatrixGain,
-    VectorLogSink,
-)
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
@@ -20,10 +14,8 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
@@ -146,19 +138,6 @@ def check_parts(
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
 
-def can_be_fed_back(
-    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
-) -> bool:
-    """Whether a plant can evaluate the law itself instead of an input `control`; see `DaePlant`.
-
-    The law must be continuous, without control limits, and depend on state and references only.
-    The arguments are those of `LoopSettings`.
-    """
-    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
-    is_direct = sampling is None and control_limits is None
-    return is_direct and law.system.num_controls > 0 and not takes_more
-
-
 def add_feasible(
     builder: DiagramBuilder,
     controller: Controller,
@@ -273,16 +252,3 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
     return [hold.get_output_port()]
-
-
-def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> VectorLogSink:
-    """Adds a log with one sample per step.
-
-    For a discrete plant the log is periodic, since after the last step of a run the state of the
-    plant belongs to a time that the run has not reached.
-    """
-    if plant.time_step:
-        log = builder.AddSystem(SampleLog(port.size(), plant.time_step))
-        builder.Connect(port, log.get_input_port())
-        return log
-    return LogVectorOutput(port, builder, {TriggerType.kPerStep})

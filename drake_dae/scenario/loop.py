@@ -16,11 +16,10 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.observing import control_lag
-from drake_dae.diagrams.parts import can_be_fed_back
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
-from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
+from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion.timing import TimedScenario

@@ -129,11 +129,15 @@ class Observed:
 
         is_slow = friction[1] < _SHARP * self._observing.least_speed
         sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
-        parts = [plane * sticks[j] for j, plane in enumerate(planes)]
-        held = ca.horzcat(ca.SX(directions[1].shape[0], 0), *parts)
+        held = self._side_by_side(planes, sticks)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
         velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
         return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
+
+    def _side_by_side(self, planes: Sequence[ca.SX], of_contacts: ca.SX) -> ca.SX:
+        """T of all contacts side by side, each times its entry of a column."""
+        scaled = [plane * of_contacts[j] for j, plane in enumerate(planes)]
+        return ca.horzcat(ca.SX(len(self.observation.rows), 0), *scaled)
 
     def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
         """The change of the estimate mu at a sample, by the part of r that friction explains."""
