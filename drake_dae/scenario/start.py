@@ -137,14 +137,17 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 
     Exogenous ones are measured: law and plant have the same.
     """
-    dae, system = loop.plant.dae, loop.controller.law.system
-    moving = {p.name for p in dae.exogenous.moving}
-    sizes = {p.name: p.value.size for p in system.parameters}
-    values, assumed = parameters.copy(), system.parameter_values
-    for p in dae.parameters:
-        if p.name not in moving and sizes.get(p.name) == p.value.size:
-            values[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
-    return values
+    if "of law" not in loop.memory:  # They are the same in all runs.
+        dae, system = loop.plant.dae, loop.controller.law.system
+        moving = {p.name for p in dae.exogenous.moving}
+        sizes = {p.name: p.value.size for p in system.parameters}
+        known, assumed = np.full(parameters.size, np.nan), system.parameter_values
+        for p in dae.parameters:
+            if p.name not in moving and sizes.get(p.name) == p.value.size:
+                known[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
+        loop.memory["of law"] = known
+    known = loop.memory["of law"]
+    return np.where(np.isnan(known), parameters, known)
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
