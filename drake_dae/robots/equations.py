@@ -134,7 +134,7 @@ def robot_equations(
         factorize=factorize,
         control_metric=ca.diag(choice[0].symbol) if choice else None,
         free_control=choice[1].symbol if choice else None,
-        contacts=bound.contacts,
+        contacts=bound.contacts(links),
         dry=tuple(name for load in known_forces for name in load.dry),
     )
 

@@ -23,9 +23,6 @@ DISTURBANCE = "disturbance"
 _TINY = 1e-200
 """The denominator where nothing slides or presses; the quotient is then not used."""
 
-_FLAT = 1e-9
-"""Directions count as equal if the ratio of their smallest to largest square is below this."""
-
 
 @checked(ModelError)
 def with_disturbance(
@@ -92,8 +89,9 @@ class Observation:
     derivative of a measurement is needed.
 
     Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, friction is a reaction:
-    any force T y, where the columns of T are the derivatives of S^T dg/dmu v with respect to the
-    velocities at rest. The momentum cannot distinguish it from d.
+    any force T y, where the columns of T are the gradients of the sliding velocities; if these are
+    not known, the derivatives of S^T dg/dmu v with respect to the velocities at rest, which span
+    the same. The momentum cannot distinguish it from d.
 
     Attributes:
         momentum: (x, u, v, parameters) -> p, its rate without inputs and d, and the part from the
@@ -101,10 +99,11 @@ class Observation:
         friction: (x, v, parameters) -> the friction force per unit of each coefficient, C = S^T
             dg/dmu v, shape (k, c), and the sliding speed from the power of friction, in m/s, shape
             (c,).
-        directions: (x, v, parameters) -> W = Q^T E^-1 Q and Q = 1 + S^T g dalpha/dd, shape (k, k),
-            where Q d is d with the reaction of the constraints, and d^T W d the squared
-            acceleration caused by d in the metric of kinetic energy; and T of each contact, side by
-            side, shape (k, c k).
+        directions: (x, v, parameters) -> Q = 1 + S^T g dalpha/dd, shape (k, k), where Q d is d with
+            the reaction of the constraints; and T of each contact, side by side.
+        metric: (x, d, parameters) -> W d with W = Q^T E^-1 Q, where d^T W d is the squared
+            acceleration caused by d in the metric of kinetic energy, shape (k,).
+        widths: The number of columns of T of each contact.
         wanted: (x, R, t, parameters) -> x with the velocities that the reference has a time t
             later, r' + t r'', on the constraints, shape (n,). None if outputs and constraints do
             not determine the velocities.
@@ -117,6 +116,8 @@ class Observation:
     momentum: TracedFunction
     friction: TracedFunction
     directions: TracedFunction
+    metric: TracedFunction
+    widths: tuple[int, ...]
     wanted: TracedFunction | None
     moving: TracedFunction
     rows: tuple[int, ...]
@@ -168,78 +169,52 @@ class Observation:
         frictional = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
         friction = system.trace("friction", frictional, pressed, often=False)
 
-        reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
-        projector = ca.SX.eye(len(rows)) + reaction
-        right = ca.SX(x.numel(), len(rows))
-        right[rows, :] = projector
-        moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
-        slopes = [ca.jacobian(column, x[rows]) for column in columns]
-        planes = ca.horzcat(ca.SX(len(rows), 0), *slopes)
+        pushes, reacts = system.g[rows, :], ca.jacobian(structure.elimination.alpha, d)
+        pushed, right = ca.SX.sym("d", len(rows)), ca.SX(x.numel(), 1)
+        right[rows] = pushed + ca.mtimes(pushes, ca.mtimes(reacts, pushed))
+        moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows]
+        moves += ca.mtimes(reacts.T, ca.mtimes(pushes.T, moves))
+        metric = system.trace("metric", {"value": moves}, {"d": pushed}, often=False)
+        planes = [
+            _plane(system, name, column, rows)
+            for name, column in zip(frictions, columns, strict=True)
+        ]
         directions_of_forces = {
-            "metric": ca.mtimes(projector.T, moves),
-            "free": projector,
-            "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
+            "free": ca.SX.eye(len(rows)) + ca.mtimes(pushes, reacts),
+            "planes": ca.densify(ca.horzcat(ca.SX(len(rows), 0), *planes)),
         }
         directions = system.trace(
             "directions of friction", directions_of_forces, pressed, often=False
         )
-        wanted, moving = _wanted(structure, rows, layout)
         return cls(
-            function, friction, directions, wanted, moving, tuple(rows), frictions, identified
+            function,
+            friction,
+            directions,
+            metric,
+            tuple(plane.shape[1] for plane in planes),
+            *_wanted(structure, rows, layout),
+            tuple(rows),
+            frictions,
+            identified,
         )
 
 
-def shares(forces: ca.SX, planes: ca.SX, velocity: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """Returns the part of d that each friction force c explains, as a factor, shape (c, 1):
-
-        (c~^T W d) / (c~^T W c),
-
-    where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
-    So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
+def _plane(system: DaeSystem, name: str, force: ca.SX, rows: Sequence[int]) -> ca.SX:
+    """T of a contact, shape (k, j).
 
     Args:
-        forces: The forces as columns, shape (k, c).
-        planes: T, the reactions of each contact if it sticks, side by side, shape (k, c k).
-        velocity: The velocities, shape (k, 1).
-        metric: W, shape (k, k).
-        d: The disturbance, shape (k, 1).
+        system: The system.
+        name: Its coefficient of friction.
+        force: The force of a coefficient of 1 at the states whose rates contain d.
+        rows: These states.
     """
-    size, components = forces.shape[0], list[ca.SX]()
-    for j in range(forces.shape[1]):
-        force, plane = forces[:, j], planes[:, j * size : (j + 1) * size]
-        # T = J^T J of the contact, and c = -J^T v_t / |v_t|: so this is J^T of what is across v_t.
-        power = ca.fmin(ca.mtimes(velocity.T, force), -_TINY)
-        across = plane - ca.mtimes(force, ca.mtimes(velocity.T, plane)) / power
-        sizes = [
-            ca.mmax(ca.sum1(columns * ca.mtimes(metric, columns))) for columns in (across, plane)
-        ]
-        across *= sizes[0] > _FLAT * sizes[1]  # Round-off where all of the plane is along c.
-        matched = ca.mtimes(metric, beside(across, metric, force))
-        square = ca.fmax(ca.dot(matched, force), _TINY)
-        components.append(ca.dot(matched, d) / square)
-    return ca.vertcat(ca.SX(0, 1), *components)
-
-
-def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """Returns the part of d that is orthogonal to all T y in the metric of accelerations.
-
-    Args:
-        planes: T, shape (k, j), of any rank.
-        metric: W, shape (k, k).
-        d: Disturbances, as columns.
-    """
-    squares = ca.sum1(planes * ca.mtimes(metric, planes))
-    least = _FLAT * ca.mmax(squares) if squares.numel() else 0
-    basis: list[tuple[ca.SX, ca.SX]] = []
-    for column in ca.horzsplit(planes):
-        for direction, matched in basis:  # Modified Gram-Schmidt, in the metric W.
-            column -= direction * ca.dot(matched, column)
-        matched = ca.mtimes(metric, column)
-        square = ca.dot(column, matched)
-        matched = ca.if_else(square > least, 1, 0) / ca.fmax(square, _TINY) * matched
-        basis.append((column, matched))
-        d -= ca.mtimes(column, ca.mtimes(matched.T, d))
-    return d
+    velocities = system.state[list(rows)]
+    for contact in system.contacts:
+        if contact.friction == name and contact.sliding is not None:
+            slope = ca.sparsify(ca.jacobian(contact.sliding, velocities)).T
+            moving = [j for j in range(slope.shape[1]) if slope[:, j].nnz()]
+            return ca.densify(slope[:, moving or [0]])
+    return ca.substitute(ca.jacobian(force, velocities), velocities, 0 * velocities)
 
 
 def _wanted(

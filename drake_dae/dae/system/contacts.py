@@ -11,7 +11,7 @@ reaches zero is the Painleve paradox (1895).
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from itertools import chain, combinations
 
@@ -36,10 +36,13 @@ class UnilateralInput:
     Attributes:
         force: The name of the constraint input, which acts on the constraint in the same place.
         friction: The name of the parameter that is its coefficient of friction; None without one.
+        sliding: The velocities that its friction opposes, as expressions that are linear in the
+            velocities among the states, shape (k, 1); None if they are not known.
     """
 
     force: str
     friction: str | None = None
+    sliding: ca.SX | None = field(default=None, repr=False, compare=False)
 
 
 class PainleveOutcome(Enum):

@@ -208,11 +208,16 @@ class ConstraintSet:
                 total += links.generalized_force(kinematics, reaction)
         return total
 
-    @property
-    def contacts(self) -> tuple[UnilateralInput, ...]:
+    def contacts(self, links: Links) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
+        kinematics = links.kinematics()
+
+        def slides(constraint: Constraint) -> ca.SX | None:
+            sliding = constraint.sliding(kinematics)
+            return None if sliding is None else kinematics.value(sliding)
+
         contacts = [
-            UnilateralInput(signal.name, constraint.friction_parameter)
+            UnilateralInput(signal.name, constraint.friction_parameter, slides(constraint))
             for constraint in self.constraints
             for signal, pushes in zip(
                 constraint.force_signals, constraint.is_unilateral, strict=True

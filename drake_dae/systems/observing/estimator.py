@@ -41,7 +41,9 @@ class StateEstimator(ObservingSystem):
     errors of the estimate are those of a linear filter for any motion. Along the constrained
     directions, M^-1 J^T A^-1 J e, the gains are those of k_n in place of k_o. Measured velocities,
     if their noise is given, correct likewise. Friction takes its share of r as in a
-    `DisturbanceObserver`, and so does a contact that sticks.
+    `DisturbanceObserver`, and so does a contact that sticks. In the prediction friction is
+    implicit, and at most stops a contact. At its first break-away a contact has a filter of its
+    own, `BreakAway`.
 
     Input ports:
         measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
@@ -103,8 +105,8 @@ class StateEstimator(ObservingSystem):
         ]
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
-        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters)
-        start = np.zeros(functions.size + law.system.num_controls + law.system.num_constraints)
+        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
+        start = np.zeros(functions.now.arguments[functions.now.input_names.index("held")].size)
         start[0] = -1.0
         self._declare(law, functions, "measured_state", start)
         self._read = functions.reads
@@ -127,7 +129,7 @@ class StateEstimator(ObservingSystem):
         sources = {entry.ticket(), self.all_parameters_ticket()}
         read = {force, self.input_port_ticket(self._ports["reference"].get_index())}
         exogenous = port_value(self._exogenous_values)
-        state, disturbance, friction, _ = (port_value(self._part, part) for part in self._parts)
+        state, disturbance, friction = (port_value(self._part, part) for part in self._parts[:3])
         for name, size, value, tickets in (
             ("estimated_state", law.system.num_states, state, sources),
             ("exogenous", functions.exogenous.outputs[0].size, exogenous, sources | read),
@@ -141,7 +143,7 @@ class StateEstimator(ObservingSystem):
 
     @property
     def _parts(self) -> tuple[slice, ...]:
-        """The parts of an estimate: state, disturbance, friction and force."""
+        """The parts of an estimate: state, disturbance, friction, force and slides."""
         estimate = self._functions.estimate
         columns = (
             estimate.sample,
@@ -149,6 +151,7 @@ class StateEstimator(ObservingSystem):
             estimate.disturbance,
             estimate.friction,
             estimate.force,
+            estimate.slides,
         )
         ends = np.cumsum([column.numel() for column in columns]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
@@ -190,7 +193,10 @@ class StateEstimator(ObservingSystem):
         return self._estimate(context)[part]
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        held = [self._estimate(context), *self._inputs(context, "control"), self._force(context)]
+        estimate = self._estimate(context)
+        (control,) = self._inputs(context, "control")
+        reference = self._reference(context, estimate[self._parts[0]])
+        held = [estimate, control, self._force(context), reference]
         state.get_mutable_discrete_state().set_value(self._held, np.concatenate(held))
         return EventStatus.Succeeded()
 
@@ -214,14 +220,15 @@ class StateEstimator(ObservingSystem):
         parts |= {} if self._measures else {_FORCE: estimate.force}
         column = estimate.column
         shown = ca.Function("shown", [column], list(parts.values()))
-        u, v = ca.SX.sym("u", self.dae.num_controls), ca.SX.sym("v", self.dae.num_constraints)
-        after = ca.Function("after", [column, u, v], [ca.vertcat(column, u, v)])
+        sizes = self.dae.num_controls, self.dae.num_constraints, self._ports["reference"].size()
+        held = [column, *(ca.SX.sym("held", size) for size in sizes)]
+        after = ca.Function("after", held, [ca.vertcat(*held)])
         computations = (
             now,
             Computation(shown, (_NOW,), tuple(parts)),
             Computation.of(functions.exogenous, state, ("exogenous",)),
         )
-        sample = Computation(after, (_NOW, "control", force), (HELD,))
+        sample = Computation(after, (_NOW, "control", force, "reference"), (HELD,))
         return self._block(computations, sample, force)
 
 

@@ -1,60 +1,20 @@
 """The computations of a `StateEstimator` at its samples, as traced functions."""
 
-from dataclasses import dataclass
-from typing import Self
-
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.beyond.chain_filter import ChainFilter
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, beside
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
+from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.observing.observed import Observed, disturbance_degree
+from drake_dae.systems.observing.break_away import BreakAway, Contacts, Slides
+from drake_dae.systems.observing.estimate import Estimate
+from drake_dae.systems.observing.observed import ContactTerms, Observed, disturbance_degree
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The estimate at a sample, as columns that are stacked.
-
-    Attributes:
-        sample: The index k of the sample t_k = k T; -1 before the first, shape (1,).
-        state: The estimated x, shape (n,).
-        disturbance: r, shape (k,).
-        friction: mu, shape (c,).
-        force: The constraint force of the model, shape (m,); none if it is measured.
-    """
-
-    sample: ca.SX
-    state: ca.SX
-    disturbance: ca.SX
-    friction: ca.SX
-    force: ca.SX
-
-    @classmethod
-    def of(cls, states: int, frictions: int, forces: int) -> Self:
-        """Symbols for given sizes of x, mu and the force."""
-        sizes = (1, states, states // 2, frictions, forces)
-        return cls(*(ca.SX.sym("estimate", size) for size in sizes))
-
-    @property
-    def rates(self) -> ca.SX:
-        """The derivatives of r: none."""
-        return ca.SX(0, 1)
-
-    @property
-    def identified(self) -> ca.SX:
-        """Other parameters: none."""
-        return ca.SX(0, 1)
-
-    @property
-    def column(self) -> ca.SX:
-        """The whole estimate as one column."""
-        return ca.vertcat(*vars(self).values())
 
 
 class EstimatorFunctions(Observed):
@@ -64,7 +24,7 @@ class EstimatorFunctions(Observed):
         estimate: The symbols of an estimate.
         size: The number of entries of an estimate.
         now: (xm, held, u, v, hold, time, parameters) -> the estimate of the present sample; held
-            is the estimate of a sample before, with u and v of that sample. It has no argument u
+            is the estimate of a sample before, with u, v and R of that sample. It has no argument u
             where the plant uses the previous control alone, and no v if the law measures no force.
         measures: Whether the constraint force is measured, or there is none.
         reads: The names of the ports of its arguments u, v and hold.
@@ -76,6 +36,7 @@ class EstimatorFunctions(Observed):
         period, lag, delay, step: Its `sample_period`, `control_lag`, `control_delay` and
             `plant_step`.
         filters: Its filters along the free and the constrained directions, one for each position.
+        deviations: The standard deviations of measured positions, shape (k,), or 0.
 
     Raises:
         ModelError: The law's system has no disturbance, or is no robot with rigid joints.
@@ -90,6 +51,7 @@ class EstimatorFunctions(Observed):
         delay: float,
         step: float,
         filters: tuple[list[ChainFilter], list[ChainFilter]],
+        deviations: FloatArray | float = 0.0,
     ) -> None:
         super().__init__(law, observing, period)
         system = self._system
@@ -100,7 +62,13 @@ class EstimatorFunctions(Observed):
                 "estimated; for other parameters leave it out, and measure the velocities or let "
                 "the encoders form differences by a velocity_bandwidth"
             )
-        self._lag, self._step, self._filters = lag, step, filters
+        self._lag, self._step, self._delay, self._filters = lag, step, delay, filters
+        each = np.broadcast_to(deviations, (len(self.observation.rows),))
+        self._first = BreakAway(self.observation, observing, period, each)
+        self._breaks_away = bool(self.observation.frictions) and (
+            self.observation.wanted is not None
+        )
+        self._reference = ca.SX.sym("R before", law.layout.reference_size)
         self.measures = law.measured_force is not None or not system.num_constraints
         forces = 0 if self.measures else system.num_constraints
         self.estimate = Estimate.of(system.num_states, len(self.observation.frictions), forces)
@@ -131,14 +99,26 @@ class EstimatorFunctions(Observed):
         contact = self.contact(middle, none)
         if not self.measures:
             force = v
-        none[system.parameter_slice(DISTURBANCE)] = r + ca.mtimes(contact.friction, mu)
+        rubs = ca.mtimes(contact.friction, mu)
+        none[system.parameter_slice(DISTURBANCE)] = r + rubs
         mass, push, damping = self._balance()(middle, acted, force, none)
         factors = stepping = PositiveDefiniteFactorization(mass)
         moves = mass
         if not damping.is_zero():  # Implicit, as in Drake's discrete plants: a light link is stiff.
             moves = mass + period * ca.diag(damping)
             stepping = PositiveDefiniteFactorization(moves)
-        moved = qd + period * stepping.solve(push)
+        # A measured force has the reaction of the constraints to the friction that acts, and a
+        # force of the model that to the friction of a contact that slides.
+        through = ca.SX.eye(count) if self.measures else contact.free
+        moved = qd + period * stepping.solve(push - ca.mtimes(through, rubs))
+        moved += self._rubbed(q, moved, stepping, through, none)
+        is_unused, slides = ca.logic_or(self._is_lost, hold), Slides.of(old.slides)
+        if self._breaks_away:
+            stuck = self._side_by_side(contact.planes, self._first.is_stuck(slides, is_unused))
+            metric = factors.solve if self.measures else contact.metric
+            momentum = ca.mtimes(mass, moved)
+            stopped = momentum - beside(stuck, metric, momentum)
+            moved -= factors.solve(ca.mtimes(through, stopped))
         ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
 
         # Correction by the measurements, along the free and the constrained directions.
@@ -155,29 +135,98 @@ class EstimatorFunctions(Observed):
         jump += ca.mtimes(contact.free, ca.mtimes(moves, difference[:, 2]))
         new_r = r + beside(contact.held, contact.metric, jump)
 
-        # Friction takes its share of the disturbance.
+        # Friction takes its share of the disturbance, and all of it at the first break-away.
         change = self.change(contact, mu, new_r, hold)
         new_r -= ca.mtimes(contact.friction, change)
-        corrected = ca.vertcat(new_q, new_v, new_r, mu + change)
-        first, valid = ca.vertcat(measured, r, mu), contact.valid
+        if self._breaks_away:
+            error = measured[:count] - ahead
+            forces = self._developed(ca.vertcat(q, new_v), none)
+            freed = ca.mtimes(contact.free, forces)
+            along = factors.solve(freed)
+            goal, contacts = self._contacts(
+                middle, push - rubs, forces, along, contact, is_unused, none
+            )
+            slide = self._first.corrected((middle, goal), error, contacts, v, none, slides)
+            terms = forces, contact.planes, new_v, contact.metric
+            late = slide.is_early * shares(*terms, ca.mtimes(mass, error))
+            usual = self._filters[0][0].gain[:, 0]
+            new_q += ca.mtimes(along, late * (slide.displacement - usual[0]))
+            new_v += ca.mtimes(along, late * (slide.speed - usual[1]))
+            new_r -= ca.mtimes(freed, slide.is_early * shares(*terms, new_r - r))
+            b = -ca.sum1(forces * along).T / contacts.pressing
+            change += slide.rise + slide.friction * b * late
+            mu = ca.if_else(slide.begins, slide.start, mu)
+            slides = slide.slides
+        new_mu = ca.fmin(ca.fmax(mu + change, 0.0), self._observing.largest_friction)
+        corrected = ca.vertcat(new_q, new_v, new_r, new_mu)
+        start = ca.vertcat(measured, r, old.friction)
+        known, valid = slides.column, contact.valid
         if not self.measures:
-            by_model = self._forces(middle, r, mu, acted)
-            corrected, valid = ca.substitute([corrected, valid], [v], [by_model])
+            by_model = self._forces(middle, r, old.friction, acted)
+            given = [corrected, known, valid]
+            corrected, known, valid = ca.substitute(given, [v], [by_model])
             ends = [0, 2 * count, 3 * count, corrected.numel()]
             state, new_r, new_mu = ca.vertsplit(corrected, ends)
             corrected = ca.vertcat(corrected, self._forces(state, new_r, new_mu, acted))
-            first = ca.vertcat(first, ca.SX.zeros(v.numel()))  # No control has acted yet.
+            start = ca.vertcat(start, ca.SX.zeros(v.numel()))  # No control has acted yet.
+        corrected = ca.vertcat(corrected, known)
+        start = ca.vertcat(start, old.slides)
         sample = ca.floor(time / period + _SAME)
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
-        fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, corrected, first))
+        fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, corrected, start))
         estimate = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
         symbols = {"control": u, "measured_force": v, "hold": hold}
         inputs = {name: symbols[name] for name in self.reads} | {"time": time}
         return system.trace(
             "estimate of the state",
             {"estimate": estimate, "valid": ca.if_else(is_corrected, valid, 0)},
-            {"held": ca.vertcat(old.column, last_u, last_v), **inputs},
+            {"held": ca.vertcat(old.column, last_u, last_v, self._reference), **inputs},
         )
+
+    def _developed(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The friction force per unit of each coefficient, fully developed, shape (k, c)."""
+        friction = self.observation.friction.function
+        return friction(self._faster(state), self._force, parameters)[0]
+
+    def _rubbed(
+        self,
+        q: ca.SX,
+        moved: ca.SX,
+        mass: PositiveDefiniteFactorization,
+        through: ca.SX,
+        parameters: ca.SX,
+    ) -> ca.SX:
+        """The change of velocities by friction over a sample.
+
+        It is implicit: against the velocity that there would be without it, which it at most stops.
+        Otherwise it would turn a light tool about from sample to sample.
+        """
+        forces = self._developed(ca.vertcat(q, moved), parameters)
+        made = self._period * mass.solve(ca.mtimes(through, forces))
+        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, _LITTLE)
+        return ca.mtimes(made, ca.fmin(self.estimate.friction, stopping))
+
+    def _contacts(
+        self,
+        x: ca.SX,
+        push: ca.SX,
+        forces: ca.SX,
+        accelerations: ca.SX,
+        contact: ContactTerms,
+        is_unused: ca.SX,
+        parameters: ca.SX,
+    ) -> tuple[ca.SX, Contacts]:
+        """The state with the wanted velocities, and the contacts for their first break-away."""
+        wanted, frictions = self.observation.wanted, self.observation.frictions.values()
+        assert wanted is not None
+        goal = wanted.function(x, self._reference, self._delay, parameters)[0]
+        towards = self._developed(goal, parameters)
+        terms = towards, contact.planes, goal[list(self.observation.rows)], contact.metric
+        pressing = ca.fmax(ca.fabs(self._force[list(frictions)]), _LITTLE)
+        needed = ca.fmin(-shares(*terms, push), self._observing.largest_friction)
+        mu, planes = self.estimate.friction, contact.planes
+        moves = forces, accelerations, towards
+        return goal, Contacts(planes, *moves, mu, needed, pressing, is_unused)
 
     def _forces(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
         """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""
@@ -215,6 +264,9 @@ class EstimatorFunctions(Observed):
             pairs += [tuple(ca.DM(gains[:, j, e]) for e in range(2)) for j in range(3)]
         return pairs
 
+
+_LITTLE = 1e-9
+"""The least normal force, in N, by which is divided."""
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""

@@ -1,12 +1,15 @@
 """The functions that all observers share: the part of friction, and the signals for the law."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation, shares
+from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation
+from drake_dae.dae.beyond.friction_share import Metric, shares
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
@@ -54,18 +57,19 @@ class ContactTerms:
 
     Attributes:
         friction: C, the friction force per unit of each coefficient, shape (k, c).
-        metric, free: W and Q of `Observation.directions`.
-        planes: T of `Observation.directions`.
-        held: T of the contacts that stick; zero for others.
+        metric: W of `Observation.metric`, as a function of columns.
+        free: Q of `Observation.directions`.
+        planes: T of `Observation.directions`, of each contact.
+        held: T of the contacts that stick, side by side; zero for others.
         velocity: The velocities, shape (k, 1).
         slides: 1 for each contact that certainly slides, shape (c,).
         valid: Finite if all of these are valid.
     """
 
     friction: ca.SX
-    metric: ca.SX
+    metric: Metric
     free: ca.SX
-    planes: ca.SX
+    planes: Sequence[ca.SX]
     held: ca.SX
     velocity: ca.SX
     slides: ca.SX
@@ -90,6 +94,7 @@ class Observed:
     def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
         self.observation = observation = Observation.of(law.structure, law.layout)
         self._system, self._observing, self._period = law.system, observing, period
+        self._stops = [0, *accumulate(observation.widths)]
         self._force = ca.SX.sym("constraint_input", law.system.num_constraints)
         entries = (law.system.parameter_slice(p.name) for p in observation.identified.parameters)
         self._places = [i for part in entries for i in range(part.start, part.stop)]
@@ -112,16 +117,27 @@ class Observed:
 
     def contact(self, state: ca.SX, parameters: ca.SX) -> ContactTerms:
         """The directions of friction and constraints at a state."""
-        observation, size = self.observation, len(self.observation.rows)
+        observation = self.observation
         friction = observation.friction.function(self._faster(state), self._force, parameters)
         directions = observation.directions.function(state, self._force, parameters)
-        metric, free, planes = directions[:3]
+        free, planes = directions[0], ca.horzsplit(directions[1], self._stops)
+
+        def metric(columns: ca.SX) -> ca.SX:
+            function = observation.metric.function
+            moved = [function(state, d, parameters)[0] for d in ca.horzsplit(columns)]
+            return ca.horzcat(ca.SX(columns.shape[0], 0), *moved)
+
         is_slow = friction[1] < _SHARP * self._observing.least_speed
         sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
-        held = planes * ca.repmat(ca.vec(ca.repmat(sticks.T, size, 1)).T, size, 1)
+        held = self._side_by_side(planes, sticks)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
         velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
         return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
+
+    def _side_by_side(self, planes: Sequence[ca.SX], of_contacts: ca.SX) -> ca.SX:
+        """T of all contacts side by side, each times its entry of a column."""
+        scaled = [plane * of_contacts[j] for j, plane in enumerate(planes)]
+        return ca.horzcat(ca.SX(len(self.observation.rows), 0), *scaled)
 
     def change(self, contact: ContactTerms, mu: ca.SX, r: ca.SX, hold: ca.SX) -> ca.SX:
         """The change of the estimate mu at a sample, by the part of r that friction explains."""

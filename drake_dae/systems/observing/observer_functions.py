@@ -6,7 +6,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.beyond.disturbance import beside, shares
+from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.dae.beyond.lags import Lags
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError

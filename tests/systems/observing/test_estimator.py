@@ -201,6 +201,31 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
     assert np.sqrt(np.mean(missed**2)) < 0.5
 
 
+@pytest.mark.slow
+def test_the_first_break_away_of_encoders_alone_does_not_swing():
+    """At most 0.1 mm and 0.3 N, at a friction of 0.45 that the law takes for 0; 0.97 mm without.
+
+    A rest of 1 s, then a line; the force of the sensor has a noise of 0.3 N.
+    """
+    line = "!Line {start: [0.0], end: [0.05], limits: {speed: 0.05, acceleration: 0.3}"
+    chosen = scenario(
+        *NOISY,
+        "plant.friction=0.45",
+        "encoders={resolution: 1.0e-5}",
+        f"references.tool.y={line}, start_time: 1.0}}",
+        "references.tool.z=0.7",
+        "references.wall.force=!PointToPoint {start: [1], end: [20], start_time: 0, end_time: 0.8}",
+        "duration=1.7",
+    )
+    loop, context = build_scenario(chosen)
+    record = roll_scenario(chosen, loop, context).record
+    late = record.time > 0.9
+    error = (record["controlled_output"] - record["desired_output"])[late]
+    assert np.linalg.norm(error[:, :2], axis=1).max() < 1e-4
+    assert np.abs(error[:, -1]).max() < 0.3
+    assert abs(record["friction"][-1, 0] - 0.45) < 0.01
+
+
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(ScenarioError, match="give the loop encoders, or leave it out"):
         run_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 100}"))

@@ -30,10 +30,17 @@ def filters():
     return state_filters(RATES, T, np.full(2, 1e-4), np.zeros(2))
 
 
-def sample(measured, v, forces, controls, step=0.0, lag=0.0, r=(0.0, 0.0), mu=0.0, friction=0.0):
-    """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new."""
-    function = EstimatorFunctions(law(friction), RATES, T, lag, 0.0, step, filters()).now
-    held = np.concatenate([[0.0], Q, v, r, [mu], controls[0], [forces[0]]])
+def sample(
+    measured, v, forces, controls, step=0.0, lag=0.0, r=(0.0, 0.0), mu=0.0, friction=0.0, slid=1e3
+):
+    """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new.
+
+    The contact has slid for many samples, or has not slid yet.
+    """
+    function = EstimatorFunctions(law(friction), RATES, T, lag, 0.0, step, filters(), 1e-4).now
+    reference = np.zeros(law(friction).layout.reference_size)
+    slides = [slid, *np.zeros(6)]
+    held = np.concatenate([[0.0], Q, v, r, [mu], slides, controls[0], [forces[0]], reference])
     system = law(friction).system
     given = [] if lag == 1.0 else [controls[1]]
     found = function(
@@ -119,3 +126,47 @@ def test_friction_that_is_known_is_predicted():
     assert_allclose(state, [*q, *after], atol=2e-5)
     assert_allclose(r, 0.0, atol=1e-3)
     assert found == pytest.approx(mu, abs=1e-6)
+
+
+def test_a_contact_that_has_not_slid_yet_sticks_whatever_friction_that_needs():
+    """No speed along the wall, and across it that of the forces with this friction; to round-off.
+
+    A control of 30 N m would accelerate the tool by 30 m/s^2.
+    """
+    push, control, still = 20.0, np.array([30.0, 0.0]), np.zeros(2)
+    known = numbers("two_link", Q, still)
+    total = control - known.bias + known.constraint_jacobian[0] * push
+    slides = known.output_jacobian[0]
+    inverse = np.linalg.inv(known.mass)
+    friction = -slides * (slides @ inverse @ total) / (slides @ inverse @ slides)
+    after = T * inverse @ (total + friction)
+    q = Q + T * after / 2.0
+    state, r, mu = sample(q, still, (push, push), (control, control), slid=0.0)
+    assert_allclose(state, [*q, *after], atol=1e-12)
+    assert abs(slides @ state[2:]) < 1e-12
+    assert abs(slides @ inverse @ total) > 10.0
+    assert_allclose(r, 0.0, atol=1e-9)
+    assert mu == 0.0
+
+
+def test_a_displacement_beyond_noise_is_a_break_away_and_what_is_less_is_none():
+    """3 and 5 standard deviations of 1e-4 rad; a speed is found, and across the wall none."""
+    push, control, still = 20.0, np.zeros(2), np.zeros(2)
+    known = numbers("two_link", Q, still)
+    slides, inverse = known.output_jacobian[0], np.linalg.inv(known.mass)
+    total = -known.bias + known.constraint_jacobian[0] * push
+    friction = -slides * (slides @ inverse @ total) / (slides @ inverse @ slides)
+    at_rest = Q + T**2 / 2.0 * inverse @ (total + friction)
+    J = known.constraint_jacobian[0]
+    along = np.array([-J[1], J[0]])
+    along /= slides @ along
+    deviation = 1e-4 * np.linalg.norm(slides)
+    usual = filters()[0][0].gain[1, 0]
+    for size, breaks in ((3.0, False), (5.0, True)):
+        measured = at_rest + size * deviation * along
+        state, _, _ = sample(measured, still, (push, push), (control, control), slid=0.0)
+        speed = slides @ state[2:]
+        if breaks:
+            assert speed > 2.0 * usual * size * deviation
+        else:
+            assert speed == pytest.approx(usual * size * deviation, rel=1e-6)

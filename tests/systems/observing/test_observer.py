@@ -6,7 +6,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from arms import error_controlled, numbers, touching
+from arms import consistent_states, error_controlled, numbers, touching
 from numpy.testing import assert_allclose
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
@@ -38,7 +38,8 @@ from drake_dae import (
     simulate,
     with_disturbance,
 )
-from drake_dae.dae.beyond.disturbance import beside, shares
+from drake_dae.dae.beyond.disturbance import Observation
+from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError, WiringError
 
 T, RATE, MASS = 0.01, 8.0, 2.5
@@ -141,11 +142,12 @@ def test_noise_of_velocities_comes_through_as_the_filter_says():
 
 
 @cache
-def frictional(friction: float) -> tuple[RobotModel, DaeSystem]:
-    """The two-link arm on its wall, and what its law takes it for: with friction to be found."""
-    smooth = touching("two_link")
+def frictional(friction: float, arm: str = "two_link") -> tuple[RobotModel, DaeSystem]:
+    """An arm on its wall, and what its law takes it for: with friction to be found."""
+    smooth = touching(arm)
     wall = replace(smooth.constraints[0], friction=friction, stiction_tolerance=1e-3)
-    model = RobotModel(smooth.links, [wall], smooth.outputs, [1.2, -1.6])
+    nominal = smooth.dae.nominal_state[: smooth.links.q.numel()]
+    model = RobotModel(smooth.links, [wall], smooth.outputs, nominal)
     velocities = [signal.name for signal in model.links.velocity_signals]
     return model, with_disturbance(model.dae, velocities, ["wall.friction"])
 
@@ -308,23 +310,31 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
 
 
 def evaluated(function, *arguments):
-    """The value of an expression of numbers, shape (k,)."""
-    return ca.evalf(function(*map(ca.SX, map(ca.DM, arguments)))).full()[:, 0]
+    """The value of an expression of numbers, shape (k,); functions and lists are passed on."""
+    given = [
+        each if callable(each) or isinstance(each, list) else ca.SX(ca.DM(each))
+        for each in arguments
+    ]
+    return ca.evalf(function(*given)).full()[:, 0]
+
+
+def metric_of(matrix):
+    return lambda columns: ca.mtimes(ca.DM(matrix), columns)
 
 
 def test_sharing_is_by_the_accelerations_that_forces_make():
     """By a square root of W: the least squares of d on the columns, of which two are one."""
     random = np.random.default_rng(0)
     root = random.standard_normal((4, 4))
-    metric, d = root.T @ root, random.standard_normal(4)
-    column = random.standard_normal((4, 1))
+    matrix, d = root.T @ root, random.standard_normal(4)
+    metric, column = metric_of(matrix), random.standard_normal((4, 1))
     wanted = np.linalg.lstsq(root @ column, root @ d, rcond=None)[0]
-    nothing, moves = np.zeros((4, 4)), random.standard_normal((4, 1))
+    nothing, moves = [ca.SX(4, 4)], random.standard_normal((4, 1))
     assert_allclose(evaluated(shares, column, nothing, moves, metric, d), wanted, rtol=1e-10)
     other = random.standard_normal((4, 1))
     planes = np.hstack([column, other, 2.0 * column])
     left = evaluated(beside, planes, metric, d)
-    assert_allclose(planes.T @ metric @ left, 0.0, atol=1e-10)
+    assert_allclose(planes.T @ matrix @ left, 0.0, atol=1e-10)
     assert_allclose(np.cross((d - left)[:3], column[:3, 0]) @ other[:3, 0], 0.0, atol=1e-8)
     assert_allclose(evaluated(beside, 0.0 * planes, metric, d), d)
     assert_allclose(evaluated(shares, 0.0 * column, nothing, moves, metric, d), 0.0)
@@ -338,7 +348,7 @@ def test_what_pulls_across_the_sliding_is_no_friction(count):
     """
     random = np.random.default_rng(1)
     root, jacobian = random.standard_normal((4, 4)), random.standard_normal((count, 4))
-    metric, moves = root.T @ root, random.standard_normal(4)
+    metric, moves = metric_of(root.T @ root), random.standard_normal(4)
     slides = jacobian @ moves
     along = slides / np.linalg.norm(slides)
     friction = -7.0 * jacobian.T @ along
@@ -347,11 +357,34 @@ def test_what_pulls_across_the_sliding_is_no_friction(count):
         columns.append(jacobian.T @ [-along[1], along[0]])
     d = random.standard_normal(4)
     wanted = np.linalg.lstsq(root @ np.transpose(columns), root @ d, rcond=None)[0]
-    planes = -40.0 * jacobian.T @ jacobian
-    given = friction[:, None], planes, moves[:, None], metric
-    assert_allclose(evaluated(shares, *given, d), wanted[0], rtol=1e-8)
-    assert_allclose(evaluated(shares, *given, 0.3 * friction), 0.3, rtol=1e-8)
-    assert_allclose(evaluated(shares, *given, columns[-1]), 2.0 - count, atol=1e-8)
+    for planes in (-40.0 * jacobian.T @ jacobian, jacobian.T, jacobian.T @ np.eye(count, 3)):
+        given = friction[:, None], [ca.SX(ca.DM(planes))], moves[:, None], metric
+        assert_allclose(evaluated(shares, *given, d), wanted[0], rtol=1e-8)
+        assert_allclose(evaluated(shares, *given, 0.3 * friction), 0.3, rtol=1e-8)
+        assert_allclose(evaluated(shares, *given, columns[-1]), 2.0 - count, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_gradients_of_sliding_span_what_derivatives_of_friction_at_rest_span():
+    """What is left of a disturbance beside them, at consistent states, to round-off."""
+    dae = frictional(0.3, "seven_joint")[1]
+    plain = replace(dae, contacts=tuple(replace(each, sliding=None) for each in dae.contacts))
+    found, other = (
+        Observation.of(law.structure, law.layout)
+        for law in (TrackingLaw(system, poles(-4.0)) for system in (dae, plain))
+    )
+    random, size = np.random.default_rng(3), len(found.rows)
+    assert (found.widths, other.widths) == ((2,), (size,))
+    for state in consistent_states("seven_joint", 3):
+        given = state, np.array([20.0]), dae.parameter_values
+        unit = [found.metric(state, d, dae.parameter_values)[0].copy() for d in np.eye(size)]
+        d = random.standard_normal(size)
+        left = [
+            evaluated(beside, each.directions(*given)[1].reshape(size, -1), metric_of(unit), d)
+            for each in (found, other)
+        ]
+        assert np.abs(left[0] - d).max() > 0.1
+        assert_allclose(left[0], left[1], rtol=0.0, atol=1e-9)
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():
