@@ -40,8 +40,9 @@ class ClosedLoop:
             `tracking_error`, and `link_state` of a robot.
         plant, controller: The systems in it.
         generator: The generator of references; None for a controller that plans them itself.
-        loggers: Port name -> (sink, names and units) of the logged signals, one sample per step.
-            `record` computes the other signals from these.
+        log: The log, one sample per step: all logged signals, stacked.
+        logged: Names and units of each logged signal, in their order in the log. `record` computes
+            the other signals from these.
         signals: Names and units of each signal that is logged or computed.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
@@ -58,7 +59,8 @@ class ClosedLoop:
     plant: Plant
     controller: Controller
     generator: ReferenceGenerator | None
-    loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
+    log: VectorLogSink
+    logged: Mapping[str, Sequence[Signal]]
     signals: Mapping[str, Sequence[Signal]]
     scene_graph: SceneGraph | None = None
     sensor: ForceSensor | None = None
@@ -146,7 +148,7 @@ class ClosedLoop:
             WiringError: An input port of plant or controller has a fixed value in this context,
                 since an unknown time.
         """
-        logged = Record.from_logs(self.loggers, context, after)
+        logged = Record.from_log(self.log, self.logged, context, after)
         if self.plant.functions:
             logged = completed(logged, self, context)
         record = self.with_errors(logged, context).while_finite()

@@ -5,14 +5,8 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
-from pydrake.systems.primitives import (
-    Adder,
-    AffineSystem,
-    LogVectorOutput,
-    MatrixGain,
-    VectorLogSink,
-)
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
@@ -20,7 +14,6 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.governing.feasible_control import FeasibleControl
@@ -259,16 +252,3 @@ def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) ->
     hold.set_name("open_contacts")
     builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
     return [hold.get_output_port()]
-
-
-def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> VectorLogSink:
-    """Adds a log with one sample per step.
-
-    For a discrete plant the log is periodic, since after the last step of a run the state of the
-    plant belongs to a time that the run has not reached.
-    """
-    if plant.time_step:
-        log = builder.AddSystem(SampleLog(port.size(), plant.time_step))
-        builder.Connect(port, log.get_input_port())
-        return log
-    return LogVectorOutput(port, builder, {TriggerType.kPerStep})

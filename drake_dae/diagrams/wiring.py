@@ -1,20 +1,18 @@
 """The connections of a closed loop: plant, references and controller."""
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import VectorLogSink
+from pydrake.systems.framework import DiagramBuilder, System
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
-from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import LinkWithNoise, add_drives, hold_before
+from drake_dae.diagrams.drives import add_drives, hold_before
 from drake_dae.diagrams.force_feedback import add_force_feedback
-from drake_dae.diagrams.observing import Observer, add_observer
+from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.parts import (
     add_block,
     add_feasible,
@@ -23,26 +21,26 @@ from drake_dae.diagrams.parts import (
     add_watch,
     check_parts,
     contact_reference,
-    log_steps,
     open_holds,
+)
+from drake_dae.diagrams.recorded import (
+    further_signals,
+    log_signals,
+    signals_of_parts,
+    signals_of_plant,
 )
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import add_exogenous, make_generator
-from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
+from drake_dae.diagrams.state_feedback import add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.drake_references import SystemReference
-from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.force_sensor import ForceSensor
-
-Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
-"""Name -> output port, names and units of a recorded signal."""
 
 
 @checked(WiringError)
@@ -55,7 +53,7 @@ def make_closed_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
 ) -> ClosedLoop:
-    """Builds the closed loop of a plant, a tracking law and references, with loggers and a view.
+    """Builds the closed loop of a plant, a tracking law and references, with a log and a view.
 
     While a contact of a `UnilateralRobotPlant` is open, the law continues, so that phi'' = -A(x)
     lambda_d with the desired force lambda_d. The integral of this force is not updated. With a
@@ -210,17 +208,17 @@ def wire_loop(
 
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {
-        **_of_plant(plant, moving, reference, law, control),
-        **_of_parts(plant, controller, measured, link, limits, observer, parts.sensor),
+        **signals_of_plant(plant, moving, reference, law, control),
+        **signals_of_parts(plant, controller, measured, link, limits, observer, parts.sensor),
     }
     if feasible is not None:
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
         named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
     if reference is not None:
-        named |= _further(reference)
+        named |= further_signals(reference)
     sources = {"reference": reference, "exogenous": moving}
     by_time = {name for name, block in sources.items() if block is None or block.follows_time}
-    loggers = _logged(builder, plant, controller, control, named, by_time)
+    log, logged = log_signals(builder, plant, controller, control, named, by_time)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -234,7 +232,8 @@ def wire_loop(
         plant,
         controller,
         reference,
-        loggers,
+        log,
+        logged,
         {name: tuple(signals) for name, (_, signals) in named.items()},
         scene_graph,
         parts.sensor,
@@ -258,90 +257,3 @@ def can_be_fed_back(
     takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
     is_direct = sampling is None and control_limits is None
     return is_direct and law.system.num_controls > 0 and not takes_more
-
-
-def _logged(
-    builder: DiagramBuilder,
-    plant: Plant,
-    controller: Controller,
-    control: OutputPort,
-    named: Named,
-    by_time: Set[str],
-) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
-    """Exports all signals, and logs those that do not follow from what is logged.
-
-    Args:
-        builder: The builder of the diagram.
-        plant, controller: The blocks.
-        control: The source of the plant's control.
-        named: The signals.
-        by_time: The signals that follow from the time.
-    """
-    available: set[str] = set()
-    if plant.functions:
-        available = {*plant.functions, *by_time}
-        if "exogenous" in by_time and controller.follows and control.get_system() is controller:
-            available.add("control")
-    loggers = {}
-    for name, (port, signals) in named.items():
-        builder.ExportOutput(port, name)
-        if name not in available:
-            loggers[name] = (log_steps(builder, port, plant), signals)
-    for name in controller.shown:
-        builder.ExportOutput(controller.GetOutputPort(name), name)
-    if plant.model is not None:
-        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
-    return loggers
-
-
-def _of_plant(
-    plant: Plant,
-    moving: ReferenceGenerator | None,
-    reference: ReferenceGenerator | None,
-    law: TrackingLaw,
-    control: OutputPort,
-) -> Named:
-    """The signals of every plant and its inputs that a record contains."""
-    dae, named = plant.dae, Named()
-    if moving is not None:
-        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
-        named["exogenous"] = (moving.get_output_port(), signals)
-    for name, signals in plant.port_signals.items():
-        named[name] = (plant.GetOutputPort(name), signals)
-    if reference is not None:
-        named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
-    return {**named, "control": (control, dae.control_signals)}
-
-
-def _of_parts(
-    plant: Plant,
-    controller: Controller,
-    measured: MeasuredState | None,
-    link: LinkWithNoise | None,
-    limits: ControlLimits | None,
-    observer: Observer | None,
-    sensor: ForceSensor | None,
-) -> Named:
-    """The further signals of controller, parts and plant that a record contains."""
-    dae, named = plant.dae, Named()
-    estimates = observer is not None and observer.HasOutputPort("estimated_state")
-    if measured is not None:
-        name = "measured_state" if estimates else "estimated_state"
-        named[name] = (measured.output, dae.state_signals)
-    if observer is not None and estimates:
-        named["estimated_state"] = (observer.GetOutputPort("estimated_state"), dae.state_signals)
-    if link is not None:
-        named["lost_controls"] = (link.block.GetOutputPort("lost_controls"), link.block.signals)
-    if limits is not None:
-        named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
-    for block in (controller, observer):
-        if block is not None:
-            named |= _further(block)
-    if sensor is not None:
-        port = sensor.GetOutputPort("measured_force")
-        named["measured_force"] = (port, dae.constraint_input_signals)
-    return named | _further(plant)
-
-
-def _further(block: Plant | Controller | Observer | ReferenceGenerator) -> Named:
-    return {name: (block.GetOutputPort(name), s) for name, s in block.further_signals.items()}

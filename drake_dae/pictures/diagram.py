@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 
 from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
-from pydrake.systems.primitives import VectorLogSink
+from pydrake.systems.primitives import Multiplexer, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
@@ -71,8 +71,16 @@ def _run_dot(text: str, kind: str) -> bytes:
 
 
 def diagram_text(diagram: Diagram) -> str:
-    """Returns the block diagram in Graphviz's language."""
-    blocks = [block for block in diagram.GetSystems() if not isinstance(block, VectorLogSink)]
+    """Returns the block diagram in Graphviz's language, without logs and what stacks for them."""
+    wires = [(reader, writer) for (reader, _), (writer, _) in diagram.connection_map().items()]
+    logs = {block for block in diagram.GetSystems() if isinstance(block, VectorLogSink)}
+    logs |= {
+        stacks
+        for stacks in diagram.GetSystems()
+        if isinstance(stacks, Multiplexer)
+        and {reader for reader, writer in wires if writer is stacks} <= logs
+    }
+    blocks = [block for block in diagram.GetSystems() if block not in logs]
     numbers = {block.get_name(): number for number, block in enumerate(blocks)}
     lines_between: dict[tuple[str, str], list[str]] = {}
     for (target, input_port), (source, output_port) in diagram.connection_map().items():

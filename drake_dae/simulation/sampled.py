@@ -1,6 +1,6 @@
 """Runs of a diagram whose plant Drake steps; one call computes all other blocks at a sample."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Self
 
@@ -16,6 +16,7 @@ from drake_dae.compiler.groups import discrete_states
 from drake_dae.compiler.stepped import NO_EVENTS, Sample, SteppedDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.errors import DrakeDaeError
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.traced import Traced
 from drake_dae.systems.plants.contract import Plant
 
@@ -41,6 +42,8 @@ class SampleLog(VectorLogSink):
         period: The period, in s.
     """
 
+    __slots__ = SHARED_DICTIONARY
+
     def __init__(self, size: int, period: float) -> None:
         super().__init__(size, {TriggerType.kPeriodic}, period)
         self.period = period
@@ -49,28 +52,21 @@ class SampleLog(VectorLogSink):
 class SampledRun:
     """A run of a diagram whose only plant is stepped by Drake, with all other blocks as one call.
 
-    The context of the diagram, its logs included, is that of Drake's Simulator, except for the last
+    The context of the diagram, its log included, is that of Drake's Simulator, except for the last
     bits of numbers. It changes once in `EVERY` samples.
 
     Args:
-        compiled: The diagram, whose outputs are the logged signals.
-        logs: The logs of the diagram.
+        compiled: The diagram, whose output is what is logged.
+        log: The log of the diagram.
         context: The context of the diagram after the initialization events; changed in place.
 
     Attributes:
         steps: The number of steps.
     """
 
-    def __init__(
-        self, compiled: CompiledDiagram, logs: Sequence[SampleLog], context: Context
-    ) -> None:
+    def __init__(self, compiled: CompiledDiagram, log: SampleLog, context: Context) -> None:
         self._compiled, self._context, self.steps = compiled, context, 0
-        stops = np.cumsum([0, *(log.get_input_port().size() for log in logs)]).tolist()
-        parts = map(slice, stops, stops[1:])
-        self._logs = [
-            (log.FindMutableLog(context).AddData, part)
-            for log, part in zip(logs, parts, strict=True)
-        ]
+        self._add = log.FindMutableLog(context).AddData
         self._time = start = context.get_time()
         (rate, block), self._parameters = compiled.stepped, compiled.values(context)
         assert block.stepped is not None
@@ -86,11 +82,11 @@ class SampledRun:
         self._diagram = SteppedDiagram(compiled, own, held, self._parameters, choice)
         self._noise = np.zeros(compiled.sizes["noise"])
         self._sources = [_Noise(source, part, compiled, context) for source, part in compiled.noise]
-        # The number of the next sample of each rate, and of the logs, which have the last bit.
+        # The number of the next sample of each rate, and of the log, which has the last bit.
         self._rates = [(rate.period, rate.offset) for rate in compiled.rates]
-        self._rates += [(log.period, 0.0) for log in logs[:1]]
+        self._rates.append((log.period, 0.0))
         self._numbers = [_first_sample(*rate, start) for rate in self._rates]
-        # The logs have the start already.
+        # The log has the start already.
         self._due = self._due_at(start) % (1 << len(compiled.rates))
 
     @classmethod
@@ -106,15 +102,16 @@ class SampledRun:
             return None
         wires = Wires.of(diagram)
         logs = [system for system in wires.systems if isinstance(system, SampleLog)]
-        if len({log.period for log in logs}) != 1 or duration < WORTH * logs[0].period:
+        if len(logs) != 1 or duration < WORTH * logs[0].period:
             return None
+        (log,) = logs
         with suppress(DrakeDaeError, RuntimeError):
-            sources = {log: wires.sources[log, 0] for log in logs}
-            ports = {str(i): s.get_output_port(k) for i, (s, k) in enumerate(sources.values())}
-            compiled = compile_diagram(diagram, ports, context=context)
-            others = {*wires.systems} - {*logs, *compiled.blocks}
+            source, index = wires.sources[log, 0]
+            logged = {"logged": source.get_output_port(index)}
+            compiled = compile_diagram(diagram, logged, context=context)
+            others = {*wires.systems} - {log, *compiled.blocks}
             if compiled.has_stepped and all(_is_still(each, context) for each in others):
-                run = cls(compiled, logs, context)
+                run = cls(compiled, log, context)
                 return run if _is_by_wires(wires, compiled, context) else None
         return None
 
@@ -192,14 +189,13 @@ class SampledRun:
         return Sample(time, due, self._noise)
 
     def _write(self, times: FloatArray, held: FloatArray) -> bool:
-        """Adds samples to the logs; returns whether all values are valid."""
+        """Adds samples to the log; returns whether all values are valid."""
         given = times[None], np.zeros((0, times.size)), held.T, self._parameters
         values, valid = (each.full() for each in self._compiled.row(*given))
         if not np.isfinite(valid).all():
             return False
         for time, row in zip(times.tolist(), np.ascontiguousarray(values.T), strict=True):
-            for add, part in self._logs:
-                add(time, row[part])
+            self._add(time, row)
         return True
 
     def _set_context(self) -> None:

@@ -186,7 +186,7 @@ def test_a_record_has_modes_gaps_and_forces_that_are_complementary(run):
     assert_allclose(
         record["controlled_output"][mode[:, 0] == 1.0, 1], force[mode == 1.0], atol=1e-9
     )
-    assert not [name for name in loop.loggers if name not in ("state", "mode")]
+    assert not [name for name in loop.logged if name not in ("state", "mode")]
 
 
 def test_events_are_kept_on_disk_and_as_rows(run, tmp_path):

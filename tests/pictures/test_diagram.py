@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import Adder, Gain, Integrator, VectorLogSink
+from pydrake.systems.primitives import Adder, Gain, Integrator, Multiplexer, VectorLogSink
 from runs import scenario
 
 from drake_dae import build_scenario, save_diagram
@@ -21,12 +21,13 @@ needs_dot = pytest.mark.skipif(shutil.which("dot") is None, reason="needs Graphv
 def test_every_block_and_every_wire_but_those_to_logs_is_drawn(name):
     loop, _ = build_scenario(scenario(name))
     text = diagram_text(loop.diagram)
-    blocks = [one for one in loop.diagram.GetSystems() if not isinstance(one, VectorLogSink)]
+    logs = VectorLogSink, Multiplexer  # All that is logged goes through one Multiplexer.
+    blocks = [one for one in loop.diagram.GetSystems() if not isinstance(one, logs)]
     assert len(re.findall(r"^b\d+ \[", text, re.MULTILINE)) == len(blocks)
     names = {one.get_name(): f"b{place}" for place, one in enumerate(blocks)}
     wanted = set()
     for (target, _), (source, leaving) in loop.diagram.connection_map().items():
-        if not isinstance(target, VectorLogSink):
+        if not isinstance(target, logs):
             port = source.get_output_port(leaving).get_name()
             wanted.add((names[source.get_name()], names[target.get_name()], port))
     found = set()

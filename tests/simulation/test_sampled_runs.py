@@ -66,10 +66,13 @@ def built(name):
 
 
 def logs(loop, context):
+    """Name of a logged signal -> times and values."""
+    log = loop.log.FindLog(context)
+    stops = np.cumsum([len(signals) for signals in loop.logged.values()])
+    columns = np.split(log.data().copy(), stops[:-1])
     return {
-        name: (log.sample_times().copy(), log.data().copy())
-        for name, (sink, _) in loop.loggers.items()
-        for log in [sink.FindLog(context)]
+        name: (log.sample_times().copy(), values)
+        for name, values in zip(loop.logged, columns, strict=True)
     }
 
 

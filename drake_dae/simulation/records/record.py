@@ -140,36 +140,45 @@ class Record:
         return event_rows(self.events)
 
     @classmethod
-    def from_logs(
+    def from_log(
         cls,
-        loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]],
+        log: VectorLogSink,
+        signals: Mapping[str, Sequence[Signal]],
         context: Context,
         after: float | None = None,
     ) -> Self:
-        """Collects per-step logs up to now.
+        """Collects what a log has up to now.
 
         Args:
-            loggers: Name -> (sink, names and units of its input).
+            log: The log of the signals, stacked.
+            signals: Name -> names and units of a signal, in the order of the log.
             context: The context of the diagram.
             after: Only later samples than this time are collected, in s; None for all.
+
+        Raises:
+            ModelError: The log has another number of entries than the signals.
         """
-        logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
-        times = [log.sample_times() for log in logs.values()]
-        # A run that failed within a step may have logged only some of the signals.
-        count = min((len(t) for t in times), default=0)
-        time = times[0][:count] if times else np.zeros(0)
+        samples, stops = log.FindLog(context), np.cumsum([len(each) for each in signals.values()])
+        size = int(stops[-1]) if stops.size else 0
+        if size != samples.get_input_size():
+            raise ModelError(
+                f"the signals of a log have {size} names together, but the log has "
+                f"{samples.get_input_size()} entries"
+            )
+        time = samples.sample_times()
         first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
+        rows = samples.data()[:, first:].T
         # The last step of a failed run may have values that are not numbers.
-        values = {name: log.data()[:, first:count].T for name, log in logs.items()}
-        finite = _finite_rows(max(count - first, 0), list(values.values()))
+        finite = _finite_rows(len(rows), [rows])
         time = time[first : first + finite]
         # The last sample of a time is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
+        columns = np.split(rows[:finite][last], stops[:-1], axis=1)
         return cls(
-            time[last].copy(),
+            time[last],
             {
-                name: Recorded(values[name][:finite][last].copy(), tuple(signals))
-                for name, (_, signals) in loggers.items()
+                name: recorded_values(np.ascontiguousarray(values), tuple(each))
+                for (name, each), values in zip(signals.items(), columns, strict=True)
             },
         )
 

@@ -31,6 +31,7 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
+from drake_dae.simulation import sampled
 from drake_dae.systems.control.references import ReferenceGenerator
 
 
@@ -82,6 +83,19 @@ def test_a_loop_that_ran_is_freed_with_its_context_and_logs(feedback: bool):
     del made, context
     gc.collect()
     assert [last() for last in lasts] == [None] * 4
+
+
+@pytest.mark.slow
+def test_a_loop_on_drakes_contact_is_freed_after_it_ran_with_one_call_a_sample(monkeypatch):
+    monkeypatch.setattr(sampled, "WORTH", 1)  # Short runs, too.
+    chosen = scenario("wall_point_contact", "compiled=false")
+    made, context = build_scenario(chosen)
+    simulate(made.diagram, context, 0.01, chosen.integrator)
+    made.record(context)
+    lasts = [ref(each) for each in (made, made.diagram, made.log, made.plant, made.plant.model)]
+    del made, context
+    gc.collect()
+    assert [last() for last in lasts] == [None] * 5
 
 
 def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():

@@ -205,7 +205,7 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     assert (compared is None) is not ("reference" in loop.signals or controller.takes_over)
     for found, wanted in zip(compared or (), (outputs, desired), strict=False):
         np.testing.assert_allclose(found, wanted[-1], atol=1e-6)
-    assert ("control" in loop.loggers) is not controller.follows
+    assert ("control" in loop.logged) is not controller.follows
     assert len(controller.changes(own)) == (1 if controller.takes_over else 0)
 
 
@@ -215,7 +215,7 @@ def test_a_controller_that_is_sampled_is_logged(controller):
         controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=SAMPLE)
     loop, context = wired(controller, sampling=Sampling(SAMPLE))
     simulate(loop.diagram, context, 0.02, fixed_step())
-    assert "control" in loop.loggers
+    assert "control" in loop.logged
     assert np.isfinite(loop.record(context)["control"]).all()
 
 

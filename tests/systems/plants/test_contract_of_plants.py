@@ -35,7 +35,7 @@ from drake_dae import (
     start_meshcat,
     sweep,
 )
-from drake_dae.diagrams.parts import log_steps
+from drake_dae.diagrams.recorded import log_steps
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
@@ -124,13 +124,13 @@ def run_of(plant, duration=0.02):
         "controlled_output": plant.dae.output_signals,
         **plant.further_signals,
     }
-    loggers = {n: (log_steps(builder, plant.GetOutputPort(n), plant), s) for n, s in ports.items()}
+    log = log_steps(builder, list(map(plant.GetOutputPort, ports)), plant)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, plant.dae.nominal_state)
     simulate(diagram, context, duration, fixed_step())
-    return own, Record.from_logs(loggers, context)
+    return own, Record.from_log(log, ports, context)
 
 
 def test_rule_1_ports(plant):

@@ -24,7 +24,9 @@ class Insert(Phase):
     is a spring of m p s and a damper of m (p + s) at the point of the tool, where m is the mass
     that it feels there. So the phase needs soft gains along and about the surface, and no observer
     of disturbances, which would cancel what the hole exerts. A slow and a fast pole along the
-    surface let the hole move the tool without a force that remains, and damp it.
+    surface let the hole move the tool without a force that remains, and damp it. On a robot whose
+    inertia couples the outputs, a push along the hole also tilts the tool, until it jams: there
+    `impedance_gains` give each output a stiffness by itself.
 
     The phase fails if the distance falls behind its reference by more than `lag`, as where the tool
     jams, or sits on the face beside the hole. The push along the hole is then at most m (p^2 lag +

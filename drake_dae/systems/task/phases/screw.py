@@ -48,7 +48,8 @@ class Screw(Phase):
         within: The largest duration of the phase, in s.
         if_late: The successor if it fails in one of these ways or lasts longer; on_failure if left
             out.
-        if_lost: The successor if the contact is lost; on_failure if left out.
+        if_lost: The successor if the contact is lost for the `patience` of the task before the
+            advance lags; on_failure if left out.
     """
 
     turn: str

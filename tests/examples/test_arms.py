@@ -1,0 +1,87 @@
+"""The tasks of `examples/arms` on a UR5, a Panda and two UR5s, by rollouts."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from programs import loaded
+
+from drake_dae import load_scenario
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.rolled import for_rollout, roll_scenario
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.start import start_scenario
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.thorough,
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
+]
+
+@pytest.fixture(scope="module")
+def example():
+    with loaded("arms") as module:
+        if not module.DATA.exists():
+            pytest.skip("pip install example-robot-data")
+        yield module
+
+
+def rolled(example, run, *settings):
+    """The loop, the rollout and the changes of phase of a run."""
+    file = find_scenario(run.split("-")[0])
+    chosen, _ = for_rollout(load_scenario(file, [*example.settings(run), *settings]))
+    completed, loop = build_completed(chosen)
+    found = roll_scenario(completed.scenario, loop, start_scenario(completed.scenario, loop))
+    return loop, found, loop.changes(found.context)
+
+
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_inserts_the_peg_with_no_more_force_than_predicted(arm, example):
+    run = f"peg_in_hole-{arm}"
+    with loaded("insertions") as insertions:
+        peaks = insertions.predicted("peg_in_hole", example.settings(run))
+    _, found, changes = rolled(example, run)
+    assert found.failure is None
+    assert (changes[-1].phase, changes[-1].reason) == ("done", "after a depth of 0.015 m")
+    forces = np.linalg.norm(found.record["contact_force"], axis=1)
+    assert 1.0 < forces.max() < max(peaks.values())
+
+
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
+    """Beyond the edge by the path in `patience`, 0.05 s at 30 mm/s, and less than 1.5 mm more."""
+    _, found, changes = rolled(example, f"edge_search-{arm}")
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    record, edges = found.record, {0: 0.454 + 0.05, 1: -0.004 + 0.04}
+    searches = [i for i, change in enumerate(changes) if change.phase in ("side", "top")]
+    for axis, index in enumerate(searches):
+        row = np.searchsorted(record.time, changes[index + 1].time)
+        place = record["controlled_output"][row, axis]
+        assert edges[axis] < place < edges[axis] + 3e-3
+
+
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, example):
+    """The center of pressure is 6 mm from that of the face, and less than 0.5 mm off its path."""
+    _, found, changes = rolled(example, f"flat_press-{arm}")
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    record = found.record
+    names = [signal.name for signal in record.signals["tracking_error"].signals]
+    moves = changes[4].time + 1.5, changes[5].time
+    rows = (record.time > moves[0]) & (record.time < moves[1])
+    force, *moments = (names.index(f"face.{name}") for name in ("force", "mx", "my"))
+    errors = record["tracking_error"][rows]
+    assert np.abs(errors[:, force]).max() < 0.3
+    assert np.abs(errors[:, moments]).max() / 30.0 < 5e-4
+
+
+def test_a_box_of_4_kg_goes_from_one_ur5_to_the_other(example):
+    """Then the right hand carries it alone, and the left one is 10 cm away."""
+    loop, found, changes = rolled(example, "hand_over-two_ur5")
+    assert found.failure is None
+    assert [c.phase for c in changes] == ["bring", "grasp", "squeeze", "pass", "retreat", "done"]
+    record, names = found.record, [s.name for s in loop.plant.dae.force_signals]
+    forces = dict(zip(names, record["constraint_force"][-1], strict=True))
+    assert_allclose(forces["right.fz"], -4.0 * 9.81, rtol=1e-6)
+    assert_allclose([forces[f"left.{name}"] for name in ("fx", "fy", "fz")], 0.0, atol=1e-9)
