@@ -209,7 +209,8 @@ class EstimatorFunctions(Observed):
         forces = self._developed(ca.vertcat(q, moved), parameters)
         made = self._period * mass.solve(ca.mtimes(through, forces))
         stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, _LITTLE)
-        return ca.mtimes(made, ca.fmin(self.estimate.friction, stopping))
+        # The noise of a force sensor may be less than zero.
+        return ca.mtimes(made, ca.fmin(self.estimate.friction, ca.fmax(stopping, 0.0)))
 
     def _contacts(
         self,

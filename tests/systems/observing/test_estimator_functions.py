@@ -191,3 +191,14 @@ def test_a_displacement_beyond_noise_is_a_break_away_and_what_is_less_is_none():
             assert speed > 2.0 * usual * size * deviation
         else:
             assert speed == pytest.approx(usual * size * deviation, rel=1e-6)
+
+
+def test_a_force_below_zero_by_noise_is_hardly_a_friction():
+    """-0.2 N with a friction of 0.4, as in free motion; what stops the tool was taken for it once.
+
+    It makes 1e-4 rad/s at most.
+    """
+    control, noise = np.zeros(2), -0.2
+    q, v = predicted(V, noise, control, 0.0)
+    state, _, _ = sample(q, V, (noise, noise), (control, control), mu=0.4)
+    assert_allclose(state, [*q, *v], atol=1e-4)
