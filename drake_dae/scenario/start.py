@@ -71,8 +71,9 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
-    if loop.link is not None and scenario.sampling is not None:
-        loop.link.set_seed(context, scenario.sampling.seed)
+    for link in (loop.link, loop.packets):
+        if link is not None and scenario.sampling is not None:
+            link.set_seed(context, scenario.sampling.seed)
     return context
 
 

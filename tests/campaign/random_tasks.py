@@ -1,4 +1,4 @@
-"""Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads, lost controls.
+"""Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads, lost packets.
 
     python tests/campaign/random_tasks.py --count 1000 --seed 0 --out FILE
 
@@ -127,6 +127,10 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     first = draw.uniform(0.0, 3.0)
     ramp = f"start: [0], end: [1], start_time: {first}, end_time: {first + 0.1}"
     waits = any(phase.startswith("!Wait") for phase in phases)
+    if draw.random() < 0.3:
+        late, loss, burst = draw.uniform(0.0, 0.2), draw.uniform(0.0, 0.02), draw.randrange(1, 5)
+        packets = f"late: {late}, loss: {loss}, burst: {burst}, most_lost: 20"
+        link += f", measurements: {{{packets}}}"
     text = TEXT.format(
         plant=plant,
         sensor=sensor,

@@ -31,7 +31,17 @@ def filters():
 
 
 def sample(
-    measured, v, forces, controls, step=0.0, lag=0.0, r=(0.0, 0.0), mu=0.0, friction=0.0, slid=1e3
+    measured,
+    v,
+    forces,
+    controls,
+    step=0.0,
+    lag=0.0,
+    r=(0.0, 0.0),
+    mu=0.0,
+    friction=0.0,
+    slid=1e3,
+    missed=0.0,
 ):
     """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new.
 
@@ -44,7 +54,7 @@ def sample(
     system = law(friction).system
     given = [] if lag == 1.0 else [controls[1]]
     found = function(
-        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [T],
+        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [missed], [T],
         system.parameter_values,
     )[0]  # fmt: skip
     return found[1:5], found[5:7], found[7]
@@ -73,6 +83,17 @@ def test_prediction_is_the_motion_between_samples(step, lag):
     state, r, mu = sample(q, V, forces, controls, step, lag)
     assert_allclose(state, [*q, *v], atol=1e-12)
     assert_allclose(r, 0.0, atol=1e-9)
+    assert mu == 0.0
+
+
+def test_without_a_new_measurement_the_prediction_stays():
+    """Whatever the old measurement is, the estimate is that of the model; to round-off."""
+    q, v = predicted(V, 30.0, np.zeros(2), 0.0)
+    state, r, mu = sample(
+        q + 0.1, V, (30.0, 30.0), (np.zeros(2), np.zeros(2)), r=(0.0, 0.0), missed=3.0
+    )
+    assert_allclose(state, [*q, *v], atol=1e-12)
+    assert_allclose(r, 0.0, atol=1e-12)
     assert mu == 0.0
 
 
@@ -170,3 +191,14 @@ def test_a_displacement_beyond_noise_is_a_break_away_and_what_is_less_is_none():
             assert speed > 2.0 * usual * size * deviation
         else:
             assert speed == pytest.approx(usual * size * deviation, rel=1e-6)
+
+
+def test_a_force_below_zero_by_noise_is_hardly_a_friction():
+    """-0.2 N with a friction of 0.4, as in free motion; what stops the tool was taken for it once.
+
+    It makes 1e-4 rad/s at most.
+    """
+    control, noise = np.zeros(2), -0.2
+    q, v = predicted(V, noise, control, 0.0)
+    state, _, _ = sample(q, V, (noise, noise), (control, control), mu=0.4)
+    assert_allclose(state, [*q, *v], atol=1e-4)
