@@ -63,7 +63,7 @@ def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
 
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
 def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, example):
-    """The center of pressure is 6 mm from that of the face, and less than 0.5 mm off its path."""
+    """The center of pressure is 6 mm off the middle: less than 0.5 mm off its path, 0.3 at its end."""
     _, found, changes = rolled(example, f"flat_press-{arm}")
     assert found.failure is None
     assert changes[-1].phase == "done"
@@ -73,8 +73,10 @@ def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, exampl
     rows = (record.time > moves[0]) & (record.time < moves[1])
     force, *moments = (names.index(f"face.{name}") for name in ("force", "mx", "my"))
     errors = record["tracking_error"][rows]
-    assert np.abs(errors[:, force]).max() < 0.3
-    assert np.abs(errors[:, moments]).max() / 30.0 < 5e-4
+    assert np.abs(errors[:, force]).max() < 0.05
+    off = np.linalg.norm(errors[:, moments], axis=1) / 30.0
+    assert off.max() < 5e-4
+    assert off[-1] < 3e-4
 
 
 def test_a_box_of_4_kg_goes_from_one_ur5_to_the_other(example):
