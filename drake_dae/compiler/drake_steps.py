@@ -26,8 +26,8 @@ class DrakeSteps:
         self._input = port.FixValue(context, np.zeros(port.size()))
         self._part, self._local = _with_state(system, context)
 
-    def after(self, time: float, given: FloatArray) -> FloatArray:
-        """Makes the step at a time in s with an input, and returns the outputs after it, stacked.
+    def step(self, time: float, given: FloatArray, outputs: FloatArray) -> None:
+        """Makes the step at a time in s with an input, and writes the outputs after it, stacked.
 
         Raises:
             RuntimeError: Drake finds no step.
@@ -35,7 +35,7 @@ class DrakeSteps:
         self._input.GetMutableData().get_mutable_value().SetFromVector(given)
         self._context.SetTime(time)
         self._part.ExecuteForcedEvents(self._local, False)
-        return self._read(self._context)
+        self._read(self._context, outputs)
 
 
 def _with_state(system: System, context: Context) -> tuple[System, Context]:

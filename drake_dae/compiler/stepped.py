@@ -17,6 +17,10 @@ NO_EVENTS = InitializeParams(suppress_initialization_events=True)
 """The initialization of a Simulator that goes on from a context."""
 
 
+Places = slice | np.ndarray
+"""The places of some entries of a column."""
+
+
 class Sample(NamedTuple):
     """A time at which blocks are updated.
 
@@ -59,12 +63,12 @@ class SteppedDiagram:
     ) -> None:
         self._rates, self._sizes, self._choice = compiled.rates, compiled.sizes, choice
         self._parameters = parameters
-        self._functions: dict[tuple[int, int], tuple[list[int], list[int], TracedFunction]] = {}
+        self._functions: dict[tuple[int, int], tuple[Places, Places, TracedFunction]] = {}
         rate, block = compiled.stepped
         assert block.stepped is not None
         self._bit, self._steps = 1 << compiled.rates.index(rate), DrakeSteps(block.stepped, start)
-        self._places = slice(rate.places[0], rate.places[-1] + 1)
         self._held, self.before, self._input = held.copy(), held.copy(), np.zeros(0)
+        self._stepped = self._held[rate.places[0] : rate.places[-1] + 1]
 
     def begin(self, sample: Sample) -> bool:
         """Makes the unrestricted updates of a sample; returns whether all values are valid."""
@@ -79,7 +83,7 @@ class SteppedDiagram:
             RuntimeError: Drake's step fails.
         """
         if sample.due & self._bit:
-            self._held[self._places] = self._steps.after(sample.time, self._input)
+            self._steps.step(sample.time, self._input, self._stepped)
         return self._call(sample, following)
 
     def _call(self, sample: Sample, following: Sample) -> bool:
@@ -102,7 +106,7 @@ class SteppedDiagram:
             self._input = given
         return True
 
-    def _traced(self, due: int, following: int) -> tuple[list[int], list[int], TracedFunction]:
+    def _traced(self, due: int, following: int) -> tuple[Places, Places, TracedFunction]:
         """Returns the places of discrete and of unrestricted updates, and their function.
 
         Its arguments are time, following time, held, noise, following noise and parameters.
@@ -130,4 +134,12 @@ class SteppedDiagram:
         outputs["valid"] = valid
         function = TracedFunction("a sample", inputs, outputs, compiled=self._choice, lean=True)
         function.arguments[5][:] = self._parameters
-        return *places, function
+        return _indexed(places[0]), _indexed(places[1]), function
+
+
+def _indexed(places: list[int]) -> Places:
+    """The places as what NumPy indexes with least time."""
+    if not places:
+        return slice(0)
+    is_one_piece = places == list(range(places[0], places[-1] + 1))
+    return slice(places[0], places[-1] + 1) if is_one_piece else np.array(places)

@@ -31,7 +31,7 @@ from drake_dae.diagrams.recorded import (
 )
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import add_exogenous, make_generator
-from drake_dae.diagrams.state_feedback import add_encoders
+from drake_dae.diagrams.state_feedback import add_encoders, add_packets
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
@@ -149,11 +149,15 @@ def wire_loop(
             add_block(builder, block)
     goal = contact_reference(controller, reference)
 
-    # The state goes to the controller, through encoders.
+    # The state goes to the controller, through encoders, and in packets that may be lost.
     state, measured = plant.GetOutputPort("state"), None
     if parts.encoders is not None:
         measured = add_encoders(builder, plant, parts.encoders, parts.period(plant.time_step))
         state = measured.output
+    forces = plant.dae.num_constraints if controller.HasInputPort("measured_force") else 0
+    packets = add_packets(builder, state, forces, parts.sampling)
+    if packets is not None:
+        state = packets.state
     observing = parts.observer if goal is not None else None
     if observing is None:
         builder.Connect(state, controller.GetInputPort("estimated_state"))
@@ -189,6 +193,8 @@ def wire_loop(
     if observing is not None and goal is not None:
         ports = state, sampling, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
+        if packets is not None:
+            builder.Connect(packets.missed, observer.GetInputPort("missed"))
         holds.append(observer.GetOutputPort("hold"))
     for block in (limits if observer is None else None, feasible):
         if block is not None:
@@ -201,15 +207,17 @@ def wire_loop(
     if controller.HasInputPort("measured_force"):
         if parts.sensor is not None:
             add_block(builder, parts.sensor)
-        others = [] if observer is None else [observer]
-        noise = add_force_feedback(builder, plant, controller, parts.sensor, parts.sampling, others)
+        ways = parts.sensor, parts.sampling, packets, [] if observer is None else [observer]
+        noise = add_force_feedback(builder, plant, controller, *ways)
     if parts.tolerances is not None and reference is not None:
         add_watch(builder, plant, reference, law, parts.tolerances)
 
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {
         **signals_of_plant(plant, moving, reference, law, control),
-        **signals_of_parts(plant, controller, measured, link, limits, observer, parts.sensor),
+        **signals_of_parts(
+            plant, controller, measured, packets, link, limits, observer, parts.sensor
+        ),
     }
     if feasible is not None:
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
@@ -243,6 +251,7 @@ def wire_loop(
         measured,
         observer,
         link,
+        packets,
     )
 
 

@@ -1,13 +1,23 @@
 """Configurations (58) and static balance: two problems for Newton's method."""
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.links.links import Links
+from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
+from drake_dae.trace.newton import CONVERGED, NewtonModel, newton, norm, once, shortest_steps
+
+NEAR, SHORTER = 1.0, 0.25
+"""Full Newton steps are taken if the first, relative to the guess or to 1, is below the first of
+these, and each is shorter than the one before by the second: so damped steps would be full too."""
+
+MOST = 1000
+"""The largest product of unknowns and squared equations whose Newton step is traced."""
 
 
 class StaticPlacement:
@@ -23,11 +33,53 @@ class StaticPlacement:
     def __init__(self, dae: DaeSystem, q: ca.SX, phi: ca.SX, h_1: ca.SX) -> None:
         of_outputs = ca.SX.sym("of outputs", dae.parameter_symbol.numel())
         h_1 = ca.substitute(h_1, dae.parameter_symbol, of_outputs)
-        self._function = TracedFunction(
-            f"{dae.name} positions",
-            {"q": q, "parameters": dae.parameter_symbol, "parameters of outputs": of_outputs},
-            {"phi": phi, "h_1": h_1, "J": ca.jacobian(phi, q), "P": ca.jacobian(h_1, q)},
+        self._name = f"{dae.name} positions"
+        self._inputs = {
+            "q": q,
+            "parameters": dae.parameter_symbol,
+            "parameters of outputs": of_outputs,
+        }
+        self._outputs = {
+            "phi": phi,
+            "h_1": h_1,
+            "J": ca.jacobian(phi, q),
+            "P": ca.jacobian(h_1, q),
+        }
+        rows = phi.numel() + h_1.numel()
+        self._is_led = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
+        self._function = TracedFunction(self._name, self._inputs, self._outputs)
+
+    @cached_property
+    def _step(self) -> TracedFunction:
+        """The Newton step to all outputs, the shortest one where they do not determine q."""
+        phi, h_1, J, P = self._outputs.values()
+        wanted = ca.SX.sym("outputs", h_1.numel())
+        factors = Factorization(ca.vertcat(J, P).T)
+        step = factors.shortest(ca.vertcat(phi, h_1 - wanted))
+        return TracedFunction(
+            self._name, {**self._inputs, "outputs": wanted}, {"step": -step}, factors.pivot
         )
+
+    def _led(self, guess: FloatArray, *arguments: FloatArray) -> FloatArray | None:
+        """The solution to which full Newton steps lead; None if they may have to be shortened.
+
+        Args:
+            guess: Where to start, shape (nq,).
+            arguments: Those of the function of the step after q.
+        """
+        q, unit, last = guess, np.maximum(1.0, np.abs(guess)), NEAR / SHORTER
+        while True:
+            step = self._step.evaluate(q, *arguments)[0]
+            if not self._step.is_valid:
+                return None
+            length = norm(step / unit)
+            if length <= CONVERGED and not length < 0.5 * last:
+                return q  # What is left is round-off.
+            if not length <= SHORTER * last:
+                return None
+            q, last = q + step, length
+            if not length:
+                return q
 
     def solve(
         self,
@@ -45,6 +97,11 @@ class StaticPlacement:
             of_outputs: The same for h_1.
         """
         count = outputs.size
+        if self._is_led and count == self._outputs["h_1"].numel():
+            found = self._led(guess, parameters, of_outputs, outputs)
+            if found is not None:
+                phi, h_1, _, _ = self._function(found, parameters, of_outputs)
+                return found, np.concatenate([phi, h_1 - outputs])
         evaluated = once(lambda q: self._function(q, parameters, of_outputs))
 
         def residual(q: FloatArray) -> FloatArray:

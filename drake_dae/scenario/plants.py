@@ -69,9 +69,11 @@ class ScenarioPlant(ABC):
     5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
+    6. With `knows_ends` its contacts end where surfaces do, such as those of a `Plate`.
     """
 
     carries: ClassVar[bool] = False
+    knows_ends: ClassVar[bool] = True
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
 
@@ -105,6 +107,8 @@ class ScenarioPlant(ABC):
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
+    knows_ends = False
+
     def plant(self, robot: RobotToSimulate) -> Plant:
         if robot.latches:
             return UnilateralRobotPlant(
@@ -136,6 +140,7 @@ class Unilateral(ScenarioPlant):
 
     restitution: dict[str, float] = field(default_factory=dict)
     settling_time: float = 1e-3
+    knows_ends = False
 
     def __post_init__(self) -> None:
         positive("settling_time", self.settling_time)

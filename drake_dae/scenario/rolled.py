@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import LINK_NOISE, link_seed
-from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.diagrams.state_feedback import PACKET_NOISE, encoder_seed, packet_seed
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
@@ -196,6 +196,7 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
         seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
     if scenario.sampling is not None:
         seeds[LINK_NOISE] = link_seed(scenario.sampling.seed)
+        seeds[PACKET_NOISE] = packet_seed(scenario.sampling.seed)
     return seeds
 
 

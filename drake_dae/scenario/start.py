@@ -71,8 +71,9 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
-    if loop.link is not None and scenario.sampling is not None:
-        loop.link.set_seed(context, scenario.sampling.seed)
+    for link in (loop.link, loop.packets):
+        if link is not None and scenario.sampling is not None:
+            link.set_seed(context, scenario.sampling.seed)
     return context
 
 
@@ -136,14 +137,17 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 
     Exogenous ones are measured: law and plant have the same.
     """
-    dae, system = loop.plant.dae, loop.controller.law.system
-    moving = {p.name for p in dae.exogenous.moving}
-    sizes = {p.name: p.value.size for p in system.parameters}
-    values, assumed = parameters.copy(), system.parameter_values
-    for p in dae.parameters:
-        if p.name not in moving and sizes.get(p.name) == p.value.size:
-            values[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
-    return values
+    if "of law" not in loop.memory:  # They are the same in all runs.
+        dae, system = loop.plant.dae, loop.controller.law.system
+        moving = {p.name for p in dae.exogenous.moving}
+        sizes = {p.name: p.value.size for p in system.parameters}
+        known, assumed = np.full(parameters.size, np.nan), system.parameter_values
+        for p in dae.parameters:
+            if p.name not in moving and sizes.get(p.name) == p.value.size:
+                known[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
+        loop.memory["of law"] = known
+    known = loop.memory["of law"]
+    return np.where(np.isnan(known), parameters, known)
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from math import isfinite
 from typing import Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydrake.systems.framework import Context, Diagram, PortDataType, System, Tr
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.groups import discrete_states
@@ -66,7 +68,7 @@ class SampledRun:
 
     def __init__(self, compiled: CompiledDiagram, log: SampleLog, context: Context) -> None:
         self._compiled, self._context, self.steps = compiled, context, 0
-        self._add = log.FindMutableLog(context).AddData
+        self._row, self._add = BufferedFunction(compiled.row), log.FindMutableLog(context).AddData
         self._time = start = context.get_time()
         (rate, block), self._parameters = compiled.stepped, compiled.values(context)
         assert block.stepped is not None
@@ -164,7 +166,7 @@ class SampledRun:
             sample = following
             if is_last:
                 break
-        if times and not self._write(np.array(times), np.array(rows)):
+        if not self._write(times, rows):
             return False
         self._time, self._due = time, due % log_bit
         self.steps += steps
@@ -188,13 +190,15 @@ class SampledRun:
                 self._noise[source.part] = source.drawn(time)
         return Sample(time, due, self._noise)
 
-    def _write(self, times: FloatArray, held: FloatArray) -> bool:
+    def _write(self, times: list[float], held: list[FloatArray]) -> bool:
         """Adds samples to the log; returns whether all values are valid."""
-        given = times[None], np.zeros((0, times.size)), held.T, self._parameters
-        values, valid = (each.full() for each in self._compiled.row(*given))
-        if not np.isfinite(valid).all():
-            return False
-        for time, row in zip(times.tolist(), np.ascontiguousarray(values.T), strict=True):
+        rows, none = list[FloatArray](), np.zeros(0)
+        for time, values in zip(times, held, strict=True):
+            row, valid = self._row(time, none, values, self._parameters)
+            if not isfinite(valid[0]):
+                return False
+            rows.append(row.copy())
+        for time, row in zip(times, rows, strict=True):
             self._add(time, row)
         return True
 

@@ -247,13 +247,15 @@ def _estimated(record: Record) -> list[str]:
 
 
 def _lost(record: Record) -> list[str]:
-    """The controls that did not arrive at the drives."""
-    if "lost_controls" not in record.signals:
-        return []
-    lost = record["lost_controls"][:, 0]
-    total = max(float(record.time[-1] - record.time[0]), 1e-300)
-    share = float(np.diff(record.time) @ (lost[1:] > 0.0)) / total
-    return [f"lost controls        in {share:.2%} of the time, at most {lost.max():g} in a row"]
+    """The controls that did not arrive at the drives, and the measurements not at the law."""
+    lines, total = [], max(float(record.time[-1] - record.time[0]), 1e-300)
+    for name in ("lost_controls", "lost_measurements"):
+        if name in record.signals:
+            lost, title = record[name][:, 0], name.replace("_", " ")
+            share = float(np.diff(record.time) @ (lost[1:] > 0.0)) / total
+            most = f"at most {lost.max():g} in a row"
+            lines.append(f"{title:<20} in {share:.2%} of the time, {most}")
+    return lines
 
 
 def _number(value: float, size: float, digits: int) -> str:

@@ -323,6 +323,7 @@ def test_help_reports_the_exit_codes(capsys):
             "hand_over",
             "tool_change",
             "edge_follow",
+            "polish_unknown_part",
         ),
     ),
 )

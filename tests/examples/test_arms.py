@@ -17,6 +17,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
 ]
 
+
 @pytest.fixture(scope="module")
 def example():
     with loaded("arms") as module:

@@ -36,7 +36,6 @@ CLAIMS = {
     "own_diagram": (1e-9,),
     "identified_plants": (0.01, 0.05, 0.12),
     "least_torque": (0.9, 1.001e-3),
-    "polish_unknown_part": (0.05, 0.05, 0.1, 0.1),
     "even_wear": (1.0 / 3.0, 0.05, 1e-6),
 }
 

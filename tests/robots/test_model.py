@@ -146,6 +146,20 @@ def test_configuration_inverts_the_outputs(name):
         np.testing.assert_allclose(numbers(name, found, v).outputs, wanted, atol=1e-10)
 
 
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_configuration_is_that_to_which_the_guess_leads_in_small_steps(name):
+    """Newton's method, whatever its steps, does not go over to another elbow; to round-off."""
+    model = arm(name).model
+    for state in consistent_states(name, 3, seed=9):
+        q = state[: state.size // 2]
+        wanted, nominal = numbers(name, q, 0.0 * q).outputs, model.dae.nominal_state[: q.size]
+        begin, followed = numbers(name, nominal, 0.0 * q).outputs, nominal
+        for share in np.linspace(0.0, 1.0, 60):
+            followed = model.configuration(begin + share * (wanted - begin), followed)
+        found = model.configuration(wanted, nominal)
+        np.testing.assert_allclose(found, followed, rtol=0.0, atol=1e-12)
+
+
 def test_configuration_out_of_reach_is_refused():
     with pytest.raises(InconsistentStateError, match=r"out\s+of reach"):
         textbook().configuration([2.5], [1.2, -1.6])

@@ -154,10 +154,10 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     chosen, loop, context = built("observer and integrals")
 
     class Failing(DrakeSteps):
-        def after(self, time, given):
+        def step(self, time, given, outputs):
             if time > 0.0445:
                 raise RuntimeError("no convergence.")
-            return super().after(time, given)
+            super().step(time, given, outputs)
 
     monkeypatch.setattr(stepped, "DrakeSteps", Failing)
     expected, seen = context.Clone(), []

@@ -163,6 +163,9 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "controls are late or lost on their way (sampling)": not (
             scenario.sampling is None or scenario.sampling.is_exact
         ),
+        "measurements are late or lost on their way (sampling.measurements)": (
+            scenario.sampling is not None and scenario.sampling.measurements is not None
+        ),
         "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]

@@ -243,6 +243,11 @@ class Constraint(ABC):
         return None
 
     @property
+    def ends(self) -> bool:
+        """Whether its surface has edges or holes, which only compliant contact knows."""
+        return False
+
+    @property
     def remark(self) -> str:
         """The approximations of its surface, as text; empty if there are none."""
         return ""

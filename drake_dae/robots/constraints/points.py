@@ -217,6 +217,10 @@ class PointOnSurface(Constraint):
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 
     @property
+    def ends(self) -> bool:
+        return self.surface.ends
+
+    @property
     def remark(self) -> str:
         return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise, product
 from math import cos, sin, sqrt, tan
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -81,6 +82,7 @@ class Plate(Plane):
     half_widths: Pair = (0.1, 0.1)
     thickness: float = 0.05
     hole: Hole | None = None
+    ends: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -50,13 +50,14 @@ class Surface(ABC):
        own contact; convex if there are several. A surface may have none. `layer` is a mesh below a
        piece of any smooth surface, for hydroelastic contact. `clearance` is the signed distance
        from the body that compliant plants use. It differs from `distance` where a body ends, which
-       laws do not know.
+       laws and ideal plants do not know; then `ends` is true.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
        which it is defined, if that is bounded.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
     has_exact_distance: ClassVar[bool] = False
+    ends: ClassVar[bool] = False
 
     @property
     @abstractmethod

@@ -7,11 +7,11 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings
-from drake_dae.running.rollout.stepping.called import BufferedFunction
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
@@ -34,9 +34,9 @@ def run_beside(
     """
     compiled = functions.program.compiled
     rate, _ = compiled.stepped
-    bit, places = 1 << compiled.rates.index(rate), list(rate.places)
-    steps, given = _steps(compiled, problem)
+    bit, (steps, given) = 1 << compiled.rates.index(rate), _steps(compiled, problem)
     held, times, none = problem.held.copy(), problem.times, np.zeros(0)
+    stepped = held[rate.places[0] : rate.places[-1] + 1]
     held_of_rows = np.empty((times.size, held.size))
     rows = count = 0
     ending, error, moment = RunEnding.DONE, None, float(times[0])
@@ -60,13 +60,13 @@ def run_beside(
         try:
             is_valid = update(moment, count, due, True, given)
             if is_valid and due & bit:
-                held[places] = steps.after(moment, given)
+                steps.step(moment, given, stepped)
             is_valid = is_valid and update(moment, count, due, False, given)
         except SimulationError as failure:
             ending, error = RunEnding.STUCK, failure
             break
         except RuntimeError as failure:  # Of Drake, as where its contact solver finds no step.
-            state = held[places]
+            state = stepped
             ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(failure))
             break
         if not is_valid:

@@ -32,6 +32,14 @@ def check_task(scenario: Scenario) -> None:
         text = "an !Impedance is not for a task with latches; give !Poles or !Coefficients"
         if task.make().plan.latches:
             problems += [(key, text) for key, own in gains.items() if isinstance(own, Impedance)]
+        ending = [c.name for c in scenario.constraints if isinstance(c, Constraint) and c.ends]
+        feeling = [phase.name for phase in task.phases if phase.feels_ends]
+        if ending and feeling and not scenario.plant.knows_ends:
+            text = (
+                f"{feeling[0]} waits for an edge or a hole, and the ideal contact of '{ending[0]}' "
+                "is that of a whole plane; take !MultibodyPlant or !CompliantContact"
+            )
+            problems.append(("plant", text))
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:

@@ -110,6 +110,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         plant_disturbances=[],
         encoders=None,
         observer=None,
+        identified=[],
         tolerances=None,
     )
     loop = build_loop(ideal, model, structure, motion=motion_in_time)

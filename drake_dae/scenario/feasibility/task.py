@@ -222,6 +222,7 @@ def _ideal(scenario: Scenario) -> Scenario:
         sampling=sampling,
         encoders=None,
         observer=None,
+        identified=[],
         saturation=False,
         may_diverge=True,
     )
@@ -240,8 +241,7 @@ def _outcome(
 
 def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:
     """Whether the last phase that failed searches a shape, which the law's model does not have."""
-    places = [change.place for change in changes if change.place < len(plan)]
-    return bool(places) and any(plan[place].is_relative for place in places)
+    return any(plan[one.place].is_relative for one in changes if one.place < len(plan))
 
 
 def phase_rows(record: Record, begin: float, end: float) -> Indices:

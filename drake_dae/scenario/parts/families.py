@@ -113,7 +113,8 @@ Plant = Annotated[
     | plants.OwnPlant,
     Choice({Sequence[contact_material.Peg]: _Pegs}),
 ]
-Sampling = Annotated[sampling.Sampling, Form()]
+_PACKETS: dict[Any, Any] = {sampling.Packets: Annotated[sampling.Packets, Form()]}
+Sampling = Annotated[sampling.Sampling, Form(_PACKETS)]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 ErrorBound = Annotated[error_bound.ErrorBound, Form()]

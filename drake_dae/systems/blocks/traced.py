@@ -149,7 +149,8 @@ class DrakeStepped:
             output of one of its computations.
         held: The context of the block -> HELD, shape (size,).
         put: (context of the system, HELD) -> None; sets the state before a step.
-        read: The context of the system -> the values of these output ports, stacked.
+        read: (context of the system, array) -> None; writes the values of these output ports,
+            stacked, to the array.
         size: The number of entries of HELD.
     """
 
@@ -160,7 +161,7 @@ class DrakeStepped:
     reads: str
     held: Callable[[Context], FloatArray]
     put: Callable[[Context, FloatArray], None]
-    read: Callable[[Context], FloatArray]
+    read: Callable[[Context, FloatArray], None]
     size: int
 
 

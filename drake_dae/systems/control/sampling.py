@@ -22,12 +22,55 @@ MOST_ON_THE_WAY = 10_000
 
 @checked(ModelError)
 @dataclass(frozen=True)
+class Packets:
+    """Measurements on their way to a sampled law: one packet for each sample, with x and forces.
+
+    The law uses the newest packet that has arrived. So do the guards of a task: they see a touch
+    when its packet comes, and a value that is repeated counts as a sample. An observer knows which
+    packets are new: at a sample without one it goes on by its model, and learns nothing.
+
+    Attributes:
+        late: The probability that a packet comes after its sample, and before the next one; less
+            than 1.
+        loss: The probability at each sample that packets begin to be lost, less than 1.
+        burst: The number of packets in a row that are lost each time.
+        most_lost: The number of samples without a new measurement after which the law stops the
+            robot, which ends the run with an error. None for never.
+
+    Raises:
+        ModelError: A number is out of range.
+    """
+
+    late: float = 0.0
+    loss: float = 0.0
+    burst: int = 1
+    most_lost: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("late", "loss"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ModelError(
+                    f"the {name} of measurements is a probability of 0 or more and less than 1, "
+                    f"got {getattr(self, name):g}"
+                )
+        check_whole_number("the burst of measurements", self.burst, 1)
+        if self.most_lost is not None:
+            check_whole_number("the most_lost of measurements", self.most_lost, 1)
+
+    @property
+    def longest(self) -> int:
+        """The largest number of samples in a row without a new packet, with one loss at a time."""
+        return (self.burst if self.loss else 0) + (1 if self.late else 0)
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
 class Sampling:
     """A law samples its inputs at t_k = k period; its control acts from t_k + delay on.
 
     With `jitter` some controls act later, with `loss` some do not arrive; then the drives hold the
     last control that arrived. The law does not know it: its integrals and its references go on. An
-    observer uses the control at the drives. Measurements are never late and never lost.
+    observer uses the control at the drives. Measurements have `Packets` of their own.
 
     Attributes:
         period: T in s, positive.
@@ -41,6 +84,7 @@ class Sampling:
         most_lost: The number of lost controls in a row at which the robot stops by itself, which
             ends the run with an error; 20 for a Franka arm. None for never.
         seed: The seed of jitter and loss in a scenario; in Python see `ClosedLoop.set_seed`.
+        measurements: Late and lost measurements; None if all arrive at once.
 
     Raises:
         ModelError: The period is not positive, the delay is negative or very many periods, or
@@ -54,6 +98,7 @@ class Sampling:
     burst: int = 1
     most_lost: int | None = None
     seed: int = 0
+    measurements: Packets | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.period) and self.period > 0.0):
@@ -82,7 +127,7 @@ class Sampling:
 
     @property
     def is_exact(self) -> bool:
-        """Whether each control arrives, with the same delay."""
+        """Whether each control arrives at the drives, with the same delay."""
         return not (self.jitter or self.loss)
 
     @property

@@ -272,7 +272,8 @@ def _goals(
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
     assignments, degrees = [], law.degrees
-    for name, reference in phase.goals(names[contact.main]).items():
+    goals = phase.goals_of_latch if contact.is_latch else phase.goals
+    for name, reference in goals(names[contact.main]).items():
         try:
             assignments.append(assigned(name, reference, names, degrees))
         except ReferenceSignalError as error:

@@ -138,10 +138,10 @@ def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch)
     """Its contact solver may find no step; what was recorded is kept."""
 
     class Failing(DrakeSteps):
-        def after(self, time, given):
+        def step(self, time, given, outputs):
             if time > 0.0095:
                 raise RuntimeError("no convergence.")
-            return super().after(time, given)
+            super().step(time, given, outputs)
 
     monkeypatch.setattr(beside, "DrakeSteps", Failing)
     found = chosen("a law with observer and integrals")

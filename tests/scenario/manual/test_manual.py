@@ -57,6 +57,8 @@ PURE = {
     ("!Adaptive", "parameters"),  # In the unit of each, squared, per J.
     ("!MeasuredForce", "gain"),
     ("Sampling", "loss"),
+    ("Packets", "late"),
+    ("Packets", "loss"),
     ("!CompliantContact", "friction"),
     ("!MultibodyPlant", "friction"),
     ("!Unilateral", "restitution"),

@@ -33,6 +33,7 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
 
@@ -274,6 +275,14 @@ def test_estimates_that_are_not_possible_are_refused(settings, message):
 def test_an_estimate_needs_an_observer():
     with pytest.raises(ScenarioError, match="identified: needs an observer"):
         build_scenario(load_scenario("two_link_wall", ["identified=[link2.mass]"]))
+
+
+@pytest.mark.slow
+def test_the_law_s_model_has_nothing_to_estimate():
+    """Formerly `analyze` refused these, since its ideal run has no observer."""
+    estimates = ["identified=[link2.mass]", "bounds.link2.mass=[1, 20]", "duration=0.2"]
+    chosen = load_scenario("wall_guarded", [*estimates, "task={phases: [!Approach {within: 0.1}]}"])
+    assert "identified" not in str(find_feasibility(chosen).problems)
 
 
 def test_bounds_are_needed_in_python_too():

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
 from drake_dae.compiler.rates import dense_function
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import RunProblem, Tableau
-from drake_dae.running.rollout.stepping.called import BufferedFunction
 from drake_dae.running.rollout.stepping.functions import REACHED
 from drake_dae.running.rollout.stepping.interpreted import fixed_steps
 

@@ -7,10 +7,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compiled import ARGUMENTS
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Tableau
-from drake_dae.running.rollout.stepping.called import BufferedFunction
 from drake_dae.running.rollout.stepping.many import VectorizedFunction
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.stepping.called import BufferedFunction
+from drake_dae.compiler.called import BufferedFunction
 
 BLOCK = 512
 """The number of moments computed together: intermediate results then fit the cache."""

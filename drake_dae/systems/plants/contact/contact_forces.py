@@ -87,8 +87,8 @@ class ContactForces(LeafSystem):
             )
         )
 
-    def contact_force(self, results: ContactResults) -> FloatArray:
-        """The contact forces of Drake's contact results, N, shape (3 m,)."""
+    def contact_force(self, results: ContactResults) -> list[float]:
+        """The contact forces of Drake's contact results, N: 3 m numbers."""
         # Plain numbers: this runs at each step, and arrays of three numbers take twice the time.
         total = [0.0] * len(self.contact_force_signals)
         for i in range(results.num_point_pair_contacts()):
@@ -99,7 +99,7 @@ class ContactForces(LeafSystem):
             patch = results.hydroelastic_contact_info(i)
             # The force is that on the body of M.
             self._add(total, patch.contact_surface().id_M(), patch.F_Ac_W().translational())
-        return np.array(total)
+        return total
 
     def _add(self, total: list[float], geometry: GeometryId, force: FloatArray) -> None:
         """Adds the force of a contact on a geometry to the forces on the robot."""
@@ -110,7 +110,7 @@ class ContactForces(LeafSystem):
         total[first + 2] += sign * z
 
     def _contact_force(self, context: Context) -> FloatArray:
-        return self.contact_force(self._results.Eval(context))
+        return np.array(self.contact_force(self._results.Eval(context)))
 
     def _force(self, context: Context) -> FloatArray:
         contact = self._contact.Eval(context).reshape(-1, 3)

@@ -116,8 +116,9 @@ def contact_step(
     "Irrotational contact fields"). Drake's solver stops at a relative residual of 1e-6; this one
     solves for v_c to round-off by a primal-dual Newton's method: since p = v_t / |v_t|_s are
     separate unknowns, it also converges if the sliding direction turns (Chan, Golub and Mulet
-    1999). For n velocities of joints it solves n equations if these are fewer than the 3 k of the
-    contacts: with the slope G of the impulses and W = J A^-1 J^T
+    1999). Velocities and impulses of a contact have the normal as their first axis. For n
+    velocities of joints it solves n equations if these are fewer than the 3 k of the contacts: with
+    the slope G of the impulses and W = J A^-1 J^T
 
         (1 - W G)^-1 = 1 + J (A - J^T G J)^-1 J^T G.
 
@@ -135,16 +136,17 @@ def contact_step(
     """
     h, count = time_step, len(contacts)
     factored = PositiveDefiniteFactorization(mass)
-    jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
+    axes = ca.diagcat(*(_axes(contact.normal) for contact in contacts))
+    jacobian = ca.mtimes(axes, ca.vertcat(*(contact.jacobian for contact in contacts)))
     response = factored.solve(jacobian.T)
     is_reduced = 3 * count > v.numel()
     delassus = None if is_reduced else ca.mtimes(jacobian, response)
-    surface = ca.vertcat(*(contact.velocity for contact in contacts))
+    surface = ca.mtimes(axes, ca.vertcat(*(contact.velocity for contact in contacts)))
     before = ca.mtimes(jacobian, v) - surface
     target = ca.mtimes(jacobian, free) - surface
     parts = [slice(3 * i, 3 * i + 3) for i in range(count)]
     laws = [
-        (p, _Lagged.of(contact, before[p], mass, h, compliance))
+        (p, _Lagged.of(contact, before[p], jacobian[p, :], mass, h, compliance))
         for p, contact in zip(parts, contacts, strict=True)
     ]
 
@@ -158,9 +160,12 @@ def contact_step(
         return velocity - target - changed
 
     velocity = before
-    shares = ca.vertcat(*(law.share(before[p]) for p, law in laws))
+    shares = [law.share(before[p]) for p, law in laws]
     for remaining in reversed(range(ITERATIONS)):
-        slope = ca.diagcat(*(law.slope(velocity[p], shares[p]) for p, law in laws))
+        slopes = (
+            law.slope(velocity[p], share) for (p, law), share in zip(laws, shares, strict=True)
+        )
+        slope = ca.diagcat(*slopes)
         if is_reduced:
             matrix = mass - ca.mtimes([jacobian.T, slope, jacobian])
         else:
@@ -172,19 +177,52 @@ def contact_step(
             pushed = ca.mtimes([jacobian.T, slope, change])
             change += ca.mtimes(jacobian, Factorization(matrix).solve(pushed))
         else:
-            change = Factorization(matrix).solve(change)
-        moved = [law.next_share(velocity[p], shares[p], change[p]) for p, law in laws]
-        velocity, shares = velocity + change, ca.vertcat(*moved)
+            change = _solved(matrix, change)
+        shares = [
+            law.next_share(velocity[p], share, change[p])
+            for (p, law), share in zip(laws, shares, strict=True)
+        ]
+        velocity += change
     slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))
     impulse = impulses(velocity)
-    return ContactStep(free + ca.mtimes(response, impulse), impulse / h, slack)
+    forces = ca.mtimes(axes.T, impulse) / h
+    return ContactStep(free + ca.mtimes(response, impulse), forces, slack)
+
+
+def _axes(normal: ca.SX) -> ca.SX:
+    """Orthonormal axes as rows, the unit normal first, without a singular direction.
+
+    Duff et al., "Building an orthonormal basis, revisited", 2017.
+    """
+    x, y, z = ca.vertsplit(normal)
+    sign = ca.copysign(1, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = ca.horzcat(1 + sign * x**2 * a, sign * b, -sign * x)
+    return ca.sparsify(ca.vertcat(normal.T, first, ca.horzcat(b, sign + y**2 * a, -y)))
+
+
+def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """X of (1 - W G) X = B. For one contact by elimination: it has positive principal minors.
+
+    Since W is positive definite and G has the normal apart from the tangential directions, where
+    -G - G^T is positive semidefinite, no pivot is below 1 or, of the last two together, zero.
+    """
+    if matrix.shape != (3, 3):
+        return Factorization(matrix).solve(right)
+    first, *factors = ca.vertsplit(matrix[:, 0])
+    lower = matrix[1:, 1:] - ca.mtimes(ca.vertcat(*factors) / first, matrix[0, 1:])
+    rest = right[1:] - ca.vertcat(*factors) / first * right[0]
+    (a, c), (b, d) = (ca.vertsplit(lower[:, j]) for j in range(2))
+    last = ca.vertcat(d * rest[0] - b * rest[1], a * rest[1] - c * rest[0]) / (a * d - b * c)
+    return ca.vertcat((right[0] - ca.mtimes(matrix[0, 1:], last)) / first, last)
 
 
 @dataclass(frozen=True, eq=False)
 class _Lagged:
-    """The impulse of one contact as a function of its velocity."""
+    """The impulse of one contact as a function of its velocity, in its axes."""
 
-    contact: PointContact
+    viscous: ca.SX
     elastic: ca.SX
     lagged: ca.SX
     softness: ca.SX
@@ -193,20 +231,33 @@ class _Lagged:
 
     @classmethod
     def of(
-        cls, contact: PointContact, before: ca.SX, mass: ca.SX, h: float, compliance: Compliance
+        cls,
+        contact: PointContact,
+        before: ca.SX,
+        jacobian: ca.SX,
+        mass: ca.SX,
+        h: float,
+        compliance: Compliance,
     ) -> "_Lagged":
-        """The impulse, with constants from the state before the step."""
+        """The impulse, with constants from the state before the step.
+
+        Args:
+            contact: The contact.
+            before: Its velocity before the step, in its axes.
+            jacobian: J, in these axes.
+            mass, h, compliance: As of `contact_step`.
+        """
         elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
-        damping = ca.fmax(0, 1 - compliance.dissipation * ca.dot(contact.normal, before))
+        damping = ca.fmax(0, 1 - compliance.dissipation * before[0])
         lagged = contact.friction * h * elastic * damping
-        J = contact.jacobian
-        response = ca.mtimes(J / ca.repmat(ca.diag(mass).T, 3, 1), J.T)
+        response = ca.mtimes(jacobian / ca.repmat(ca.diag(mass).T, 3, 1), jacobian.T)
         softness = ca.fmax(compliance.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
-        return cls(contact, elastic, lagged, softness, h, compliance)
+        viscous = h * contact.viscous_friction * (elastic > 0)
+        return cls(viscous, elastic, lagged, softness, h, compliance)
 
     def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
         """v_t and |v_t|_s."""
-        sliding = self.contact.along(velocity)
+        sliding = velocity[1:]
         return sliding, ca.sqrt(ca.sumsqr(sliding) + self.softness**2)
 
     def share(self, velocity: ca.SX) -> ca.SX:
@@ -217,21 +268,19 @@ class _Lagged:
     def next_share(self, velocity: ca.SX, share: ca.SX, change: ca.SX) -> ca.SX:
         """p after a Newton step, with a length of at most 1."""
         sliding, size = self._size(velocity)
-        moved = self.contact.along(change)
+        moved = change[1:]
         share_after = (sliding + moved - share * ca.dot(sliding / size, moved)) / size
         return share_after / ca.fmax(1, ca.norm_2(share_after))
 
     def impulse(self, velocity: ca.SX) -> ca.SX:
         """gamma in N s, shape (3, 1)."""
-        push, _ = self._push(velocity)
-        viscous = self.time_step * self.contact.viscous_friction * self.contact.along(velocity)
-        along = -self.lagged * self.share(velocity) - ca.if_else(self.elastic > 0, viscous, 0)
-        return self.contact.normal * push + along
+        along = -self.lagged * self.share(velocity) - self.viscous * velocity[1:]
+        return ca.vertcat(self._push(velocity)[0], along)
 
     def _push(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
         """gamma_n and its derivative."""
         h, k, d = self.time_step, self.compliance.stiffness, self.compliance.dissipation
-        leaving = ca.dot(self.contact.normal, velocity)
+        leaving = velocity[0]
         elastic, damping = self.elastic - h * k * leaving, 1 - d * leaving
         touches = (self.elastic > 0) * (elastic > 0) * (damping > 0)
         return touches * h * elastic * damping, -touches * h * (h * k * damping + d * elastic)
@@ -239,8 +288,6 @@ class _Lagged:
     def slope(self, velocity: ca.SX, share: ca.SX) -> ca.SX:
         """The derivative of the impulse, with p in place of one of its directions, shape (3, 3)."""
         sliding, size = self._size(velocity)
-        n, t = self.contact.normal, sliding / size
-        plane = ca.SX.eye(3) - ca.mtimes(n, n.T)
-        viscous = self.time_step * self.contact.viscous_friction * (self.elastic > 0)
-        along = self.lagged / size * (plane - ca.mtimes(share, t.T)) + viscous * plane
-        return ca.mtimes(n, n.T) * self._push(velocity)[1] - along
+        plane = ca.SX.eye(2)
+        along = self.lagged / size * (plane - ca.mtimes(share, (sliding / size).T))
+        return ca.diagcat(self._push(velocity)[1], -along - self.viscous * plane)

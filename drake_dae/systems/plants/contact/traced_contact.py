@@ -36,10 +36,12 @@ def traced_contact(
     dae, manifold, forces = plant.dae, plant.structure.manifold, contact.contact_force_signals
     positions, results = map(scene.GetOutputPort, ("link_state", "contact_results"))
 
-    def read(context: Context) -> FloatArray:
+    count = positions.size()
+
+    def read(context: Context, into: FloatArray) -> None:
+        into[:count] = positions.Eval(context)
         # Half the time of evaluating the port of the contact force.
-        force = contact.contact_force(results.Eval(context))
-        return np.concatenate([positions.Eval(context), force])
+        into[count:] = contact.contact_force(results.Eval(context))
 
     stepped = DrakeStepped(
         scene,
@@ -53,7 +55,7 @@ def traced_contact(
         dae.num_states + len(forces),
     )
     held, parameters = ca.SX.sym("held", stepped.size), ca.DM(values)
-    stops = np.cumsum([0, positions.size(), len(forces)]).tolist()
+    stops = np.cumsum([0, count, len(forces)]).tolist()
     of_links, contact_force, of_stages = ca.vertsplit(held, [*stops, stepped.size])
     state = ca.vertcat(of_links, of_stages)
     normals = contact_normals(plant.robot("contact")).function(state, parameters)[0]

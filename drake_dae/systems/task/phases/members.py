@@ -8,7 +8,7 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.references import Reference
+from drake_dae.dae.references import LineReference, PathLimits, Reference
 from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
@@ -18,6 +18,9 @@ _SPEED = 0.05
 
 _AWAY = 0.02
 """The distance in m from its start at which a Release has left the contact."""
+
+_FALL, _LEAST = PathLimits(0.5, 1.0), -1e3
+"""How fast the reference of a Release falls below zero, in N/s and N/s^2, and its least value."""
 
 
 @checked(ModelError)
@@ -263,6 +266,9 @@ class Dwell(_Lasting):
 class Release(Phase):
     """The force goes smoothly to zero; the phase ends below the task's contact_force.
 
+    If it has not ended after `over`, a model error holds the tool, such as an unknown weight or an
+    integral that is held: then the reference goes on to fall, by 0.5 N/s, until the contact opens.
+
     All forces and moments of a latch go to zero; then a command opens it.
 
     The phase is also late if the tool is 20 mm away and a force is still measured, which is then
@@ -280,6 +286,9 @@ class Release(Phase):
     for_latch = True
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
+        return {contact_output: LineReference([0.0], [_LEAST], _FALL, self.over, order=6)}
+
+    def goals_of_latch(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: 0.0}
 
     def margin(self, now: Moment, contact_force: float) -> float:

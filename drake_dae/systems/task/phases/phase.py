@@ -90,6 +90,7 @@ class Phase(ABC):
        the largest force, distance and rate of its directions.
     7. With `finds_line` the paths of its contact points are straight, and `followed_lines` fits a
        line to them.
+    8. With `feels_ends` it waits for an edge or a hole of a surface that ends.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -122,6 +123,7 @@ class Phase(ABC):
     for_contact: ClassVar[bool] = True
     for_latch: ClassVar[bool] = False
     finds_line: ClassVar[bool] = False
+    feels_ends: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING
@@ -181,6 +183,14 @@ class Phase(ABC):
                 this one of its distances, the others go to the same.
         """
         return {}
+
+    def goals_of_latch(self, contact_output: str) -> Mapping[str, Reference | float]:
+        """The goals of a phase that leads a latch; by default those of `goals`.
+
+        Args:
+            contact_output: The name of the latch's first force, or distance if it is open.
+        """
+        return self.goals(contact_output)
 
     def rates(self, contact_output: str) -> Mapping[str, float]:
         """Name of an output without a goal -> its final rate, in its unit per s.

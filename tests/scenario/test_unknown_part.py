@@ -1,0 +1,70 @@
+"""The scenario polish_unknown_part: a part off its place is felt, found and polished."""
+
+import numpy as np
+import pytest
+from runs import scenario
+
+from drake_dae import build_scenario, rollout, start_values
+
+DURATION = 12.1  # Until the part is polished.
+BALL = "plant=!CompliantContact {friction: 0.3, radius: 0.01}"
+IDEAL = "plant=!Unilateral {}"
+
+
+def polished(*settings):
+    """The scenario, its loop, and record and starts of phases of a rollout."""
+    chosen = scenario("polish_unknown_part", *settings, f"duration={DURATION}")
+    loop, context = build_scenario(chosen)
+    times = np.linspace(0.0, DURATION, round(1000 * DURATION) + 1)
+    (run,) = rollout(loop, *start_values(loop, context), times)
+    assert run.failure is None, run.failure
+    changes = {change.phase: change.time for change in loop.changes(run.context)}
+    return chosen, loop, run.record, changes
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "settings", [(BALL,), (IDEAL, "plant_parameters.part.friction=0.3")], ids=["ball", "ideal"]
+)
+def test_a_part_5_mm_and_5_degrees_off_is_found_and_polished(settings):
+    """The place is that of the surface under the way of the tool, by the estimates at each time.
+
+    At the first touch it is off by some mm; 0.1 mm is asked after the part is felt.
+    """
+    chosen, loop, record, changes = polished(*settings)
+    assert list(changes)[:5] == ["Move", "Approach", "Press", "feel", "polish"]
+    dae = loop.controller.law.system
+    distance = dae.trace("distance", {"value": dae.k})
+    places = {name: np.array(chosen.plant_parameters[name]) for name in chosen.identified}
+    truth = dae.with_values(places).parameter_values
+    begin, end = changes["polish"], DURATION
+    rows = np.flatnonzero((record.time > begin) & (record.time < end))[::50]
+    names = [signal.name.partition("[")[0] for signal in record.signals["identified"].signals]
+
+    def off(at):
+        """The distances of the estimated surface from the true one along the way, m."""
+        found = {n: record["identified"][at][[m == n for m in names]] for n in chosen.identified}
+        values = dae.with_values(found).parameter_values
+        return np.array(
+            [
+                distance(x, values)[0].item() - distance(x, truth)[0].item()
+                for x in record["state"][rows]
+            ]
+        )
+
+    before = off(np.searchsorted(record.time, changes["Press"]))
+    assert np.abs(before).max() > 5e-3  # Where the law has the part.
+    every = np.array([off(at) for at in rows])
+    assert np.sqrt(np.mean(every**2)) < 1e-4
+    # The force, after the transition of a second, and the tool beside the normal, in rad.
+    late = (record.time > begin + 1.0) & (record.time < end)
+    errors = dict(
+        zip(
+            [signal.name for signal in record.signals["tracking_error"].signals],
+            record["tracking_error"][late].T,
+            strict=True,
+        )
+    )
+    assert np.sqrt(np.mean(errors["part.force"] ** 2)) < 0.05
+    assert np.sqrt(np.mean(errors["part.tilt_x"] ** 2 + errors["part.tilt_y"] ** 2)) < 3e-3

@@ -1,0 +1,42 @@
+"""A release ends, whatever force the law does not know."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from polishing import push, run_on, started, task_loop
+
+from drake_dae import Approach, Press, Release
+from drake_dae.systems.task.phases import Moment
+
+RELEASE = Release(over=0.2, within=8.0, on_success="stop", on_failure="stop")
+
+
+@pytest.mark.parametrize("unknown", [0.0, 2.0])
+def test_a_release_ends_against_a_force_that_the_law_does_not_know(unknown):
+    """A hand pushes with F into the wall: its force is r + F, and 0.5 N ends the phase.
+
+    The push along the normal moves no other output, so the wall's force is off by exactly F; the
+    guard finds its end within 1e-3 N. Formerly the force stayed at F, and the phase was late.
+    """
+    loop = task_loop([Approach(0.05, over=0.1), Press(10.0, tolerance=3.0, over=0.1), RELEASE])
+    context = started(loop, 0.005)
+    push(loop, context, unknown)
+    run_on(loop, context, 9.0)
+    changes = loop.changes(context)
+    assert [change.phase for change in changes][-2:] == ["Release", "held"]
+    assert (changes[-1].chosen, changes[-1].failed) == ("stop", False)
+    lasted = changes[-1].time - changes[-2].time
+    if not unknown:
+        assert lasted < 0.2
+        return
+    goal = RELEASE.goals("wall.force")["wall.force"].derivatives([0])
+    assert_allclose(goal(lasted)[0], 0.5 - unknown, atol=1e-3)
+
+
+def test_the_reference_of_a_release_is_zero_until_it_should_have_ended():
+    goal = Release(over=0.3).goals("wall.force")["wall.force"].derivatives([0])
+    assert_allclose([goal(time)[0] for time in np.linspace(0.0, 0.3, 7)], 0.0, atol=0.0)
+    assert np.all(np.diff([goal(time)[0] for time in np.linspace(0.3, 60.0, 200)]) < 0.0)
+    # Those of a latch have any sign, and go to zero.
+    assert Release(over=0.3).goals_of_latch("left.fx") == {"left.fx": 0.0}
+    assert Release().margin(Moment(9.0, 0.4, 0.0, 0.0, -4.0), 0.5) < 0.0
