@@ -63,7 +63,7 @@ def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
 
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
 def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, example):
-    """The center of pressure is 6 mm off the middle: less than 0.5 mm off its path, 0.3 at its end."""
+    """The center of pressure is 6 mm off the middle: within 0.5 mm of its path, 0.3 at its end."""
     _, found, changes = rolled(example, f"flat_press-{arm}")
     assert found.failure is None
     assert changes[-1].phase == "done"
