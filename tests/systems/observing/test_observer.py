@@ -64,7 +64,9 @@ def body() -> DaeSystem:
     return with_disturbance(system, ["v"])
 
 
-def pushed(push: float, delay: float = 0.0, sampling: Sampling | None = None, **more):
+def pushed(
+    push: float, delay: float = 0.0, sampling: Sampling | None = None, seed: int = 0, **more
+):
     """The body under its law with an observer, pushed from the start on."""
     system = body()
     law = TrackingLaw(system, poles(-5.0))
@@ -77,6 +79,7 @@ def pushed(push: float, delay: float = 0.0, sampling: Sampling | None = None, **
     context = loop.diagram.CreateDefaultContext()
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_parameter(own, "disturbance", push)
+    loop.set_seed(context, seed)
     simulate(loop.diagram, context, 3.0, STEPS)
     return loop.record(context)
 
@@ -101,7 +104,8 @@ def test_constant_push_is_found_at_the_rate(delay):
     assert abs(found[-1, 0] - 4.0) < 1e-3
 
 
-def test_an_observer_goes_on_by_its_model_where_a_measurement_is_missing():
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_observer_goes_on_by_its_model_where_a_measurement_is_missing(seed):
     """A constant push of 4 N is found at the rate, in steps after gaps, and not overshot.
 
     The prediction in a gap has the force of the spring at its start, so that 1e-4 may be wrong. An
@@ -109,17 +113,19 @@ def test_an_observer_goes_on_by_its_model_where_a_measurement_is_missing():
     """
     push = 4.0
     sampling = Sampling(T, measurements=Packets(loss=0.1, burst=3))
-    record = pushed(push, sampling=sampling)
+    record = pushed(push, sampling=sampling, seed=seed)
     missed, found = record["lost_measurements"][:, 0], record["disturbance"][:, 0]
     assert missed.max() >= 3.0
     assert 0.1 < np.mean(missed > 0.0) < 0.5
     assert np.diff(found).min() > -1e-4 * push
     assert found.max() < push * (1.0 + 1e-4)
-    # Between samples the estimate is that of the last measurement, at most seven samples late.
+    # Between samples the estimate is that of the last measurement: late by the longest gap. After
+    # two bursts in a row, half of 1 / RATE, the force of the spring at their start makes 3 %.
     exact, late = (
-        push * (1.0 - np.exp(-RATE * np.maximum(record.time - gap * T, 0.0))) for gap in (0, 7)
+        push * (1.0 - np.exp(-RATE * np.maximum(record.time - gap * T, 0.0)))
+        for gap in (0, missed.max() + 2)
     )
-    assert np.all((found > late - 0.02 * push) & (found < exact + 0.02 * push))
+    assert np.all((found > late - 0.02 * push) & (found < exact + 0.05 * push))
     assert_allclose(found[-1], push, rtol=1e-6)
 
 
