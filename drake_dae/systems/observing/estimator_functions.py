@@ -103,8 +103,8 @@ class EstimatorFunctions(Observed):
         contact = self.contact(middle, none)
         if not self.measures:
             force = v
-        rubs = ca.mtimes(contact.friction, mu)
-        none[system.parameter_slice(DISTURBANCE)] = r + rubs
+        friction_force = ca.mtimes(contact.friction, mu)
+        none[system.parameter_slice(DISTURBANCE)] = r + friction_force
         mass, push, damping = self._balance()(middle, acted, force, none)
         factors = stepping = PositiveDefiniteFactorization(mass)
         moves = mass
@@ -114,7 +114,7 @@ class EstimatorFunctions(Observed):
         # A measured force has the reaction of the constraints to the friction that acts, and a
         # force of the model that to the friction of a contact that slides.
         through = ca.SX.eye(count) if self.measures else contact.free
-        moved = qd + period * stepping.solve(push - ca.mtimes(through, rubs))
+        moved = qd + period * stepping.solve(push - ca.mtimes(through, friction_force))
         moved += self._rubbed(q, moved, stepping, through, none)
         is_unused, slides = ca.logic_or(self._is_lost, hold), Slides.of(old.slides)
         if self._breaks_away:
@@ -149,7 +149,7 @@ class EstimatorFunctions(Observed):
             freed = ca.mtimes(contact.free, forces)
             along = factors.solve(freed)
             goal, contacts = self._contacts(
-                middle, push - rubs, forces, along, contact, is_unused, none
+                middle, push - friction_force, forces, along, contact, is_unused, none
             )
             slide = self._first.corrected((middle, goal), error, contacts, v, none, slides)
             terms = forces, contact.planes, new_v, contact.metric
