@@ -68,7 +68,7 @@ class Expressions:
             parameters. Both then use the controller's symbols.
         is_short: Whether the derivative of such a plant is computed by `Block.under` of its
             controller, where the controller is connected directly to the plant.
-        reacts: Whether updates make the changes of a `Guard`, where it has a `Reaction`.
+        reacts: Whether updates make the changes of a `Guard`, where it has `TracedChanges`.
 
     Attributes:
         time: The time in s.

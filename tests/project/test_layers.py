@@ -24,6 +24,7 @@ from house import (
     may_import,
     modules,
     room,
+    shared_names,
     too_long,
     violations,
 )
@@ -66,6 +67,11 @@ def test_long_files_have_a_reason() -> None:
     assert too_long(lines) == []
     assert len(too_long({**lines, "drake_dae.long": 351})) == 1
     assert len(too_long(dict.fromkeys(LONG, 350))) == len(LONG)
+
+
+def test_no_two_classes_have_one_name() -> None:
+    assert shared_names({name: path.read_text() for name, path in modules().items()}) == []
+    assert len(shared_names({"a": "class A:\n", "b": "x = 1\nclass A(B):\n"})) == 1
 
 
 def test_tests_borrow_from_support_alone(tmp_path: Path) -> None:

@@ -243,6 +243,23 @@ def too_long(lines: Mapping[str, int]) -> list[str]:
     return found + [f"{module} is not too long: take it out of LONG" for module in short]
 
 
+def shared_names(sources: Mapping[str, str]) -> list[str]:
+    """Classes of one name in two files, as sentences.
+
+    Args:
+        sources: For each module its source.
+    """
+    places: dict[str, list[str]] = {}
+    for module, source in sources.items():
+        for name in re.findall(r"^class (\w+)", source, flags=re.MULTILINE):
+            places.setdefault(name, []).append(module)
+    return [
+        f"class {name} is in {' and '.join(held)}: two things have two names"
+        for name, held in places.items()
+        if len(held) > 1
+    ]
+
+
 def borrowed(tests: Path) -> list[str]:
     """Imports from test files of other folders, which are found only if those were read before."""
     every = {path.stem: path for path in tests.rglob("test_*.py")}

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.beyond.identified import Identified, check_bounded
+from drake_dae.dae.beyond.identified import IdentifiedTerms, check_bounded
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
@@ -122,7 +122,7 @@ class Observation:
     moving: TracedFunction
     rows: tuple[int, ...]
     frictions: dict[str, int]
-    identified: Identified
+    identified: IdentifiedTerms
 
     @classmethod
     def of(cls, structure: Structure, layout: DerivativeLayout) -> "Observation":
@@ -155,7 +155,7 @@ class Observation:
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
         signals = {"control": u, "constraint_input": v}
         function = system.trace("momentum", outputs, signals, often=False)
-        identified = Identified.of(system, others, outputs, signals)
+        identified = IdentifiedTerms.of(system, others, outputs, signals)
 
         # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]

@@ -29,7 +29,7 @@ def check_bounded(system: DaeSystem, parameters: Sequence[Parameter]) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class IdentifiedTerms:
     """The parameters theta of a system that an observer estimates, c numbers.
 
     An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
@@ -55,7 +55,7 @@ class Identified:
         parameters: tuple[Parameter, ...],
         momentum: dict[str, ca.SX],
         inputs: dict[str, ca.SX],
-    ) -> "Identified":
+    ) -> "IdentifiedTerms":
         """Derives the functions.
 
         Args:

@@ -62,7 +62,7 @@ class PhaseNeeds:
 
 
 @dataclass(frozen=True)
-class Touch:
+class TaskTouch:
     """A touch of a task.
 
     Attributes:
@@ -107,7 +107,7 @@ class TaskNeeds:
     record: Record
     parameters: FloatArray
     phases: tuple[PhaseNeeds, ...]
-    touches: tuple[Touch, ...]
+    touches: tuple[TaskTouch, ...]
     outcome: str
     problems: tuple[str, ...]
 
@@ -313,9 +313,9 @@ def _touches(
     controller: TaskController,
     scenario: Scenario,
     model: RobotModel,
-) -> tuple[list[Touch], list[str]]:
+) -> tuple[list[TaskTouch], list[str]]:
     """The touches, and the guards of the force that they may trip."""
-    touches, problems, material = list[Touch](), list[str](), scenario.plant.material
+    touches, problems, material = list[TaskTouch](), list[str](), scenario.plant.material
     task, forces = controller.task, list(controller.contact.forces)
     for before, after in () if task.plan.latches else pairwise(changes):  # Latches close at rest.
         if not after.in_contact > before.in_contact or before.place >= task.plan.last:
@@ -327,7 +327,7 @@ def _touches(
         speed = max(float(np.max(-record["distance"][last, len(forces) :])), 0.0)
         matrix = controller.law.structure.constraint_matrix(record["state"][last])
         mobility = float(np.min(np.diag(matrix)[forces]))
-        touch = Touch(
+        touch = TaskTouch(
             before.phase, float(record.time[last]), speed, 1.0 / mobility, speed / mobility
         )
         if material is not None:

@@ -100,7 +100,7 @@ class Projection:
 
 
 @dataclass(frozen=True, eq=False)
-class Reaction:
+class TracedChanges:
     """The changes of a block as functions, for exports: no Python makes them there.
 
     Attributes:
@@ -129,7 +129,7 @@ class Guard:
     computation: Computation
     react: Callable[[Context, State], EventStatus]
     in_samples: bool = False
-    reaction: Callable[[], Reaction] | None = None
+    reaction: Callable[[], TracedChanges] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ class Block:
     failure: Callable[[float, Sequence[FloatArray]], SimulationError] | None = None
 
     def with_reaction(self) -> "Block":
-        """The same block, whose updates make the changes of its guard if it has a `Reaction`."""
+        """The same block; its updates make the changes of its guard if it has `TracedChanges`."""
         if self.guard is None or self.guard.reaction is None:
             return self
         reaction = self.guard.reaction()

@@ -68,7 +68,7 @@ class Slides:
 
 
 @dataclass(frozen=True, eq=False)
-class Contacts:
+class SampledContacts:
     """The contacts at a sample, as expressions.
 
     Attributes:
@@ -149,7 +149,7 @@ class BreakAway:
         self,
         states: tuple[ca.SX, ca.SX],
         error: ca.SX,
-        contacts: Contacts,
+        contacts: SampledContacts,
         force: ca.SX,
         parameters: ca.SX,
         slides: Slides,
@@ -207,7 +207,9 @@ class BreakAway:
         noise = ca.sum1(forces**2 * self._squares).T / pressing**2
         return ca.fmax(noise, (self._least * self._period / _CLEAR) ** 2)
 
-    def _leaves(self, error: ca.SX, contacts: Contacts, distance: ca.SX, is_moved: ca.SX) -> ca.SX:
+    def _leaves(
+        self, error: ca.SX, contacts: SampledContacts, distance: ca.SX, is_moved: ca.SX
+    ) -> ca.SX:
         """1 for each contact whose displacement is no noise: as it is wanted, or in any way."""
         ahead = -ca.mtimes(contacts.towards.T, error) / contacts.pressing
         deviation = ca.sqrt(self._noise(contacts.towards, contacts.pressing))

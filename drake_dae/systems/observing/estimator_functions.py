@@ -9,7 +9,7 @@ from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.observing.break_away import BreakAway, Contacts, Slides
+from drake_dae.systems.observing.break_away import BreakAway, SampledContacts, Slides
 from drake_dae.systems.observing.estimate import Estimate
 from drake_dae.systems.observing.observed import ContactTerms, Observed, disturbance_degree
 from drake_dae.systems.observing.observer_rates import Observing
@@ -221,7 +221,7 @@ class EstimatorFunctions(Observed):
         contact: ContactTerms,
         is_unused: ca.SX,
         parameters: ca.SX,
-    ) -> tuple[ca.SX, Contacts]:
+    ) -> tuple[ca.SX, SampledContacts]:
         """The state with the wanted velocities, and the contacts for their first break-away."""
         wanted, frictions = self.observation.wanted, self.observation.frictions.values()
         assert wanted is not None
@@ -232,7 +232,7 @@ class EstimatorFunctions(Observed):
         needed = ca.fmin(-shares(*terms, push), self._observing.largest_friction)
         mu, planes = self.estimate.friction, contact.planes
         moves = forces, accelerations, towards
-        return goal, Contacts(planes, *moves, mu, needed, pressing, is_unused)
+        return goal, SampledContacts(planes, *moves, mu, needed, pressing, is_unused)
 
     def _forces(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
         """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.identified import Identified
+from drake_dae.dae.beyond.identified import IdentifiedTerms
 
 GAP = 2e-5
 """The standard deviation of a measured distance to a surface, in m."""
@@ -71,7 +71,7 @@ class Sampled:
     """A sample of the functions of a `ParameterFilter`, as expressions.
 
     Attributes:
-        momentum, drift, inputs: The derivatives of `Identified.slopes`, shape (k, c') each.
+        momentum, drift, inputs: The derivatives of `IdentifiedTerms.slopes`, shape (k, c') each.
         friction: C of the contacts that slide, zero for others, shape (k, f).
         gaps, gap_slopes: The distances in contact, shape (j, 1), and their derivatives, (j, c').
         forces: The constraint force at each of these distances, shape (j, 1).
@@ -119,7 +119,7 @@ class ParameterFilter:
 
     def __init__(
         self,
-        identified: Identified,
+        identified: IdentifiedTerms,
         start: FloatArray,
         largest_friction: float,
         size: int,

@@ -3,7 +3,14 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Computation, Reaction, Update
+from drake_dae.systems.blocks.traced import (
+    HELD,
+    PARAMETERS,
+    TIME,
+    Computation,
+    TracedChanges,
+    Update,
+)
 from drake_dae.systems.task.contacts.laws import CONTACT, FREE
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Outcome
@@ -23,13 +30,13 @@ class SampledTask(TracedTask):
     A task that ends by "fail" rests as one that ends by "hold"; its number of ENDINGS differs.
     """
 
-    def reaction(self, period: float) -> Reaction:
+    def reaction(self, period: float) -> TracedChanges:
         """The begin of the task and its update.
 
         Args:
             period: The sample period, in s.
         """
-        return Reaction(self._begun(), Update(self._advanced(), period, 0.0, True))
+        return TracedChanges(self._begun(), Update(self._advanced(), period, 0.0, True))
 
     def _begun(self) -> Computation:
         """The numbers at the start of a run, as `TaskPlanner.first`."""
