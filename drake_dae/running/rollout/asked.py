@@ -16,7 +16,12 @@ from drake_dae.running.rollout.problems import checked_times
 from drake_dae.running.rollout.program import RolloutProgram, program_of
 from drake_dae.running.rollout.run import Settings
 from drake_dae.running.rollout.stepping import machine
-from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
+from drake_dae.simulation.records.record import (
+    Record,
+    RecordAfter,
+    computed_record,
+    recorded_values,
+)
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
@@ -119,4 +124,4 @@ def record_of(
         name: recorded_values(part, tuple(columns))
         for (name, columns), part in zip(program.signals.items(), parts, strict=True)
     }
-    return program.complete(Record(times[first : len(rows)], signals), context)
+    return program.complete(computed_record(times[first : len(rows)], signals), context)
