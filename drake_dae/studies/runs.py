@@ -30,7 +30,7 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.structures import TOGETHER, Batch, built_data, study_data
+from drake_dae.studies.structures import TOGETHER, Batch, built_data, structure_key, study_data
 from drake_dae.studies.variations import Variation
 
 if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
@@ -63,11 +63,11 @@ class Runner:
         Raises:
             ScenarioError: The loop cannot be built; the message names the key.
         """
-        built = built_data(data, self._completed)
-        key = json.dumps(built, sort_keys=True)
+        key = structure_key(data, self._completed)
         if key != self._key:
             self._key, self._built, self._contexts = "", None, []
             self.builds += 1
+            built = built_data(data, self._completed)
             try:
                 self._built = build_completed(read_scenario(built))[1]
             except DrakeDaeError as error:
