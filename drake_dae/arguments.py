@@ -272,6 +272,8 @@ def _is_bool(value: Any) -> bool:
 
 
 def _is_array(value: Any, finite: bool = True) -> bool:
+    if type(value) is np.ndarray and value.dtype.kind == "f":  # The most frequent, at once.
+        return not finite or bool(np.isfinite(value).all())
     try:
         array = numbers("", value, ValueError)
     except ValueError:

@@ -1,6 +1,7 @@
 """The figures of a run as numbers, with names for tables of many runs."""
 
 from collections.abc import Iterator
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,11 @@ from drake_dae.simulation.job import late_rms
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import SLACK, Limits
 
+Rooms = list[tuple[Signal, float]]
+"""Signals that have limits, each with its distance from them."""
 
-def run_figures(record: Record, limits: Limits) -> dict[str, float]:
+
+def run_figures(record: Record, rooms: Rooms) -> dict[str, float]:
     """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
     For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
@@ -23,7 +27,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     Args:
         record: A record with tracking_error, constraint_force, control, constraint_residual and
             state; an empty one has no figures.
-        limits: The limits of the robot.
+        rooms: Its `margins`.
     """
     if not record.time.size:
         return {}
@@ -48,7 +52,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
         **figures,
         **{
             _label("margin of", signal): room
-            for signal, room in margins(record, limits)
+            for signal, room in rooms
             if _label("least", signal) not in figures  # They are equal.
         },
         "largest residual": float(residual),
@@ -56,12 +60,15 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     }
 
 
-def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
+def margins(record: Record, limits: Limits) -> Rooms:
     """The distance of each signal from its limits, in its unit; negative beyond a limit.
 
     The limit of a control is on |u|, the lower limit of a unilateral force is 0, and positions and
     velocities have two limits. An excess by round-off counts as 0, since a start may be on a limit.
+    An empty record has none.
     """
+    if not record.time.size:
+        return []
     rooms = []
     for index, (signal, largest) in enumerate(
         _each(record, "control", _largest(record["control"]))
@@ -78,14 +85,12 @@ def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:
             for (signal, least, largest), low, high in zip(extremes, *bounds, strict=False):
                 room = float(min(least - low, high - largest))
                 rooms.append((signal, 0.0 if -SLACK <= room < 0.0 else room))
-    return [(signal, room) for signal, room in rooms if np.isfinite(room)]
+    return [(signal, room) for signal, room in rooms if isfinite(room)]
 
 
-def exceeded(record: Record, limits: Limits) -> list[str]:
-    """Names of the signals beyond their limits, including negative unilateral forces."""
-    if not record.time.size:
-        return []
-    return [signal.name for signal, room in margins(record, limits) if room < 0.0]
+def exceeded(rooms: Rooms) -> tuple[str, ...]:
+    """Names of the signals beyond their limits, with negative unilateral forces, from margins."""
+    return tuple(signal.name for signal, room in rooms if room < 0.0)
 
 
 def _each(record: Record, name: str, *numbers: FloatArray) -> Iterator[tuple[Any, ...]]:
