@@ -20,7 +20,7 @@ from drake_dae.diagrams.state_feedback import MeasuredState, PacketsWithNoise
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.pictures.diagram import diagram_svg
 from drake_dae.simulation.records.afterwards import completed
-from drake_dae.simulation.records.record import Record, recorded_values
+from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -177,7 +177,7 @@ class ClosedLoop:
             values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
         derived = controller.derived(at_controller, record.time, values)
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
-        return Record(record.time, {**record.signals, **added})
+        return computed_record(record.time, {**record.signals, **added})
 
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.

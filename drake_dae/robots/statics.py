@@ -10,11 +10,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.links.links import Links
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import CONVERGED, NewtonModel, newton, norm, once, shortest_steps
-
-NEAR, SHORTER = 1.0, 0.25
-"""Full Newton steps are taken if the first, relative to the guess or to 1, is below the first of
-these, and each is shorter than the one before by the second: so damped steps would be full too."""
+from drake_dae.trace.newton import NewtonModel, newton, once, shortest_steps
 
 MOST = 1000
 """The largest product of unknowns and squared equations whose Newton step is traced."""
@@ -46,40 +42,19 @@ class StaticPlacement:
             "P": ca.jacobian(h_1, q),
         }
         rows = phi.numel() + h_1.numel()
-        self._is_led = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
+        self._is_traced = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
         self._function = TracedFunction(self._name, self._inputs, self._outputs)
 
     @cached_property
     def _step(self) -> TracedFunction:
-        """The Newton step to all outputs, the shortest one where they do not determine q."""
+        """The Newton step from any point by the matrix of q, to all outputs; the shortest one."""
         phi, h_1, J, P = self._outputs.values()
+        q, at = self._inputs["q"], ca.SX.sym("at", self._inputs["q"].numel())
         wanted = ca.SX.sym("outputs", h_1.numel())
         factors = Factorization(ca.vertcat(J, P).T)
-        step = factors.shortest(ca.vertcat(phi, h_1 - wanted))
-        return TracedFunction(
-            self._name, {**self._inputs, "outputs": wanted}, {"step": -step}, factors.pivot
-        )
-
-    def _led(self, guess: FloatArray, *arguments: FloatArray) -> FloatArray | None:
-        """The solution to which full Newton steps lead; None if they may have to be shortened.
-
-        Args:
-            guess: Where to start, shape (nq,).
-            arguments: Those of the function of the step after q.
-        """
-        q, unit, last = guess, np.maximum(1.0, np.abs(guess)), NEAR / SHORTER
-        while True:
-            step = self._step.evaluate(q, *arguments)[0]
-            if not self._step.is_valid:
-                return None
-            length = norm(step / unit)
-            if length <= CONVERGED and not length < 0.5 * last:
-                return q  # What is left is round-off.
-            if not length <= SHORTER * last:
-                return None
-            q, last = q + step, length
-            if not length:
-                return q
+        step = factors.shortest(ca.substitute(ca.vertcat(phi, h_1 - wanted), q, at))
+        inputs = {**self._inputs, "outputs": wanted, "at": at}
+        return TracedFunction(self._name, inputs, {"step": -step}, factors.pivot)
 
     def solve(
         self,
@@ -97,11 +72,7 @@ class StaticPlacement:
             of_outputs: The same for h_1.
         """
         count = outputs.size
-        if self._is_led and count == self._outputs["h_1"].numel():
-            found = self._led(guess, parameters, of_outputs, outputs)
-            if found is not None:
-                phi, h_1, _, _ = self._function(found, parameters, of_outputs)
-                return found, np.concatenate([phi, h_1 - outputs])
+        is_traced = self._is_traced and count == self._outputs["h_1"].numel()
         evaluated = once(lambda q: self._function(q, parameters, of_outputs))
 
         def residual(q: FloatArray) -> FloatArray:
@@ -109,6 +80,11 @@ class StaticPlacement:
             return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
         def linearize(q: FloatArray) -> NewtonModel | None:
+            if is_traced:
+                given = q, parameters, of_outputs, outputs
+                self._step.evaluate(*given, q)
+                if self._step.is_valid:
+                    return NewtonModel(lambda x: self._step.evaluate(*given, x)[0].copy(), True)
             _, _, J, P = evaluated(q)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)

@@ -25,12 +25,14 @@ from drake_dae.systems.task import phases
 
 
 def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's plain data with other values at dotted keys.
+    """A scenario's plain data with other values at dotted keys; parts without changes are shared.
 
     Raises:
         ScenarioError: There is no such place.
     """
-    varied: dict[str, Any] = pickle.loads(pickle.dumps(dict(data)))  # Thrice as fast as deepcopy.
+    varied = dict(data)
+    for part in {key.partition(".")[0] for key in changes} & varied.keys():
+        varied[part] = pickle.loads(pickle.dumps(varied[part]))  # Thrice as fast as deepcopy.
     for key, value in changes.items():
         put_entry(varied, key, value, scenario_reader().free_names)
     return varied

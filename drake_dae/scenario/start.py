@@ -27,8 +27,8 @@ _TURNS = np.array([0.0, -1.0, 1.0])
 """The whole turns that are tried, relative to the number of turns nearest to a guess."""
 
 
-def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
-    """A new context of a closed loop at a scenario's start.
+def start_scenario(scenario: Scenario, loop: ClosedLoop, unused: Context | None = None) -> Context:
+    """A context of a closed loop at a scenario's start.
 
     The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
     references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
@@ -39,11 +39,13 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
         loop: What `build_completed` made.
+        unused: A context of the loop with its defaults, which becomes the result; None for a new
+            one, which takes Drake up to a millisecond.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    context = loop.diagram.CreateDefaultContext()
+    context = loop.diagram.CreateDefaultContext() if unused is None else unused
     if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
         with at("integrator.start_time"):
             raise ModelError(

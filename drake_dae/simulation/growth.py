@@ -1,6 +1,7 @@
 """States, controls and errors beside their sizes: whether they leave all measure."""
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Self
 
 import numpy as np
@@ -35,9 +36,9 @@ Sizes = dict[str, float]
 def with_sizes(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
     """The largest numbers in each unit, of these sizes and of further values."""
     merged = dict(sizes)
-    for signal, value in zip(signals, values, strict=False):
-        if np.isfinite(value):
-            merged[signal.unit] = max(merged.get(signal.unit, 0.0), abs(float(value)))
+    for signal, value in zip(signals, values.tolist(), strict=False):
+        if isfinite(value):
+            merged[signal.unit] = max(merged.get(signal.unit, 0.0), abs(value))
     return merged
 
 

@@ -25,12 +25,12 @@ from drake_dae.errors import (
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import exceeded, run_figures
+from drake_dae.simulation.figures import exceeded, margins, run_figures
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.structures import TOGETHER, Batch, built_data, study_data
+from drake_dae.studies.structures import TOGETHER, Batch, built_data, structure_key, study_data
 from drake_dae.studies.variations import Variation
 
 if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
@@ -54,6 +54,7 @@ class Runner:
         self._lasting = lasting
         self._key, self._read = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
+        self._contexts: list[Context] = []
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
@@ -62,11 +63,11 @@ class Runner:
         Raises:
             ScenarioError: The loop cannot be built; the message names the key.
         """
-        built = built_data(data, self._completed)
-        key = json.dumps(built, sort_keys=True)
+        key = structure_key(data, self._completed)
         if key != self._key:
-            self._key, self._built = "", None
+            self._key, self._built, self._contexts = "", None, []
             self.builds += 1
+            built = built_data(data, self._completed)
             try:
                 self._built = build_completed(read_scenario(built))[1]
             except DrakeDaeError as error:
@@ -80,7 +81,7 @@ class Runner:
     def limits(self) -> Limits:
         """The limits of the robot whose loop was built last."""
         assert isinstance(self._built, ClosedLoop)
-        return Limits.of(self._built.plant.robot("a study"))
+        return _limits(self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """Returns the error in the keys and values of a variation; None if there is none.
@@ -136,8 +137,11 @@ class Runner:
                 self._timed(number, 0.0, self._start, number, variation)
                 for number, variation in batch[first : first + size]
             ]
-            self._roll_together([run for run in started if isinstance(run, _StartedRun)])
+            rolled = [run for run in started if isinstance(run, _StartedRun)]
+            self._roll_together(rolled)
             yield from started
+            if self._lasting is not None:
+                self._contexts += [run.context for run in rolled if run.loop is self._built]
 
     def _timed(
         self, number: int, before: float, function: Callable[..., Any], *arguments: Any
@@ -162,9 +166,21 @@ class Runner:
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
         try:
-            return _StartedRun(number, scenario, loop, start_scenario(scenario, loop))
+            context = start_scenario(scenario, loop, self._unused(loop))
         except DrakeDaeError as error:
             return _not_started(number, error)
+        return _StartedRun(number, scenario, loop, context)
+
+    def _unused(self, loop: ClosedLoop) -> Context:
+        """A context of a loop with its defaults: one of an earlier rollout, or a new one."""
+        if not self._contexts:
+            self._contexts = [loop.diagram.CreateDefaultContext()]
+        default = self._contexts[0]
+        if len(self._contexts) == 1:
+            return loop.diagram.CreateDefaultContext()
+        unused = self._contexts.pop()
+        unused.SetTimeStateAndParametersFrom(default)
+        return unused
 
     def _roll_together(self, started: Sequence["_StartedRun"]) -> None:
         """Computes the rollouts of runs with the same loop together; failed ones stay None."""
@@ -204,8 +220,8 @@ class Runner:
         number, bound = run.number, run.scenario.error_bound
         try:
             record, steps, failure = self._recorded(run)
-            limits = Limits.of(run.loop.plant.robot("a study"))
-            figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
+            rooms = margins(record, _limits(run.loop))
+            figures, beyond = run_figures(record, rooms), exceeded(rooms)
             if bound is not None and record.time.size:
                 figures |= bound.figures(record)
         except DrakeDaeError as error:
@@ -231,6 +247,13 @@ class _StartedRun:
     context: Context
     rollout: "Rollout | None" = None
     seconds: float = 0.0
+
+
+def _limits(loop: ClosedLoop) -> Limits:
+    """The limits of the robot of a loop."""
+    if "limits" not in loop.memory:
+        loop.memory["limits"] = Limits.of(loop.plant.robot("a study"))
+    return cast(Limits, loop.memory["limits"])
 
 
 def _not_started(number: int, error: DrakeDaeError) -> RunResult:

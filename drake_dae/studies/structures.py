@@ -20,6 +20,8 @@ TOGETHER = 32
 _OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
 """The keys of a scenario that the closed loop does not depend on."""
 
+_text = json.JSONEncoder(sort_keys=True).encode
+
 Batch = Sequence[tuple[int, Variation]]
 """(number, variation) of runs with one structure."""
 
@@ -55,9 +57,13 @@ def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
     """Returns a text that is equal for scenarios that the same closed loop can simulate.
 
     Such scenarios differ only in settings of the run and in data of a context: start, parameters of
-    the plant, uncoupled gains, seed.
+    the plant, uncoupled gains, seed. The text has the parts that are not those of the base.
     """
-    return json.dumps(built_data(data, base), sort_keys=True)
+    own = {}
+    for name, part in built_data(data, base).items():
+        if part is not base[name] and (text := _text(part)) != _text(base[name]):
+            own[name] = text
+    return _text(own)
 
 
 def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:

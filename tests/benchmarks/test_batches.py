@@ -18,6 +18,7 @@ from drake_dae import (
     start_values,
 )
 from drake_dae.running.rollout import rollout as module
+from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import scenario_data
 from drake_dae.studies.runs import Runner
 
@@ -42,8 +43,10 @@ def in_turn(calls, rounds=15):
     return best
 
 
-def problem(name, *settings):
+def problem(name, *settings, rolled=False):
     chosen = scenario(name, *settings)
+    if rolled:
+        chosen, _ = for_rollout(chosen)
     loop, context = build_scenario(chosen)
     return (loop, *start_values(loop, context)), chosen.integrator
 
@@ -71,6 +74,30 @@ def test_steps_side_by_side(robot, options, wanted, monkeypatch, report):
     goal = f" (>{wanted / 1e6:g})" if robot == "seven_joint_wall" else ""
     ratio = f"{lanes / 1e6:.2f}, x {lanes / scalar:.1f}{goal}"
     report(f"{robot}: million 1 ms steps a second of a core, {what}", {"side by side": ratio})
+
+
+@pytest.mark.parametrize("name", ["wall_point_contact", "wall_flexible_contact"])
+def test_contact_beside_real_time(name, report):
+    """2 s each of an arm on Drake's contact, traced, with law and observer at 1 kHz."""
+    (loop, start, parameters), config = problem(name, "duration=2", rolled=True)
+    times = np.linspace(0.0, 2.0, 2001)
+
+    def run(count):
+        starts = np.tile(start, (count, 1))
+        found = rollout(loop, starts, parameters, times, config=config, compiled=True)
+        assert all(each.failure is None for each in found)
+
+    calls = {"lanes": lambda: run(16), "scalar": lambda: run(2)}
+    for call in calls.values():
+        call()
+    seconds = in_turn(calls, 4)
+    report(
+        f"{name}: times real time a core, all rows recorded",
+        {
+            "16 side by side": f"{16 * 2.0 / seconds['lanes']:.0f} (>500)",
+            "alone": f"{2 * 2.0 / seconds['scalar']:.0f}",
+        },
+    )
 
 
 def test_ten_thousand_short_runs(report):

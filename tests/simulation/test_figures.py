@@ -31,7 +31,7 @@ LIMITS = Limits(
 
 
 def test_figures_by_hand():
-    assert run_figures(RECORD, LIMITS) == {
+    assert run_figures(RECORD, margins(RECORD, LIMITS)) == {
         "largest error of z [m]": 0.3,
         "final error of z [m]": 0.05,
         "late error of z [m]": pytest.approx(np.sqrt((0.3**2 - 0.3 * 0.05 + 0.05**2) / 3)),
@@ -54,7 +54,7 @@ def test_figures_by_hand():
 
 def test_what_left_its_limits():
     """A force that pulls, a joint beyond; round-off on a limit is none."""
-    assert exceeded(RECORD, LIMITS) == ["wall.force", "q1"]
+    assert exceeded(margins(RECORD, LIMITS)) == ("wall.force", "q1")
     assert [signal.name for signal, _ in margins(RECORD, Limits(pushing=frozenset()))] == []
 
 
@@ -66,5 +66,5 @@ def test_an_empty_record_has_none():
             for name, values in RECORD.signals.items()
         },
     )
-    assert run_figures(empty, LIMITS) == {}
-    assert exceeded(empty, LIMITS) == []
+    assert margins(empty, LIMITS) == []
+    assert run_figures(empty, []) == {}

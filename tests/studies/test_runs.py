@@ -11,7 +11,7 @@ from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import run_figures
+from drake_dae.simulation.figures import margins, run_figures
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.processes import next_place
 from drake_dae.studies.results import Outcome, RunResult
@@ -47,7 +47,7 @@ def alone(base, changes):
     """The figures of a variation in a closed loop of its own."""
     chosen = read_scenario(varied_data(base, changes))
     loop, _, record = run_scenario(chosen)
-    return run_figures(record, Limits.of(loop.plant.model))
+    return run_figures(record, margins(record, Limits.of(loop.plant.model)))
 
 
 def check(base, changes, result, tolerance=0.0):

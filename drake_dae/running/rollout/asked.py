@@ -9,14 +9,19 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.rollout.lanes import library as lanes
 from drake_dae.running.rollout.problems import checked_times
 from drake_dae.running.rollout.program import RolloutProgram, program_of
 from drake_dae.running.rollout.run import Settings
 from drake_dae.running.rollout.stepping import machine
-from drake_dae.simulation.records.record import Record, RecordAfter, recorded_values
+from drake_dae.simulation.records.record import (
+    Record,
+    RecordAfter,
+    computed_record,
+    recorded_values,
+)
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
@@ -113,10 +118,8 @@ def record_of(
 ) -> Record:
     """Returns the record of a run, or of its rows after a time in s."""
     first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
-    stops = np.cumsum([len(signals) for signals in program.signals.values()])
-    parts = np.split(rows[first:], stops[:-1], axis=1)
-    signals = {
-        name: recorded_values(part, tuple(columns))
-        for (name, columns), part in zip(program.signals.items(), parts, strict=True)
-    }
-    return program.complete(Record(times[first : len(rows)], signals), context)
+    columns, stop, signals = by_columns(rows[first:]), 0, {}
+    for name, entries in program.signals.items():
+        start, stop = stop, stop + len(entries)
+        signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
+    return program.complete(computed_record(times[first : len(rows)], signals), context)

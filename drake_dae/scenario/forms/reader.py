@@ -10,7 +10,7 @@ import pydantic
 from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.forms.forms import Form, ReadingContext
-from drake_dae.scenario.forms.problems import problem, with_parts
+from drake_dae.scenario.forms.problems import problem
 
 T = TypeVar("T")
 
@@ -30,7 +30,8 @@ class Reader(Generic[T]):
     @cached_property
     def free_names(self) -> set[str]:
         """Dotted keys of the dictionaries with any names; "*" is any entry of a list."""
-        return set(_free_names(self.schema, ""))
+        # The schema of pydantic: the JSON Schema takes longer than a short run.
+        return set(_free_names(self._adapter.core_schema, ""))
 
     def read(self, data: Any, folder: Path | None = None, known: dict[Any, Any] | None = None) -> T:
         """Makes the dataclass of plain data.
@@ -75,11 +76,20 @@ def _unwritable(data: Any, key: str) -> Iterator[str]:
 
 
 def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
-    schema = with_parts(schema)
-    if isinstance(schema.get("additionalProperties"), dict):
+    """The dotted keys below a path whose data are dictionaries with any names."""
+    if schema["type"] == "dict":
         yield path
-    for member in schema.get("oneOf", ()):
-        yield from _free_names(member, path)
-    inside = {"*": schema["items"]} if isinstance(schema.get("items"), dict) else {}
-    for name, inner in {**schema.get("properties", {}), **inside}.items():
-        yield from _free_names(inner, f"{path}.{name}" if path else name)
+    elif schema["type"] == "list":
+        yield from _free_names(schema.get("items_schema", {"type": "any"}), _below(path, "*"))
+    elif schema["type"] == "typed-dict":
+        for name, field in schema["fields"].items():
+            yield from _free_names(field["schema"], _below(path, name))
+    elif schema["type"] == "tagged-union":
+        for member in schema["choices"].values():
+            yield from _free_names(member, path)
+    elif "schema" in schema:  # A nullable value, a check.
+        yield from _free_names(schema["schema"], path)
+
+
+def _below(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name

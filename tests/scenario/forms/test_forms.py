@@ -14,6 +14,7 @@ from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.reader import Reader
 from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml, set_entry
 from drake_dae.scenario.forms.values import Numbers, Triple
+from drake_dae.scenario.scenario import scenario_reader
 
 
 class Surface:
@@ -170,3 +171,35 @@ def test_the_json_schema_knows_tags():
     assert bowl["properties"]["_tag"]["const"] == "!Bowl"
     assert "_tag" not in bowl.get("required", [])
     assert set(cone["required"]) == {"_tag", "apex"}
+
+
+def test_names_are_free_where_the_json_schema_allows_any_key():
+    def free(schema, path):
+        if schema.get("additionalProperties"):
+            yield ".".join(path)
+        some = [inner for inner in schema.get("anyOf", []) if inner.get("type") != "null"]
+        for inner in [*(some if len(some) == 1 else []), *schema.get("oneOf", [])]:
+            yield from free(inner, path)
+        if isinstance(schema.get("items"), dict):
+            yield from free(schema["items"], [*path, "*"])
+        for name, inner in schema.get("properties", {}).items():
+            yield from free(inner, [*path, name])
+
+    reader = scenario_reader()
+    assert {"references", "task.phases.*.direction"} < reader.free_names
+    assert reader.free_names == set(free(reader.schema, []))
+
+
+def test_a_class_at_several_places_has_the_tag_and_the_defaults_of_each():
+    @dataclass
+    class Places:
+        plain: Cone
+        steep: Annotated[Cone, Form(defaults={"angle": 80.0})]
+        chosen: Surfaces
+
+    apex = "apex: [1, 2, 3]"
+    text = f"plain: {{{apex}, angle: 5}}\nsteep: {{{apex}}}\nchosen: !Funnel {{{apex}}}"
+    made = Reader(Places).read(load_yaml(text, "text"))
+    assert (made.plain.angle, made.steep.angle, made.chosen.angle) == (5.0, 80.0, 30.0)
+    with pytest.raises(ScenarioError, match="takes no tag"):
+        Reader(Places).read(load_yaml(text.replace("steep: ", "steep: !Funnel "), "text"))

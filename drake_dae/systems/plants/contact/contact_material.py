@@ -110,7 +110,10 @@ class PointMaterial:
         stiffness: The stiffness of point contact, N/m.
         dissipation: The Hunt-Crossley dissipation, s/m.
         friction: The coefficient of friction of all contacts; None for those of the constraints.
-        stiction_tolerance: v_s of Drake's regularized friction, m/s.
+        stiction_tolerance: v_s of Drake's regularized friction, m/s. In a continuous plant, fixed
+            steps of an explicit scheme must not exceed m v_s / (mu f_n), with the mass m that
+            slides and the normal force f_n: the slope of friction over velocity is 15/8 mu f_n /
+            v_s, and the velocity of a point that sticks would alternate from step to step.
         radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
             constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
             radius.

@@ -292,6 +292,19 @@ def test_creep_at_half_the_friction_limit_tells_the_two_laws_apart():
         assert_allclose(state[2], share * tolerance, rtol=1e-8)
 
 
+@pytest.mark.parametrize("steps", [1.0, 2.0])
+def test_friction_settles_with_fixed_steps_up_to_m_v_s_by_mu_f_n(steps):
+    """Where step5 is steepest; the step is 15/8 of the time constant of friction, or 15/4.
+
+    Explicit schemes are stable up to 2.0 (Euler) to 3.3 (this one). Each of 1,000 steps takes an
+    error to a fifth, down to round-off, or lets it grow until friction is less steep.
+    """
+    tolerance = 1e-4 * 5.0 / 2.1 / steps
+    state = run_sled(0.0, 2.5, 0.1, stiction_tolerance=tolerance)
+    off = abs(state[2] - 0.5 * tolerance) / tolerance
+    assert off < 1e-8 if steps == 1.0 else off > 0.05, off
+
+
 def test_steps_tend_to_the_continuous_motion_at_first_order():
     """Sliding at 1.5 times the limit, where both laws of friction are full from 0.1 s on."""
     exact = 0.1 * (7.5 - 5.0) / 2.1
