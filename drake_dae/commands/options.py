@@ -279,9 +279,9 @@ def _add_pictures(commands: Any, scenario: CommandParser) -> None:
         "outputs)",
     )
     plot.flag("--errors", "|z - r| of outputs, over the predicted one")
-    plot.path(
-        "--out",
-        "a .png, .pdf or .svg (default: plot.png)",
-        metavar="FILE",
-        default=Path("plot.png"),
+    plot.flag(
+        "--all",
+        "all plots of each run, into its folder: outputs, errors, constraint residual, controls, "
+        "paths, as write.plots=true does in a run",
     )
+    plot.path("--out", "a .png, .pdf or .svg (default: plot.png)", metavar="FILE")

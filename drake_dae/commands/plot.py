@@ -1,22 +1,35 @@
 """`drake-dae plot`, `render` and `diagram`: pictures of recorded runs, and of a loop's blocks."""
 
 import argparse
+import sys
 from pathlib import Path
 
+from pydrake.systems.framework import Context
+
+from drake_dae.commands.run.files import RunFiles
 from drake_dae.commands.run.folder import FILM, SCENARIO, load_run, runs_by_name, stage
+from drake_dae.commands.run.report import report_run
+from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.pictures.diagram import save_diagram
 from drake_dae.pictures.film import save_film
+from drake_dae.pictures.plots import PLOTS
+from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.parts.parts import Write
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.simulation.records.record import Record
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Draws or renders what the options name; returns the exit code."""
+    if options.command == "plot" and options.all:
+        return _plot_all(options)
     draw = {"render": _render, "plot": _plot, "diagram": _diagram}[options.command]
     path = draw(options)
     print(f"written to {path}")
@@ -26,14 +39,41 @@ def run_command(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> Path:
     """Films the run in a folder."""
     folder: Path = options.folder
-    if not (folder / SCENARIO).is_file():
-        raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
-    record = load_run(folder)
-    loop, context = build_scenario(load_scenario(folder / SCENARIO, []))
+    _, loop, context, record = _run_again(folder)
     path: Path = options.out or folder / FILM
     with stage(path.parent, path.name) as temporary:
         save_film(loop, record, context, temporary / path.name)
     return path
+
+
+def _run_again(folder: Path) -> tuple[Scenario, ClosedLoop, Context, Record]:
+    """The scenario of the run in a folder, its loop, a context, and the record of the run.
+
+    Raises:
+        ModelError: The folder has no scenario or no record.
+    """
+    if not (folder / SCENARIO).is_file():
+        raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
+    record = load_run(folder)
+    scenario = load_scenario(folder / SCENARIO, [])
+    return scenario, *build_scenario(scenario), record
+
+
+def _plot_all(options: argparse.Namespace) -> int:
+    """Draws the plots of runs into their folders; returns the exit code."""
+    if options.signals or options.errors or options.out is not None:
+        raise ModelError("--all draws all plots of each run, without --signals, --errors or --out")
+    problems = []
+    for folder in runs_by_name(options.runs).values():
+        scenario, loop, context, record = _run_again(folder)
+        files, wanted = RunFiles(folder), Write(plots=True, animation=False)
+        files.write_pictures(report_run(scenario, loop, context, record), loop, context, wanted)
+        problems += files.problems
+        written = [name for name in (*PLOTS, PROFILE) if (folder / name).exists()]
+        print(f"written to {folder}/: {', '.join(written)}")
+    for line in problems:
+        print(f"error: {line}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 def _diagram(options: argparse.Namespace) -> Path:
@@ -48,7 +88,7 @@ def _diagram(options: argparse.Namespace) -> Path:
 
 def _plot(options: argparse.Namespace) -> Path:
     """Draws signals of runs over each other."""
-    path: Path = options.out
+    path: Path = options.out or Path("plot.png")
     if path.suffix not in SUFFIXES:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
     records = {name: load_run(run) for name, run in runs_by_name(options.runs).items()}

@@ -32,6 +32,7 @@ from drake_dae.commands.run.folder import (
 from drake_dae.commands.run.report import RunReport, report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
@@ -253,7 +254,9 @@ def _print_report(report: RunReport, files: RunFiles) -> list[str]:
         where = f"written to {folder}/: {', '.join(written)}"
         _print(f"{verdict}\n\n{report.text}\n{where}", sys.stdout)
         if ANIMATION in written:
-            _print(f"watch it: drake-dae play {shlex.quote(str(folder))}", sys.stdout)
+            named = shlex.quote(str(folder))
+            drawn = "" if PLOTS[0] in written else f"; plots: drake-dae plot {named} --all"
+            _print(f"watch it: drake-dae play {named}{drawn}", sys.stdout)
     with suppress(OSError):
         _print("".join(f"error: {line}\n" for line in files.problems), sys.stderr)
     return written

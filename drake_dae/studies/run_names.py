@@ -48,6 +48,7 @@ def rerun_commands(made: Sequence[str], variations: Sequence[Variation], folder:
             [
                 *made,
                 *(part for item in changes.items() for part in ("--set", setting(*item))),
+                *("--set", "write.plots=true"),
                 *("--out", str(folder / f"run{number}")),
             ]
         )

@@ -20,12 +20,14 @@ from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures.plots import PATHS, PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 
+PLOTTED = "write.plots=true"
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The default scenario, as `make demo` runs it except for its length."""
+    """The default scenario, as `make demo` runs it except for its length, and with plots."""
     folder = tmp_path_factory.mktemp("demo") / "run"
-    process = command("simulate", "--out", folder, "--set", "duration=2")
+    process = command("simulate", "--out", folder, "--set", "duration=2", "--set", PLOTTED)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     return folder, out, err
@@ -84,7 +86,8 @@ def test_the_page_holds_the_animation(demo):
 )
 def test_a_closed_loop_of_links(name, link, force, tmp_path, capsys):
     """Without a surface there is none to draw, but the force that closes the loop is."""
-    assert main(["simulate", name, "--out", str(tmp_path), "--set", "duration=0.5"]) == 0
+    short = ["--set", "duration=0.5", "--set", PLOTTED]
+    assert main(["simulate", name, "--out", str(tmp_path), *short]) == 0
     files = sorted(path.name for path in tmp_path.iterdir())
     assert files == sorted({*FILES} - {PATHS})  # Nothing moves on a surface.
     tracks = animation((tmp_path / "animation.html").read_text())
@@ -103,7 +106,9 @@ def test_the_scenario_as_run_gives_the_same_record(demo, tmp_path):
     assert path.read_text().splitlines()[0] == (
         f"# Scenario as run by drake-dae {drake_dae.__version__}"
     )
-    assert load_scenario(path) == load_scenario(find_scenario(DEFAULT_SCENARIO), ["duration=2"])
+    assert load_scenario(path) == load_scenario(
+        find_scenario(DEFAULT_SCENARIO), ["duration=2", PLOTTED]
+    )
     assert main(["simulate", str(path), "--out", str(tmp_path), *QUICK]) == 0
     first, second = (Record.load(p / "record.npz") for p in (folder, tmp_path))
     np.testing.assert_array_equal(first.time, second.time)
@@ -189,7 +194,7 @@ def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     """The run would last a minute; it is interrupted as soon as it has begun its record."""
     process = command(
         *("simulate", "two_link_wall", "--out", tmp_path / "run"),
-        *("--set", "duration=60", "--set", "integrator.target_realtime_rate=1"),
+        *("--set", "duration=60", "--set", "integrator.target_realtime_rate=1", "--set", PLOTTED),
     )
     assert process.stdout.readline().startswith("two_link_wall: built")
     limit = time.monotonic() + 60

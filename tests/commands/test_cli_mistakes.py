@@ -143,7 +143,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(Figure, "savefig", fill)
     monkeypatch.setattr(files, "animate", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
-    assert main(arguments) == 1
+    assert main([*arguments, "--set", "write.plots=true"]) == 1
     out, err = capsys.readouterr()
     assert "simulated            5 s in" in out
     lines = err.splitlines()

@@ -142,7 +142,9 @@ def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
 def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
     moments, signals = random.Random(13), (*ENDING_SIGNALS, signal.SIGKILL)
     chosen = [(sent, moments.uniform(0.1, 2.2 * SECONDS)) for sent in 3 * signals]
-    counts = [check(*found, undisturbed) for found in interrupted(chosen, tmp_path)]
+    counts = [
+        check(*found, undisturbed) for found in interrupted(chosen, tmp_path, ("write.plots=true",))
+    ]
     assert len(set(counts)) > 3
 
 

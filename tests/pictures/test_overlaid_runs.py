@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from runs import scenario
 
 from drake_dae import Record, build_scenario, simulate
@@ -118,6 +119,10 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["plot", *folders, "--errors"]) == 0
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["plot", *folders, "--all"]) == 0
+    assert "one/: outputs.png, errors.png, residual.png, controls.png, path.png" in (
+        capsys.readouterr().out
+    )
     record = str(tmp_path / "one" / "record.npz")
     assert main(["plot", record, "--signals=wall.force,control", "--out=a.svg"]) == 0
     assert "<svg" in (tmp_path / "a.svg").read_text()
@@ -125,12 +130,43 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     for arguments, said in (
         ([folders[0], "--out=a.txt"], "a plot is a .png, .pdf or .svg, got 'a.txt'"),
         ([folders[0], folders[0]], "a run is named twice"),
+        ([*folders, "--all", "--errors"], "without --signals, --errors or --out"),
+        ([record, "--all"], "is no folder of a run: it has no scenario.yaml"),
         ([str(tmp_path)], "is no folder of a run: it has no record.npz"),
         (["nothing"], "nothing is not a record of a run: No such file or directory"),
         ([folders[0], "--signals=tool.x"], "no signal 'tool.x'; did you mean 'tool."),
     ):
         assert main(["plot", *arguments]) == 1
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_plots_of_a_run_are_the_same_later(tmp_path):
+    """With the events of its contact, an impact among them."""
+    short = ["simulate", "wall_bounce", "--set=duration=1", "--set=write.animation=false"]
+    folders = [tmp_path / name for name in ("at_once", "later")]
+    for folder, plots in zip(folders, ("true", "false"), strict=True):
+        assert main([*short, f"--set=write.plots={plots}", f"--out={folder}"]) == 0
+    assert not [*folders[1].glob("*.png")]
+    assert main(["plot", "--all", str(folders[1])]) == 0
+    pictures = sorted(folders[0].glob("*.png"))
+    assert len(pictures) >= 4
+    for picture in pictures:
+        assert (folders[1] / picture.name).read_bytes() == picture.read_bytes()
+
+
+@pytest.mark.slow
+def test_plots_that_cannot_be_written_are_told(tmp_path, monkeypatch, capsys):
+    def fill(*_arguments, **_options):
+        raise OSError(28, "No space left on device")
+
+    bare = ("--set=duration=0.05", "--set=write.animation=false")
+    assert main(["simulate", "two_link_wall", *bare, f"--out={tmp_path}"]) == 0
+    monkeypatch.setattr(Figure, "savefig", fill)
+    capsys.readouterr()
+    assert main(["plot", "--all", str(tmp_path)]) == 1
+    said = f"error: {tmp_path}/outputs.png: No space left on device\n"
+    assert capsys.readouterr().err == said
 
 
 def test_a_notebook_shows_figures_and_loops(monkeypatch):

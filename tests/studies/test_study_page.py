@@ -102,7 +102,8 @@ def test_a_sweep_writes_the_page_and_its_commands_run(tmp_path, monkeypatch, cap
     command = shlex.split(said["again"][1])
     assert command[0] == "drake-dae"
     assert main(command[1:]) == 0
-    assert (tmp_path / "s" / "run1" / "animation.html").exists()
+    for name in ("animation.html", "outputs.png"):
+        assert (tmp_path / "s" / "run1" / name).exists()
     errors = load_scenario(tmp_path / "s" / "run1" / "scenario.yaml").start.errors
     assert errors["tool.z"] == 0.02
     capsys.readouterr()
@@ -117,7 +118,8 @@ def test_a_study_of_a_scenario_says_how_its_runs_are_made_again(tmp_path):
     assert said["duration"] == 0.1
     words = shlex.split(said["again"][1])
     assert words[:4] == ["drake-dae", "simulate", str(tmp_path / "scenario.yaml"), "--rollout"]
-    assert words[4:] == ["--set", "start.errors.tool.z=0.02", "--out", str(tmp_path / "run1")]
+    assert words[4:6] == ["--set", "start.errors.tool.z=0.02"]
+    assert words[6:] == ["--set", "write.plots=true", "--out", str(tmp_path / "run1")]
     again = load_scenario(words[2], [words[5]])
     assert (again.duration, again.start.errors["tool.z"]) == (0.1, 0.02)
     assert again.references.keys() == given.references.keys()

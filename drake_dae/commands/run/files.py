@@ -68,7 +68,7 @@ class RunFiles:
             (temporary / name).write_text(text, encoding="utf-8")
 
     def write_pictures(
-        self, report: RunReport, loop: ClosedLoop, context: Context, wanted: Write, title: str
+        self, report: RunReport, loop: ClosedLoop, context: Context, wanted: Write, title: str = ""
     ) -> None:
         """Writes the plots, the profiles of time-optimal references, and the animation."""
         record, limits = report.record, report.limits

@@ -58,7 +58,7 @@ def report_run(
     loop: ClosedLoop,
     context: Context,
     record: Record,
-    statistics: RunStatistics | None,
+    statistics: RunStatistics | None = None,
     failure: str = "",
 ) -> RunReport:
     """Judges a run by its record.
@@ -68,7 +68,7 @@ def report_run(
         loop: The loop that ran.
         context: The context of the loop at the end of the run.
         record: The record of the run, of at least one time.
-        statistics: The statistics of the run; None for a failed run.
+        statistics: The statistics of the run; None for a failed run, or one of an earlier time.
         failure: The reason of the failure.
     """
     model, config = loop.plant.model, scenario.integrator

@@ -304,10 +304,11 @@ class Write:
 
     Attributes:
         record: Whether it writes record.npz, all signals at all times.
-        plots: Whether it writes plots.
+        plots: Whether it writes plots, as `drake-dae plot FOLDER --all` does at any later time.
+            Drawing takes about as long as all else of a short run.
         animation: Whether it writes animation.html, which plays in a browser.
     """
 
     record: bool = True
-    plots: bool = True
+    plots: bool = False
     animation: bool = True
