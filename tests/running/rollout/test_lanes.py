@@ -187,6 +187,9 @@ OPERATIONS = ca.vertcat(
     ca.if_else(ca.logic_and(a > 0, ca.logic_or(b > 1, ca.logic_not(c > 0))), P[0] * b, P[1]),
     ca.if_else(a > 0, ca.sqrt(a), 0),
     *(ca.sin(1e4 * a), ca.cos(1e4 * a), ca.sin(1e7 * a), ca.cos(1e7 * a), 3.0),
+    *(ca.sin(2e8 * a), ca.cos(2e8 * a), a / ca.sqrt(b + 1), ca.sqrt(b + 1), 1 / ca.sqrt(b + 3)),
+    *(b / ca.sqrt(ca.fmax(a, 0)), ca.sqrt(ca.fmax(a, 0)), b / ca.sqrt(b / ca.fmax(a, 0))),
+    *(b / ca.sqrt(1e300 * b), b / ca.sqrt(1e-320 * b)),
 )
 ENTRY = """
 __attribute__((visibility("default"))) int evaluate(const double *x, const double *p, double *r) {
@@ -196,13 +199,29 @@ __attribute__((visibility("default"))) int evaluate(const double *x, const doubl
     for (i = 0; i < 3; i++) LANE(own[i], lane) = x[3 * lane + i];
     for (i = 0; i < 2; i++) LANE(shared[i], lane) = p[i];
   }
-  operations(own, shared, found);
+  const mask far = operations(own, shared, found);
+  for (lane = 0; lane < LANES; lane++) r[ROWS * LANES + lane] = LANE(far, lane) ? 1.0 : 0.0;
   for (lane = 0; lane < LANES; lane++) {
     for (i = 0; i < ROWS; i++) r[ROWS * lane + i] = LANE(found[i], lane);
   }
   return LANES;
 }
 """
+
+
+@pytest.mark.slow
+def test_angles_that_are_too_large_for_the_lanes_are_no_less_accurate(monkeypatch):
+    """A reference of 1e18 rad/s, whose acceleration of 1 m/s^2 the torques have.
+
+    Runs side by side take angles up to 5e8 rad, and are continued alone from 5e-10 s on.
+    """
+    settings = ["references.tool.z.amplitudes=[1.0e-36]", "references.tool.z.frequencies=[1.0e+18]"]
+    loop, chosen, starts, rows = problem("two_link_wall", *FIXED, *settings)
+    found = both_ways(
+        monkeypatch, loop, starts, rows, np.linspace(0.0, 0.02, 5), config=chosen.integrator
+    )
+    assert np.ptp(found[0][0].record["desired_output"]) > 0.0
+    assert_same(*found, 1e-13)
 
 
 @pytest.mark.parametrize("first", [0, 3])
@@ -238,6 +257,10 @@ def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
     assert str(slow.failure) == str(ours[first].failure)
 
 
+def given_of(*arrays):
+    return [each.ctypes.data_as(ctypes.c_void_p) for each in arrays]
+
+
 @pytest.mark.parametrize("options", ["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"])
 def test_operations_are_those_of_casadi(options):
     """To two units in the last place; sine and cosine have a series of their own."""
@@ -256,13 +279,18 @@ def test_operations_are_those_of_casadi(options):
     for _ in range(20):
         points = random.uniform([-2.0, 0.1, -0.9], [2.0, 2.0, 0.9], (8, 3))
         points[0, 0] = 0.0
-        found = np.zeros((8, rows))
-        given = (each.ctypes.data_as(ctypes.c_void_p) for each in (points, shared, found))
-        lanes = code.evaluate(*given)
+        found = np.zeros((9, rows))
+        lanes = code.evaluate(*given_of(points, shared, found))
         assert lanes == (1 if options == "-DONE_LANE" else lanes)
         for point, values in zip(points[:lanes], found, strict=False):
             wanted = function(point, shared).full()[:, 0]
             np.testing.assert_allclose(values, wanted, rtol=5e-16, atol=2e-16)
+        assert not found.ravel()[lanes * rows : lanes * (rows + 1)].any()
+    # Angles are up to 2e8 a. One lane has libm's sine, for which none is too large.
+    points[:, 0] = [0.0, 3.0, 1e3, -3.0, -1e20, 2.0, np.nan, 2.4]
+    code.evaluate(*given_of(points, shared, found))
+    far = found.ravel()[lanes * rows : lanes * (rows + 1)]
+    np.testing.assert_array_equal(far, np.abs(points[:lanes, 0]) > 2.5 if lanes > 1 else 0.0)
 
 
 def test_what_lanes_do_not_know_is_refused():

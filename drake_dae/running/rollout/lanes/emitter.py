@@ -61,7 +61,8 @@ def emitted(function: ca.Function, name: str) -> str:
 
     Args:
         function: A function of expressions (SX), whose inputs and outputs are dense columns.
-        name: The name of the C function, `void name(const real *a0, ..., real *r0, ...)`.
+        name: The name of the C function, `mask name(const real *a0, ..., real *r0, ...)`. It
+            returns for which runs an angle is too large for `turn`.
 
     Raises:
         ModelError: An operation is not supported, see `can_be_emitted`.
@@ -70,7 +71,7 @@ def emitted(function: ca.Function, name: str) -> str:
         raise ModelError(f"{function.name()} has an operation that lanes do not support")
     places: dict[int, str] = {}
     turned, inverted = set[str](), set[str]()
-    often = _divisors(function)
+    often, roots = _divisors(function)
     lines = []
     for i in range(function.n_instructions()):
         code = function.instruction_id(i)
@@ -88,8 +89,14 @@ def emitted(function: ca.Function, name: str) -> str:
             if angle not in turned:
                 turned.add(angle)
                 lines.append(f"real sin_{angle}, cos_{angle};")
-                lines.append(f"turn({angle}, &sin_{angle}, &cos_{angle});")
+                lines.append(f"far |= turn({angle}, &sin_{angle}, &cos_{angle});")
             places[results[0]] = f"{'sin' if code == ca.OP_SIN else 'cos'}_{angle}"
+            continue
+        elif i in roots:
+            inverted.add(value)
+            lines.append(f"real {value}, over_{value};")
+            lines.append(f"root({places[operands[0]]}, &{value}, &over_{value});")
+            places[results[0]] = value
             continue
         elif code == ca.OP_DIV and i in often:
             divided, by = (places[place] for place in operands)
@@ -104,20 +111,29 @@ def emitted(function: ca.Function, name: str) -> str:
     arguments = [f"const real *a{i}" for i in range(function.n_in())]
     arguments += [f"real *r{i}" for i in range(function.n_out())]
     unused = " ".join(f"(void)a{i};" for i in range(function.n_in()))
-    body = "\n  ".join([unused, *lines])
-    return f"ON_DEVICE static APART void {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
+    body = "\n  ".join(["mask far = none();", unused, *lines, "return far;"])
+    return f"ON_DEVICE static APART mask {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
 
 
-def _divisors(function: ca.Function) -> set[int]:
-    """Returns divisions with a common divisor: a division takes as long as ten products."""
+def _divisors(function: ca.Function) -> tuple[set[int], set[int]]:
+    """Returns divisions that become products, since a division takes as long as ten of them.
+
+    Returns:
+        Divisions with a common divisor or by a square root; and the square roots.
+    """
     places, divisions = dict[int, int](), dict[int, list[int]]()
+    roots = set[int]()
     for i in range(function.n_instructions()):
         code, operands = function.instruction_id(i), function.instruction_input(i)
         if code == ca.OP_DIV:
             divisions.setdefault(places[operands[1]], []).append(i)
+        if code == ca.OP_SQRT:
+            roots.add(i)
         if code != ca.OP_OUTPUT:
             places[function.instruction_output(i)[0]] = i
-    return {i for same in divisions.values() if len(same) > 1 for i in same}
+    roots &= divisions.keys()
+    often = {i for by, same in divisions.items() if len(same) > 1 or by in roots for i in same}
+    return often, roots
 
 
 def _number(value: float) -> str:

@@ -45,6 +45,7 @@ typedef struct {
 typedef struct {
   real x[SIZE], held[HELD + 1], parameters[PARAMETERS + 1], given[GIVEN + 1];
   real time; /* of `given` */
+  mask far;  /* for which runs `given` has an angle that is too large */
   long long run[LANES], event[LANES];
 } Lanes;
 
@@ -57,6 +58,7 @@ ON_DEVICE static void load(const Batch *b, Lanes *l, int lane, long long run) {
     LANE(l->parameters[i], lane) = b->parameters[run * b->parameter_step + i];
   }
   LANE(l->time, lane) = NAN;
+  LANE(l->far, lane) = 0;
 }
 
 ON_DEVICE static void save(const Batch *b, const Lanes *l, int lane, const real *x, const real *held,
@@ -88,29 +90,30 @@ ON_DEVICE static long long take(const Batch *b, long long count) {
 
 ON_DEVICE static void set_time(real time, Lanes *l) {
   if (!GIVEN || !any(~SAME(time, l->time))) return;
-  dae_given(&time, l->parameters, l->given);
+  l->far = dae_given(&time, l->parameters, l->given);
   l->time = time;
 }
 
 /* Computes the derivative of the state; returns for which runs it has a value. */
 ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
   real valid;
+  mask far;
   set_time(time, l);
-  dae_rate(&time, x, l->held, l->parameters, l->given, rate, &valid);
-  return is_number(valid);
+  far = dae_rate(&time, x, l->held, l->parameters, l->given, rate, &valid);
+  return is_number(valid) & ~(far | l->far);
 }
 
 /* Projects some states onto N*; returns which are on it. */
 ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
   real found[SIZE], at[SIZE], left;
   const real *from = x;
-  mask open = wanted, near;
+  mask open = wanted, near, far;
   int i, attempt;
   if (!PROJECTS || !any(wanted)) return wanted;
   set_time(time, l);
   for (attempt = 0; attempt < 8; attempt++) {
-    dae_newton(&time, from, l->held, l->parameters, l->given, found, &left);
-    near = NOT_MORE(left, REACHED) & open;
+    far = dae_newton(&time, from, l->held, l->parameters, l->given, found, &left);
+    near = NOT_MORE(left, REACHED) & open & ~(far | l->far);
     for (i = 0; i < SIZE; i++) {
       at[i] = found[i];
       x[i] = CHOOSE(near, found[i], x[i]);
@@ -126,10 +129,11 @@ ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
 ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, const real *x,
                             const long long *row) {
   real values[WIDTH + 1], valid;
+  mask far;
   int i, lane;
   set_time(time, l);
-  dae_row(&time, x, l->held, l->parameters, l->given, values, &valid);
-  wanted &= is_number(valid);
+  far = dae_row(&time, x, l->held, l->parameters, l->given, values, &valid);
+  wanted &= is_number(valid) & ~(far | l->far);
   for (lane = 0; lane < LANES; lane++) {
     double *into = b->rows + (l->run[lane] * b->num_rows + row[lane]) * WIDTH;
     if (!LANE(wanted, lane)) continue;

@@ -93,8 +93,9 @@ def _updated(number: int, count: int, is_unrestricted: bool) -> str:
     const mask own = due(b, l, now, {number});
     if (any(own)) {{
       real values[{count + 1}], valid;
-      dae_update_{number}(&time, l->x, l->held, l->parameters, l->given, noise, values, &valid);
-      good &= is_number(valid) | ~own;
+      const mask far = dae_update_{number}(&time, l->x, l->held, l->parameters, l->given, noise,
+                                           values, &valid) | l->far;
+      good &= (is_number(valid) & ~far) | ~own;
       for (i = 0; i < {count}; i++) {{
         fresh[places_{number}[i]] = CHOOSE(own, values[i], fresh[places_{number}[i]]);
       }}
