@@ -212,6 +212,19 @@ def test_what_most_runs_do_not_need_loads_when_it_is_used() -> None:
 
 
 @pytest.mark.slow
+def test_a_run_loads_nothing_that_draws(tmp_path: Path) -> None:
+    """It would take as long as all else of a short run; `drake-dae plot RUN --all` draws."""
+    words = ["simulate", "two_link_wall", "--set", "duration=0.05", "--out", str(tmp_path / "run")]
+    code = f"import sys\nfrom drake_dae.cli import main\nmain({words})\nprint(*sys.modules)"
+    command = [sys.executable, "-W", "error", "-c", code]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    loaded = set(printed.splitlines()[-1].split())
+    assert (tmp_path / "run" / "animation.html").exists()
+    assert "pydrake" in loaded
+    assert loaded.isdisjoint({"matplotlib", "PIL", "scipy.integrate", "scipy.optimize"})
+
+
+@pytest.mark.slow
 def test_traced_functions_load_no_system() -> None:
     loaded = {room(name) for name in loaded_with(["trace"]) if name.startswith("drake_dae.")}
     assert loaded == {"errors", "arrays", "trace"}

@@ -9,11 +9,11 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.beyond.identified import IdentifiedTerms
 
-GAP = 2e-5
+GAP = 1e-5
 """The standard deviation of a measured distance to a surface, in m."""
 
-COMPLIANCE = 3e-5
-"""The standard deviation of the unknown compliance of a contact, in m/N."""
+COMPLIANCE = 3e-5, 1e-4
+"""The standard deviations of a contact's unknown compliances c_1 in m/N and c_2 in m/N^(1/2)."""
 
 MEMORY = 100.0
 """The time in s in which a parameter may move by its range."""
@@ -95,10 +95,16 @@ class Sampled:
 class ParameterFilter:
     """Estimates parameters theta with their covariance P, from the disturbance r that is left.
 
-    The true parameters leave r = 0 and, in contact, phi(x) = -c lambda with the compliance c of the
-    contact. With the low-pass filtered regressor Y of the observer, a sample measures
+    The true parameters leave r = 0 and, in contact, a depth that the force makes,
 
-        r = Y (theta* - theta) + noise,    -phi - c lambda = dphi/dtheta (theta* - theta) + noise.
+        -phi(x) = c_1 lambda + c_2 lambda^(1/2),    c_1, c_2 >= 0.
+
+    A spring has c_1 alone, and a ball on a compliant layer, as in Drake's hydroelastic contact, c_2
+    alone; one of Hertz is between them. With the low-pass filtered regressor Y of the observer, a
+    sample measures
+
+        r = Y (theta* - theta) + noise,
+        -phi - c_1 lambda - c_2 lambda^(1/2) = dphi/dtheta (theta* - theta) + noise.
 
     r is scaled by the root of the diagonal of M; its noise is s^2, the mean square of what
     remained, times the samples in which it does not change, 2 / (k_o T). Between samples P returns
@@ -129,17 +135,17 @@ class ParameterFilter:
         known, self._period = identified.low.size, period
         frictions, contacts = start.size - known, len(identified.pressed)
         self.num_parameters = start.size
-        count = start.size + contacts
-        self._low = np.concatenate([identified.low, np.zeros(frictions), np.zeros(contacts)])
-        high = np.full(frictions, largest_friction), np.full(contacts, np.inf)
+        count = start.size + 2 * contacts
+        self._low = np.concatenate([identified.low, np.zeros(frictions + 2 * contacts)])
+        high = np.full(frictions, largest_friction), np.full(2 * contacts, np.inf)
         self._high = np.concatenate([identified.high, *high])
         self._size, self._count, self._contacts = size, count, contacts
         deviations = (self._high - self._low)[: start.size] / 12.0**0.5
-        self._prior = np.concatenate([deviations, np.full(contacts, COMPLIANCE)]) ** 2
+        self._prior = np.concatenate([deviations, *contacts * [COMPLIANCE]]) ** 2
         self._samples = 2.0 / (rate * period)
         self.memory = memory = FilterMemory.of(size, count)
         self.start = np.zeros(memory.column.numel())
-        self.start[memory.parts["values"]] = np.concatenate([start, np.zeros(contacts)])
+        self.start[memory.parts["values"]] = np.concatenate([start, np.zeros(2 * contacts)])
         rows, columns = np.tril_indices(count)
         by_columns = np.lexsort((rows, columns))
         triangle = np.diag(self._prior)[rows[by_columns], columns[by_columns]]
@@ -173,7 +179,7 @@ class ParameterFilter:
     def regressor(self, sample: Sampled) -> ca.SX:
         """-G, the derivative of a sample of d with respect to theta* - theta, shape (k, c)."""
         memory, shape = self.memory, (self._size, self._count)
-        wide = self._size, self._contacts
+        wide = self._size, 2 * self._contacts
         momentum, drift = self._slopes(sample)
         before = (ca.reshape(part, *shape) for part in (memory.momentum, memory.drift))
         last, drifted = before
@@ -206,14 +212,14 @@ class ParameterFilter:
         noise = memory.spread * self._samples
         measured = [(rows[i, :], rest[i], noise, used) for i in range(self._size)]
         for j in range(self._contacts):
-            c = before[self.num_parameters + j]
-            compliant = ca.SX(1, self._contacts)
-            compliant[j] = sample.forces[j]
+            own = slice(2 * j, 2 * j + 2)
+            compliant = ca.SX(1, 2 * self._contacts)
+            compliant[own] = ca.vertcat(sample.forces[j], ca.sqrt(ca.fmax(sample.forces[j], 0)))
             known = sample.gap_slopes.shape[1]
             row = ca.horzcat(
                 sample.gap_slopes[j, :], ca.SX(1, self.num_parameters - known), compliant
             )
-            gap = -(sample.gaps[j] + c * sample.forces[j])
+            gap = -(sample.gaps[j] + ca.mtimes(compliant, before[self.num_parameters :]))
             measured.append((row, gap, GAP**2 * self._samples, used * sample.is_closed[j]))
         change = ca.SX.zeros(count)
         for row, error, variance, is_used in measured:
@@ -222,6 +228,9 @@ class ParameterFilter:
             gain = is_used * moved / (variance + ca.mtimes(row, moved))
             change += gain * (error - ca.mtimes(row, change))
             P -= ca.mtimes(gain, moved.T)
+        # A compliance that is raised to zero takes along what is correlated with it.
+        for i in range(self.num_parameters, count):
+            change += P[:, i] / P[i, i] * ca.fmax(-before[i] - change[i], 0)
         values = ca.fmin(ca.fmax(before + change, self._low), self._high)
         change = values - before
         remaining = ca.sumsqr(rest - ca.mtimes(rows, change)) / self._size
