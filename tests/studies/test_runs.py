@@ -258,6 +258,31 @@ def test_a_run_of_compliant_contact_has_its_own_parameters_alone():
     np.testing.assert_array_equal(loop.plant.get_parameter(own, "wall.position"), [0.7, 0.0, 0.0])
 
 
+@pytest.mark.slow
+def test_a_rollout_has_nothing_of_the_one_before_it():
+    """Whose context it uses again: the same figures, bit by bit, as in a context of its own."""
+    chosen = scenario(
+        "two_link_wall",
+        "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
+        "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}",
+        "duration=0.1",
+    )
+    other = {
+        "plant.friction": 0.1,
+        "plant_parameters": {"link1.mass": 11.0, "wall.position": [1.201, 0.0, 0.0]},
+        "gains.all": [-8.0],
+        "start.errors.tool.z": 0.01,
+        "force_feedback.seed": 3,
+    }
+    base, runs = scenario_data(chosen), [(0, other), (1, {})]
+    used = Runner(base, 1.0)
+    (_,), (after,) = (list(used.run_all([run])) for run in runs)
+    (fresh,) = Runner(base, 1.0).run_all(runs[1:])
+    assert used.builds == 1
+    assert after.outcome == Outcome.FINISHED
+    assert after.figures == fresh.figures
+
+
 def test_steps_do_not_begin_before_zero():
     """Drake's periodic events do not, so such a plant would stand still until then."""
     found = scenario("wall_point_contact", "compiled=false", "integrator.start_time=-1")
