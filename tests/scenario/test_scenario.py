@@ -148,7 +148,7 @@ def test_every_form_reads_back_equal(tmp_path):
 
 def test_defaults_are_those_of_the_dataclasses(tmp_path):
     scenario = load_scenario(lever(tmp_path))
-    assert scenario.write == forms.Write(True, True, True)
+    assert scenario.write == forms.Write(record=True, plots=False, animation=True)
     assert scenario.integrator.integration_scheme == "runge_kutta5"
     assert scenario.integrator.use_error_control
     assert scenario.gains == forms.Poles(all=[-4.0])
@@ -176,7 +176,7 @@ def test_packages_of_a_robot(tmp_path):
     [
         ("duration=5", lambda s: s.duration == 5.0),
         ("integrator.accuracy=1e-9", lambda s: s.integrator.accuracy == 1e-9),
-        ("write.plots=false", lambda s: s.write.plots is False),
+        ("write.plots=true", lambda s: s.write.plots is True),
         ("constraints.0.surface.point.0=1.1", lambda s: s.constraints[0].surface.point[0] == 1.1),
         ("constraints.0.surface.point=[1, 0, 0]", lambda s: s.constraints[0].surface.point[0] == 1),
         ("gains=!Coefficients {all: [16, 8]}", lambda s: s.gains == forms.Coefficients([16, 8])),

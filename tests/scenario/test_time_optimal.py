@@ -82,7 +82,8 @@ def test_robots_without_a_profile_are_refused_in_a_sentence(name):
 @pytest.mark.parametrize("rolled", [[], ["--rollout"]])
 def test_the_command_leaves_a_picture_of_the_profile(tmp_path, capsys, rolled):
     folder = tmp_path / "run"
-    settings = ["--set", "integrator.accuracy=1e-7", "--set", "write.animation=false"]
+    settings = ["--set", "integrator.accuracy=1e-7"]
+    settings += ["--set", "write={plots: true, animation: false}"]
     given = [str(SCENARIO), "--time-optimal", "--json", "--out", str(folder), *settings, *rolled]
     assert main(["simulate", *given]) == 0
     found = json.loads(capsys.readouterr().out)
