@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from drake_dae.cli import main as command
 
-DATA = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data")
+DATA = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data").absolute()
 """The package example-robot-data."""
 
 

@@ -33,7 +33,9 @@ from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import USED
 
-ROBOTS = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
+ROBOTS = Path(
+    sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots"
+).absolute()
 
 DURATION, AFTER, PUSHED = 2.4, 0.8, 1.6
 """The end of a run, the time from which its errors are bounded, and that of the push, in s."""
