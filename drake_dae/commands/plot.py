@@ -69,6 +69,8 @@ def _plot_all(options: argparse.Namespace) -> int:
         files, wanted = RunFiles(folder), Write(plots=True, animation=False)
         files.write_pictures(report_run(scenario, loop, context, record), loop, context, wanted)
         problems += files.problems
+        if files.problems:  # Pictures there may be of an earlier time.
+            continue
         written = [name for name in (*PLOTS, PROFILE) if (folder / name).exists()]
         print(f"written to {folder}/: {', '.join(written)}")
     for line in problems:

@@ -84,7 +84,7 @@ def margins(record: Record, limits: Limits) -> Rooms:
 
 
 def exceeded(rooms: Rooms) -> tuple[str, ...]:
-    """Names of the signals beyond their limits, with negative unilateral forces, from margins."""
+    """Names of the signals beyond their limits, by their `margins`."""
     return tuple(signal.name for signal, room in rooms if room < 0.0)
 
 

@@ -163,10 +163,12 @@ def test_plots_that_cannot_be_written_are_told(tmp_path, monkeypatch, capsys):
     bare = ("--set=duration=0.05", "--set=write.animation=false")
     assert main(["simulate", "two_link_wall", *bare, f"--out={tmp_path}"]) == 0
     monkeypatch.setattr(Figure, "savefig", fill)
+    (tmp_path / "outputs.png").write_bytes(b"of an earlier time")
     capsys.readouterr()
     assert main(["plot", "--all", str(tmp_path)]) == 1
     said = f"error: {tmp_path}/outputs.png: No space left on device\n"
-    assert capsys.readouterr().err == said
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ("", said)
 
 
 def test_a_notebook_shows_figures_and_loops(monkeypatch):

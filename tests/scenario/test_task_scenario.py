@@ -60,8 +60,9 @@ def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_command_runs_a_task_in_the_ideal_contact(file, tmp_path, capsys):
-    """Its contact opens and closes: the record has the impact, the animation shows it."""
+    """Its contact opens and closes: the record has the impact, plots and animation show it."""
     words = ["--set", "duration=0.3", "--set", "plant=!Unilateral {restitution: {wall: 0.0}}"]
+    words += ["--set", "write.plots=true"]
     assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
     told = capsys.readouterr().out
     assert "\nTracked as predicted" in told
@@ -69,6 +70,7 @@ def test_command_runs_a_task_in_the_ideal_contact(file, tmp_path, capsys):
     record = Record.load(tmp_path / "run" / "record.npz")
     assert record.events[0].contacts == ("wall",)
     assert_allclose(record.events[0].time, 0.25, atol=1e-3)
+    assert (tmp_path / "run" / "outputs.png").exists()
     assert (tmp_path / "run" / "animation.html").exists()
 
 

@@ -32,12 +32,10 @@ def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded
     return recorded
 
 
-def computed_record(
-    time: FloatArray, signals: Mapping[str, Recorded], events: tuple[ContactEvent, ...] = ()
-) -> "Record":
+def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
     """A record that the library itself has computed, made without checks of the arguments."""
     record = object.__new__(Record)
-    vars(record).update(time=time, signals=signals, events=events, about={})
+    vars(record).update(time=time, signals=signals, events=(), about={})
     return record
 
 
