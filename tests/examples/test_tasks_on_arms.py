@@ -49,6 +49,16 @@ def test_each_arm_inserts_the_peg_with_no_more_force_than_predicted(arm, example
     assert 1.0 < forces.max() < max(peaks.values())
 
 
+def test_pegs_that_are_too_thick_are_counted_as_not_inserted(example, capsys):
+    """The command of many pegs is that of `examples/insertions`, with the settings of the arm."""
+    thick = "plant.pegs.0.radius=0.0051"
+    assert example.main(["peg_in_hole-ur5", "--pegs", "1", "--set", thick]) == 1
+    assert "0 of 1 inserted" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        example.main(["flat_press-ur5", "--pegs", "1"])
+    assert "no run 'flat_press-ur5'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
 def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
     """Beyond the edge by the path in `patience`, 0.05 s at 30 mm/s, and less than 1.5 mm more."""
