@@ -67,7 +67,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
             is no error: the analysis reports it.
     """
     scene_graph = SceneGraph()
-    completed, model = completed_model(scenario, scene_graph)
+    completed, model = completed_model(scenario, scene_graph, drawn=False)
     scenario = completed.scenario
     try:
         structure = scenario_structure(model, scenario.task)

@@ -73,7 +73,7 @@ def new_scenario(
     """
     is_url = file.startswith("package://")
     robot = new_robot(file if is_url or not file else os.path.realpath(file), tip, point)
-    links, _ = robot_links(robot.robot, SceneGraph())
+    links, _ = robot_links(robot.robot, SceneGraph(), drawn=False)
     tried: list[str] = []
     usable: tuple[Scenario, NewTask, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
