@@ -14,6 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from pydrake.math import RollPitchYaw
+
 from drake_dae.cli import main as command
 
 DATA = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data").absolute()
@@ -82,6 +85,9 @@ ARMS = {
 
 TABLE = {"point": [0.45, 0.0, 0.2], "normal": [0.0, 0.0, 1.0]}
 OVER_TABLE = "tool.x: 0.45, tool.y: 0.0"
+TURN = "!AxisCoordinates {frame: tool, axis: x, components: y}"
+"""How the tool is turned about the normal, as an output in place of the last joint."""
+
 AXIS = "!AxisCoordinates {frame: tool, axis: z, components: xy}"
 
 YIELDING = (
@@ -115,13 +121,57 @@ def edge_search(arm: Arm) -> list[str]:
     ]
 
 
-def flat_press(arm: Arm) -> list[str]:
-    """The table is tilted by 1 degree from where the law has it, as in the shipped scenario.
+def edge_follow(arm: Arm) -> list[str]:
+    """The plate is 6 mm and 2 degrees off where the law has it, as in the shipped scenario.
 
-    How the tool is turned about the normal is an output, in place of the last joint.
+    Its edge runs along x, 16 mm beside the start of the arm.
     """
-    turn = "!AxisCoordinates {frame: tool, axis: x, components: y}"
-    outputs, held = ["{frame: tool, axes: xy}", turn], [OVER_TABLE, "tool.x_axis.y: 0.0"]
+    middle, side = np.array([0.45, 0.066, 0.2]), [0.0, -0.05, -0.01]
+    moved, turned = middle + np.array([-0.003, 0.004, -0.003]), [0.0175, -0.0175, -0.035]
+    moved_side = moved + RollPitchYaw(turned).ToRotationMatrix() @ side
+    outputs, held = f"{{frame: tool, axes: x}}, {AXIS}, {TURN}", "tool.z_axis, tool.x_axis.y"
+    references = f"tool.x: 0.4, '{held}': 0.0, wall.distance: 0.01"
+    if joints := arm.joints[:-1]:
+        outputs += f", {_joints(joints)}"
+        references += f", {_held(arm, joints)}"
+    return [
+        *_surfaces(1),
+        f"constraints.0.surface.point={middle.tolist()}",
+        "constraints.0.surface.half_widths=[0.08, 0.05]",
+        f"constraints.1.surface.point={(middle + side).tolist()}",
+        "constraints.1.surface.normal=[0.0, -1.0, 0.0]",
+        "constraints.1.surface.half_widths=[0.08, 0.01]",
+        f"outputs=[{outputs}]",
+        f"plant_parameters.wall.position={moved.tolist()}",
+        f"plant_parameters.wall.rpy={turned}",
+        f"plant_parameters.side.position={moved_side.tolist()}",
+        f"plant_parameters.side.rpy={turned}",
+        f"task.phases.0.references={{{references}}}",
+        "task.phases.3.along=tool.x",
+    ]
+
+
+def polish_unknown_part(arm: Arm) -> list[str]:
+    """The part is 5 mm and 5 degrees off where the law has it, as in the shipped scenario."""
+    eight = (
+        "tool.x: !Sinusoids {offset: 0.45, amplitudes: [0.06], frequencies: [2.0]}, "
+        "tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.07], frequencies: [1.0]}"
+    )
+    force = "!Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}"
+    tilt = "!TiltFromNormal {constraint: part, axis: z}"
+    return [
+        *_surfaces(1),
+        f"outputs=[{{frame: tool, axes: xy}}, {tilt}, {_joints(arm.joints)}]",
+        "plant_parameters={part.position: [0.4526, 0.003, 0.203], part.rpy: [0.056, 0.06, 0.03]}",
+        "bounds.part.position=[[0.44, -0.01, 0.19], [0.46, 0.01, 0.21]]",
+        f"task.phases.3.references={{{eight}, part.force: 10.0}}",
+        f"task.phases.4.references={{{eight}, part.force: {force}}}",
+    ]
+
+
+def flat_press(arm: Arm) -> list[str]:
+    """The table is tilted by 1 degree from where the law has it, as in the shipped scenario."""
+    outputs, held = ["{frame: tool, axes: xy}", TURN], [OVER_TABLE, "tool.x_axis.y: 0.0"]
     if joints := arm.joints[:-1]:
         outputs.append(_joints(joints))
         held.append(_held(arm, joints))
@@ -169,6 +219,8 @@ RUNS = {
     for task, arms in (
         (peg_in_hole, ("ur5", "panda")),
         (edge_search, ("ur5", "panda")),
+        (edge_follow, ("ur5", "panda")),
+        (polish_unknown_part, ("ur5", "panda")),
         (flat_press, ("ur5", "panda")),
         (hand_over, ("two_ur5",)),
     )

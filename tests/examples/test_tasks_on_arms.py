@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from found_places import found_off
 from numpy.testing import assert_allclose
 from programs import loaded
+from pydrake.math import RollPitchYaw
 
-from drake_dae import load_scenario
+from drake_dae import followed_lines, load_scenario
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.shipped import find_scenario
@@ -59,6 +61,42 @@ def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
         row = np.searchsorted(record.time, changes[index + 1].time)
         place = record["controlled_output"][row, axis]
         assert edges[axis] < place < edges[axis] + 3e-3
+
+
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_finds_the_line_of_an_edge_that_is_6_mm_off(arm, example):
+    """The law has the planes turned by 0.0175 rad about the edge: 3 mm and 4 mm times that."""
+    loop, found, changes = rolled(example, f"edge_follow-{arm}")
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    (line,) = followed_lines(loop, found.record, found.context)
+    turned = RollPitchYaw(0.0175, -0.0175, -0.035).ToRotationMatrix()
+    edge = turned @ [1.0, 0.0, 0.0]
+    place = np.array([0.447, 0.07, 0.197]) + turned @ [0.0, -0.05, 0.0]
+    assert np.linalg.norm(np.cross(line.point - place, edge)) < 0.0175 * np.hypot(0.003, 0.004)
+    assert np.linalg.norm(np.cross(line.direction, edge)) < 1e-4
+
+
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(arm, example):
+    """On springs, since a rollout has no hydroelastic contact; within 0.1 mm under the tool."""
+    ball = "plant=!CompliantContact {friction: 0.3, radius: 0.01}"
+    loop, found, changes = rolled(example, f"polish_unknown_part-{arm}", ball)
+    assert found.failure is None
+    assert changes[-1].phase == "done"
+    record, times = found.record, {change.phase: change.time for change in changes}
+    chosen = load_scenario(
+        find_scenario("polish_unknown_part"), example.settings(f"polish_unknown_part-{arm}")
+    )
+    polish = (record.time > times["polish"]) & (record.time < times["Release"])
+    rows = np.flatnonzero(polish)[::50]
+    errors = [found_off(chosen, loop, record, np.array([row]), row)[0] for row in rows]
+    assert np.abs(found_off(chosen, loop, record, rows, 0)).max() > 5e-3
+    assert np.abs(errors).max() < 1e-4
+    names = [signal.name for signal in record.signals["tracking_error"].signals]
+    late = record.time[polish] > times["polish"] + 1.0  # After the transition.
+    force = record["tracking_error"][polish][late, names.index("part.force")]
+    assert np.sqrt(np.mean(force**2)) < 0.05
 
 
 @pytest.mark.parametrize("arm", ["ur5", "panda"])

@@ -1,7 +1,10 @@
 """The scenario polish_unknown_part: a part off its place is felt, found and polished."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from found_places import found_off
 from runs import scenario
 
 from drake_dae import build_scenario, rollout, start_values
@@ -34,25 +37,9 @@ def test_a_part_5_mm_and_5_degrees_off_is_found_and_polished(settings):
     """
     chosen, loop, record, changes = polished(*settings)
     assert list(changes)[:5] == ["Move", "Approach", "Press", "feel", "polish"]
-    dae = loop.controller.law.system
-    distance = dae.trace("distance", {"value": dae.k})
-    places = {name: np.array(chosen.plant_parameters[name]) for name in chosen.identified}
-    truth = dae.with_values(places).parameter_values
     begin, end = changes["polish"], DURATION
     rows = np.flatnonzero((record.time > begin) & (record.time < end))[::50]
-    names = [signal.name.partition("[")[0] for signal in record.signals["identified"].signals]
-
-    def off(at):
-        """The distances of the estimated surface from the true one along the way, m."""
-        found = {n: record["identified"][at][[m == n for m in names]] for n in chosen.identified}
-        values = dae.with_values(found).parameter_values
-        return np.array(
-            [
-                distance(x, values)[0].item() - distance(x, truth)[0].item()
-                for x in record["state"][rows]
-            ]
-        )
-
+    off = partial(found_off, chosen, loop, record, rows)
     before = off(np.searchsorted(record.time, changes["Press"]))
     assert np.abs(before).max() > 5e-3  # Where the law has the part.
     every = np.array([off(at) for at in rows])
