@@ -1,11 +1,9 @@
 """The distance of declared friction from the Painleve paradox, along a recorded run."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from drake_dae.dae.states.contact_margin import ContactMargin, ContactMargins
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.records.record import Record
@@ -29,7 +27,7 @@ def declared_margin(loop: ClosedLoop, highest: Scenario, record: Record) -> Cont
     structure, model = loop.controller.law.structure, loop.plant.robot("the margin of friction")
     system, joints = structure.system, model.links.q.numel()
     states = record["state"]
-    friction = _friction(highest, [c.friction for c in system.contacts if c.friction])
+    friction = _friction(highest, [c.friction for c in system.contacts if c.friction], system)
     if not any(friction.values()) or {system.num_states, states.shape[1]} != {2 * joints}:
         return None
     if any(contact.friction and contact.sliding is None for contact in system.contacts):
@@ -62,11 +60,11 @@ def in_words(margin: ContactMargin) -> str:
     )
 
 
-def _friction(scenario: Scenario, names: list[str]) -> dict[str, float]:
+def _friction(scenario: Scenario, names: list[str], system: DaeSystem) -> dict[str, float]:
     """The coefficient of friction of each contact of the plant of a scenario."""
     material = scenario.plant.material
     if material is not None:
-        return dict.fromkeys(names, material.friction)
-    own: Mapping[str, Any] = scenario.plant_parameters
-    of_model = {f"{each.name}.friction": each.friction for each in scenario.constraints}
-    return {name: float(own.get(name, of_model[name] or 0.0)) for name in names}
+        return dict.fromkeys(names, material.friction or 0.0)
+    values, own = system.parameter_values, scenario.plant_parameters
+    of_law = {name: float(values[system.parameter_slice(name)].item()) for name in names}
+    return {name: float(np.squeeze(own.get(name, of_law[name]))) for name in names}
