@@ -142,7 +142,7 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     """Adds a zero wrench to each movable link."""
     if scenario.plant.carries:
         return scenario  # A plant with Drake's own contact contains pushes.
-    plant = robot_links(scenario.robot, SceneGraph())[0].plant
+    plant = robot_links(scenario.robot, SceneGraph(), drawn=False)[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
         KnownWrench(body.scoped_name().get_full(), name=PUSH + body.scoped_name().get_full())

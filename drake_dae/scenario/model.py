@@ -76,16 +76,25 @@ def complete_scenario(scenario: Scenario) -> Completed:
         ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
             are independent of those in the scenario; the message names the key.
     """
-    return _read(scenario, SceneGraph()).completed
+    return _read(scenario, SceneGraph(), drawn=False).completed
 
 
 def completed_model(
     scenario: Scenario,
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
+    drawn: bool = True,
 ) -> tuple[Completed, RobotModel]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads."""
-    robot = _read(scenario, scene_graph or SceneGraph(), payloads)
+    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
+
+    Args:
+        scenario: What `load_scenario` returns.
+        scene_graph: The scene graph of the robot's geometry, or None.
+        payloads: The payloads.
+        drawn: Whether the scene graph, if there is one, will be drawn.
+    """
+    drawn = drawn and scene_graph is not None
+    robot = _read(scenario, scene_graph or SceneGraph(), payloads, drawn)
     scenario = robot.completed.scenario
     outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
     with at("actuation" if robot.stages else "outputs"):
@@ -123,11 +132,14 @@ class _BuiltRobot:
 
 
 def _read(
-    scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
+    scenario: Scenario,
+    scene_graph: SceneGraph,
+    payloads: Sequence[Payload] = (),
+    drawn: bool = True,
 ) -> _BuiltRobot:
     # The robot.
     name = scenario.robot.title
-    links, loops = robot_links(scenario.robot, scene_graph, payloads)
+    links, loops = robot_links(scenario.robot, scene_graph, payloads, drawn)
 
     # The constraints.
     constraints = _constraints(scenario.constraints, loops, links)

@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -96,21 +96,14 @@ class RolloutProgram:
 
 
 def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
-    """Returns the program of a closed loop or of any diagram; that of a loop is made once.
+    """Returns the program of a closed loop or of any diagram, which is made once.
 
     Raises:
         ModelError: A block cannot be traced, with its name and the reason; or a diagram has no
             output port with a vector.
     """
     if isinstance(loop, Diagram):
-        compiled = compile_diagram(loop)
-        if not compiled.outputs:
-            raise ModelError(
-                "the diagram has no output port with a vector, so that a rollout has nothing to "
-                "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
-            )
-        name = loop.get_name() or "the diagram"
-        return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
+        return _of_diagram(loop)
     if "program" not in loop.memory:
         loop.memory["program"] = RolloutProgram(
             compile_diagram(loop.diagram, list(loop.signals)),
@@ -122,6 +115,18 @@ def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
         )
     program: RolloutProgram = loop.memory["program"]
     return program
+
+
+@lru_cache(maxsize=4)
+def _of_diagram(diagram: Diagram) -> RolloutProgram:
+    compiled = compile_diagram(diagram)
+    if not compiled.outputs:
+        raise ModelError(
+            "the diagram has no output port with a vector, so that a rollout has nothing to "
+            "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
+        )
+    name = diagram.get_name() or "the diagram"
+    return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
 
 
 def _completed(loop: ClosedLoop, record: Record, context: Context | None) -> Record:

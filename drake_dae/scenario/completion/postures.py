@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -72,19 +73,23 @@ class Posture:
         in place of v and B_u. Each row is divided by its length without constraints, so that units
         and lever lengths do not matter. It is 1 for fully independent rows, and 0 if B is singular.
         """
-        lower = np.linalg.cholesky(self.mass)
-
-        def weighted(gradients: FloatArray) -> FloatArray:
-            return np.linalg.solve(lower, gradients.T).T
-
-        J, P = weighted(self.constraints), weighted(self.gradients[list(rows)])
-        Q = np.linalg.qr(weighted(self.actuation.T).T)[0]
-        inverse = np.linalg.pinv(J, 1e-9)  # J^T (J M^-1 J^T)^-1 in these units.
-        F = (self.forces @ inverse.T) if len(self.forces) else np.zeros((0, len(self.mass)))
-        B = np.vstack([_one_long(P, P - P @ inverse @ J), _one_long(F, F)]) @ Q
+        of_rows, of_forces = self._control
+        B = np.vstack([of_rows[list(rows)], of_forces])
         if len(B) > B.shape[1]:
             return 0.0
         return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0))
+
+    @cached_property
+    def _control(self) -> tuple[FloatArray, FloatArray]:
+        """The rows of B(x) of `independence`: of all rows, and of the force outputs."""
+        lower, nv = np.linalg.cholesky(self.mass), len(self.mass)
+        right = np.vstack([self.constraints, self.gradients, self.actuation.T]).T
+        weighted = np.linalg.solve(lower, right).T
+        J, P, drives = np.split(weighted, np.cumsum([len(self.constraints), len(self.gradients)]))
+        Q = np.linalg.qr(drives.T)[0]
+        inverse = np.linalg.pinv(J, 1e-9)  # J^T (J M^-1 J^T)^-1 in these units.
+        F = (self.forces @ inverse.T) if len(self.forces) else np.zeros((0, nv))
+        return _one_long(P, P - P @ inverse @ J) @ Q, _one_long(F, F) @ Q
 
 
 def _value_of(parameter: Parameter, values: Mapping[str, FloatArray]) -> FloatArray:

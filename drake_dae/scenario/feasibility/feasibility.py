@@ -66,9 +66,21 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         ScenarioError: The scenario is not valid; the message names the key. A violated assumption
             is no error: the analysis reports it.
     """
+    return complete_and_examine(scenario)[1]
+
+
+def complete_and_examine(scenario: Scenario) -> tuple[Scenario, Feasibility]:
+    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds.
+
+    The arguments and exceptions are those of `find_feasibility`.
+    """
     scene_graph = SceneGraph()
-    completed, model = completed_model(scenario, scene_graph)
-    scenario = completed.scenario
+    completed, model = completed_model(scenario, scene_graph, drawn=False)
+    return completed.scenario, _feasibility(completed.scenario, model, scene_graph)
+
+
+def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph) -> Feasibility:
+    """The feasibility of a completed scenario with its model."""
     try:
         structure = scenario_structure(model, scenario.task)
     except AssumptionError:

@@ -18,9 +18,8 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.robots.surfaces.surfaces import Plane
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.feasibility.feasibility import complete_and_examine
 from drake_dae.scenario.feasibility.report import Feasibility
-from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.new.places import find_places
 from drake_dae.scenario.new.robot import NewRobot, new_robot
 from drake_dae.scenario.new.task import NewTask, SurfaceKind, circle
@@ -73,7 +72,7 @@ def new_scenario(
     """
     is_url = file.startswith("package://")
     robot = new_robot(file if is_url or not file else os.path.realpath(file), tip, point)
-    links, _ = robot_links(robot.robot, SceneGraph())
+    links, _ = robot_links(robot.robot, SceneGraph(), drawn=False)
     tried: list[str] = []
     usable: tuple[Scenario, NewTask, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
@@ -82,8 +81,7 @@ def new_scenario(
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RobotFileWarning)  # The links are reported.
-                whole = complete_scenario(_scenario(robot, task, links)).scenario
-                report = find_feasibility(whole)
+                whole, report = complete_and_examine(_scenario(robot, task, links))
             problems = report.problems
             deeper = usable is not None and _depth(report) >= _depth(usable[2])
             if not deeper and not set(problems) - {*_beside(report), *report.wrong_sides}:

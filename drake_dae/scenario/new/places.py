@@ -96,6 +96,11 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
     return [place for place, _ in sorted(ranked, key=lambda pair: -pair[1])]
 
 
+def _tilts(axis: int) -> list[int]:
+    """The rows of the components of an axis of the world across the tool."""
+    return [3 + 2 * axis, 4 + 2 * axis]
+
+
 class _PlaceSearch:
     """Postures of a robot for surfaces that are not yet placed."""
 
@@ -130,33 +135,42 @@ class _PlaceSearch:
         efforts[driven] = links.effort_limits
         self._efforts = np.where(efforts > 0.0, efforts, np.inf)
         self._guesses = self._postures.guesses(_TRIES)
+        self._slanted = [self._postures.at(guess) for guess in self._guesses]
+        self._aligned = [self._along(axis) for axis in range(3)]
 
-    def best(self, axis: int, sign: float) -> TipPlace | None:
-        """The best place for a surface with a normal; None if there is none."""
-        tilts = [3 + 2 * axis, 4 + 2 * axis]
+    def _along(self, axis: int) -> list[Posture]:
+        """The postures with the tool along an axis of the world."""
         aligned: list[Posture] = []
         for count, guess in enumerate(self._guesses):
             if count == _PATIENCE and not aligned:
                 break  # A planar robot cannot rotate its tool about some axes.
-            posture = near_posture(self._postures, tilts, np.zeros(2), guess)
+            posture = near_posture(self._postures, _tilts(axis), np.zeros(2), guess)
             aligned += [] if posture is None else [posture]
-        slanted = [self._postures.at(guess) for guess in self._guesses]
-        postures = [(posture, 1.0) for posture in aligned]
-        postures += [(posture, _SLANTED) for posture in slanted]
-        places = (self._place(axis, sign, posture, weight) for posture, weight in postures)
-        reached = [place for place in places if place is not None]
-        return max(reached, key=lambda place: place.quality * place.directions, default=None)
+        return aligned
 
-    def _place(self, axis: int, sign: float, posture: Posture, weight: float) -> TipPlace | None:
-        """The place of a posture; None if the tip cannot move along the surface."""
-        tilts = [3 + 2 * axis, 4 + 2 * axis]
-        first = [k for k in range(3) if k != axis]
-        rows = first_independent(posture, [], [axis, *first, *tilts], posture.q.size)
-        ways = tuple(row for row in rows if row in first)
-        if axis not in rows or not ways:
+    def best(self, axis: int, sign: float) -> TipPlace | None:
+        """The best place for a surface with a normal; None if there is none."""
+        postures = [(posture, 1.0) for posture in self._aligned[axis]]
+        postures += [(posture, _SLANTED) for posture in self._slanted]
+        across = [k for k in range(3) if k != axis]
+        directions = [axis, *across, *_tilts(axis)]
+        best: tuple[float, list[int], Posture] | None = None
+        for posture, weight in postures:
+            share = weight * self._postures.margin(posture.q)
+            share *= self._surroundings(posture, axis, sign)
+            # No independence is above 1.
+            if best is not None and share * len(directions) <= best[0] * len(best[1]):
+                continue
+            rows = first_independent(posture, [], directions, posture.q.size)
+            if axis not in rows or not {*rows} & {*across}:
+                continue  # The tip cannot move along the surface.
+            quality = share * posture.independence(rows)
+            if best is None or quality * len(rows) > best[0] * len(best[1]):
+                best = quality, rows, posture
+        if best is None:
             return None
-        quality = posture.independence(rows) * self._postures.margin(posture.q)
-        quality *= weight * self._surroundings(posture, axis, sign)
+        quality, rows, posture = best
+        ways = tuple(row for row in rows if row in across)
         return TipPlace(
             posture.rows[:3],
             axis,

@@ -49,7 +49,10 @@ def add_robot(
 
 @at("robot.file")
 def robot_links(
-    robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
+    robot: Robot,
+    scene_graph: SceneGraph,
+    payloads: Sequence[Payload] = (),
+    drawn: bool = True,
 ) -> tuple[MultibodyExpressions, list[Constraint]]:
     """The links of a scenario's robot, and its loop-closing joints as constraints.
 
@@ -57,11 +60,12 @@ def robot_links(
         robot: The key `robot` of the scenario.
         scene_graph: The scene graph for its geometry.
         payloads: The key `plant_payloads` of the scenario, for the links of the plant.
+        drawn: Whether the geometry will be drawn.
 
     Raises:
         ScenarioError: The file cannot be read or a change does not fit; the message names the key.
     """
-    plant, efforts = read_robot(robot, scene_graph)
+    plant, efforts = read_robot(robot, scene_graph, drawn)
     change_robot(robot, plant, efforts)
     add_payloads("plant_payloads", payloads, plant)
     cuts = cut_loops(plant)

@@ -38,13 +38,15 @@ _IDLE = {
 
 
 def read_robot(
-    robot: Robot, scene_graph: SceneGraph | None = None
+    robot: Robot, scene_graph: SceneGraph | None = None, drawn: bool = True
 ) -> tuple[MultibodyPlant, Efforts]:
     """Makes a plant in continuous time with the models of the robot's file, not finalized.
 
     Args:
         robot: The key `robot` of the scenario.
         scene_graph: The scene graph for the robot's geometry; None leaves geometry out.
+        drawn: Whether the geometry will be drawn: visual meshes are converted then, which takes
+            longer than all else.
 
     Returns:
         The plant, and the effort limits of the file.
@@ -57,11 +59,14 @@ def read_robot(
     plant = MultibodyPlant(0.0)
     if scene_graph is not None:
         plant.RegisterAsSourceForSceneGraph(scene_graph)
-    return plant, read_into(plant, robot, scene_graph)
+    return plant, read_into(plant, robot, scene_graph, drawn)
 
 
 def read_into(
-    plant: MultibodyPlant, robot: Robot, scene_graph: SceneGraph | None = None
+    plant: MultibodyPlant,
+    robot: Robot,
+    scene_graph: SceneGraph | None = None,
+    drawn: bool = True,
 ) -> Efforts:
     """Adds the models of the robot's file to a plant that is not finalized; see `read_robot`.
 
@@ -69,6 +74,7 @@ def read_into(
         plant: The plant.
         robot: The key `robot` of the scenario.
         scene_graph: The scene graph for the plant's geometry; None leaves geometry out.
+        drawn: Whether the geometry will be drawn.
 
     Returns:
         The effort limits of the file.
@@ -87,7 +93,7 @@ def read_into(
     parser = Parser(plant)
     missing: dict[str, str] = {}
     base = [robot.base.weld] if robot.base is not None else []
-    copies = ReadableCopies(robot.leave_out, [*base, *robot.free])
+    copies = ReadableCopies(robot.leave_out, [*base, *robot.free], drawn)
     with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
@@ -121,7 +127,7 @@ def read_into(
         folders += [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
         folders += described[:2]  # The package and the repository of a description.
         check_resources(scene_graph, folders)
-        _warn_of_omitted(copies.left_out, scene_graph)
+        _warn_of_omitted(copies.left_out, scene_graph, drawn)
     return read_efforts(models)
 
 
@@ -185,14 +191,16 @@ def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
             joint.set_velocity_limits(-unlimited, unlimited)
 
 
-def _warn_of_omitted(unread: list[Path], scene_graph: SceneGraph) -> None:
-    """Warns of geometry that Drake cannot read, and of geometry that Meshcat cannot draw."""
+def _warn_of_omitted(unread: list[Path], scene_graph: SceneGraph, drawn: bool) -> None:
+    """Warns of geometry that Drake cannot read, and of drawn geometry that Meshcat cannot draw."""
     if unread:
         warnings.warn(
             f"geometry that Drake cannot read is left out: {_listed(unread)}; no equation needs it",
             GeometryWarning,
             stacklevel=2,
         )
+    if not drawn:
+        return
     inspector = scene_graph.model_inspector()
     shapes = [
         inspector.GetShape(geometry) for geometry in inspector.GetAllGeometryIds(Role.kIllustration)

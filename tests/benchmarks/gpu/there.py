@@ -86,7 +86,7 @@ def on_gpu(cupy: Any, case: Case, repeat: int = 3) -> tuple[float, float, tuple[
     return case.num_steps(count) / min(seconds), compiling, checked
 
 
-def on_processor(case: Case, threads: int, seconds: float = 0.5) -> float:
+def on_processor(case: Case, threads: int, seconds: float = 0.2, repeat: int = 5) -> float:
     """Returns steps/s of this machine's processor, by the same source."""
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder, "code.c"), Path(folder, "code.so")
@@ -96,18 +96,21 @@ def on_processor(case: Case, threads: int, seconds: float = 0.5) -> float:
         subprocess.run(command, check=True)
         run = ctypes.CDLL(str(library)).run_lanes
     count = 512 * threads
-    while True:
-        arrays = case.arguments(count)
-        batch = case.structure(count, {name: array.ctypes.data for name, array in arrays.items()})
-        started = time.perf_counter()
-        with ThreadPoolExecutor(threads) as pool:
-            for call in [pool.submit(run, ctypes.byref(batch)) for _ in range(threads)]:
-                call.result()
-        taken = time.perf_counter() - started
-        if taken > seconds:
-            case.check(arrays["rows"], arrays["endings"])
-            return case.num_steps(count) / taken
+    while _seconds(case, run, count, threads) < seconds:
         count *= 2
+    return case.num_steps(count) / min(_seconds(case, run, count, threads) for _ in range(repeat))
+
+
+def _seconds(case: Case, run: Any, count: int, threads: int) -> float:
+    arrays = case.arguments(count)
+    batch = case.structure(count, {name: array.ctypes.data for name, array in arrays.items()})
+    started = time.perf_counter()
+    with ThreadPoolExecutor(threads) as pool:
+        for call in [pool.submit(run, ctypes.byref(batch)) for _ in range(threads)]:
+            call.result()
+    taken = time.perf_counter() - started
+    case.check(arrays["rows"], arrays["endings"])
+    return taken
 
 
 def main() -> None:

@@ -28,8 +28,9 @@ from pydrake.systems.primitives import (
 from runs import both
 from scipy.linalg import expm
 
-from drake_dae import export_code, rollout, start_values
+from drake_dae import compile_diagram, export_code, rollout, start_values
 from drake_dae.errors import ModelError
+from drake_dae.running.rollout import program
 
 
 def fixed(step=1e-3):
@@ -342,3 +343,27 @@ def test_a_diagram_without_outputs_has_nothing_to_record():
     diagram = builder.Build()
     with pytest.raises(ModelError, match="nothing to record: export one"):
         start_values(diagram, diagram.CreateDefaultContext())
+
+
+def test_a_diagram_is_compiled_once(monkeypatch):
+    """To compile one takes many times as long as a short run; another diagram is another."""
+    made = []
+
+    def counted(diagram):
+        made.append(diagram)
+        return compile_diagram(diagram)
+
+    monkeypatch.setattr(program, "compile_diagram", counted)
+    ends = []
+    for factor in (1.0, 2.0):
+        builder = DiagramBuilder()
+        source = builder.AddSystem(ConstantVectorSource([factor]))
+        integrator = builder.AddSystem(Integrator(1))
+        builder.Connect(source.get_output_port(), integrator.get_input_port())
+        builder.ExportOutput(integrator.get_output_port(), "sum")
+        diagram = builder.Build()
+        for start in (0.0, 1.0):
+            (run,) = rollout(diagram, [start], None, [0.0, 0.5], config=fixed(), compiled=False)
+            ends.append(run.record["sum"][-1, 0] - start)
+    assert len(made) == 2
+    np.testing.assert_allclose(ends, [0.5, 0.5, 1.0, 1.0], rtol=1e-12)

@@ -313,3 +313,20 @@ def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float,
     )
     # .gltf has single precision; Drake's box has a margin of its own.
     np.testing.assert_allclose(np.ptp(corners, axis=1), unit * np.array([200, 200, 300]), rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
+def test_a_mesh_is_converted_only_for_a_robot_that_is_drawn(tmp_path: Path):
+    box_of_collada(tmp_path / "box.dae", 1.0)
+    file = tmp_path / "robot.urdf"
+    file.write_text(
+        '<robot name="r"><link name="a"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
+        'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'
+        '<mesh filename="box.dae"/></geometry></visual></link></robot>'
+    )
+    for drawn, name in ((False, "box.dae"), (True, "box.gltf")):
+        scene_graph = SceneGraph()
+        read_robot(Robot(str(file)), scene_graph, drawn)
+        inspector = scene_graph.model_inspector()
+        (one,) = inspector.GetAllGeometryIds(Role.kPerception)
+        assert Path(inspector.GetShape(one).source().path()).name == name

@@ -55,6 +55,7 @@ class ReadableCopies:
     Attributes:
         leave_out: The key `leave_out` of the scenario.
         placed: The links that the scenario welds or makes free, "base" or "left::base".
+        drawn: Whether visual meshes are converted to those that can be drawn everywhere.
         originals: A copy -> its original, with the same lines.
         left_out: The omitted meshes.
         repaired: The replaced inertias.
@@ -63,6 +64,7 @@ class ReadableCopies:
 
     leave_out: Collection[str]
     placed: Collection[str] = ()
+    drawn: bool = True
     originals: dict[Path, Path] = field(default_factory=dict)
     left_out: list[Path] = field(default_factory=list)
     repaired: list[RepairedInertia] = field(default_factory=list)
@@ -152,7 +154,7 @@ def _readable(
         text, left_out = without_assets(text, file)
     elif has_geometry:
         text, left_out = _without_collisions(text, file, packages)
-        text = _with_visuals(text, file, packages)
+        text = _with_visuals(text, file, packages) if copies.drawn else text
     if text == plain:
         return file, fixed
     if not _is_mjcf(file):  # Absolute names, since the copy is in another folder.
