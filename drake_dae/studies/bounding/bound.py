@@ -10,11 +10,12 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, number
 from drake_dae.errors import ModelError
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.figures import exceeded, margins
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.bounding.bounded import BoundedErrors, FailedRun
+from drake_dae.studies.bounding.declared_friction import declared_margin
 from drake_dae.studies.runs import Runner
 from drake_dae.studies.structures import structure_key, study_data
 from drake_dae.studies.variations import Variation, numbers_that_vary, variation_at
@@ -68,7 +69,8 @@ def bound_errors(
         rollout: Simulates by `rollout` instead of Drake's Simulator.
 
     Returns:
-        The bound, the share of each cause, and the corners at which a run fails.
+        The bound, the share of each cause, the corners at which a run fails, and how far the
+        highest declared friction is from the Painleve paradox.
 
     Raises:
         ScenarioError: A key or a value is not valid, or the loop cannot be built.
@@ -104,6 +106,8 @@ def bound_errors(
     runner = Runner(base, scenario.duration * len(variations) if rollout else None)
     if (error := runner.why_not(variations[0])) is not None:
         raise error
+    highest = variation_at(ranges, dict.fromkeys(names, 1.0))
+    top, margin = read_scenario(study_data(base, highest, rollout)), None
     found = _Found(after, len(names), first_corner, corners)
     order = _by_structure(base, variations, rollout)
     records = runner.records([(i, variations[i]) for i in order])
@@ -111,6 +115,9 @@ def bound_errors(
         found.add(i, record, reason, runner.limits)
         if not found.middle.size:
             raise ModelError(f"in the middle of all ranges the run fails: {reason}")
+        if i == 0 and record is not None:
+            middle_loop = runner.loop(study_data(base, variations[0], rollout))
+            margin = declared_margin(middle_loop, top, record)
     shares = dict(zip(names, found.shares[: len(names)], strict=True))
     if found.shares[-1].any():
         shares[NOISE] = found.shares[-1]
@@ -126,6 +133,7 @@ def bound_errors(
             FailedRun(points[min(i, len(points) - 1)], r) for i, r in found.reasons.items()
         ),
         events=dict(found.events),
+        friction_margin=margin,
         scenario=completed,
     )
 

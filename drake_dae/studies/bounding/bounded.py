@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from drake_dae.analysis.contact_text import contact_margin_as_dict
 from drake_dae.analysis.tables import Part, Table, count_of, to_markdown, to_text
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import ErrorBound
+from drake_dae.studies.bounding.declared_friction import in_words
 
 MOST_CAUSES = 12
 """The largest number of causes with a row of their own."""
@@ -48,6 +51,10 @@ class BoundedErrors:
         runs, corners: The number of all runs, and of random corners of the ranges.
         failed: The runs that ended early; with one of them there is no bound.
         events: "<signal>: contact lost" or "<signal>: beyond its limit" -> the number of corners.
+        friction_margin: The distance of the highest declared friction from the Painleve paradox,
+            along the run in the middle of all ranges, if contacts slide in their worst directions;
+            None without friction, with states besides those of rigid joints, or if the sliding
+            velocities of a contact are not known.
         scenario: The scenario with its law, for which this is the bound.
     """
 
@@ -60,6 +67,7 @@ class BoundedErrors:
     corners: int
     failed: tuple[FailedRun, ...]
     events: Mapping[str, int]
+    friction_margin: ContactMargin | None
     scenario: Scenario = field(repr=False)
 
     @property
@@ -131,6 +139,7 @@ class BoundedErrors:
             "corners": self.corners,
             "failed": [failed.reason for failed in self.failed],
             "events": dict(self.events),
+            "friction_margin": contact_margin_as_dict(self.friction_margin),
         }
 
     def _parts(self) -> list[Part]:
@@ -154,6 +163,8 @@ class BoundedErrors:
             f"{event} in {count} of {self.corners} corners of the ranges"
             for event, count in sorted(self.events.items())
         ]
+        if self.friction_margin is not None:
+            lines.append(in_words(self.friction_margin))
         if self.failed:
             lines.append(f"PROBLEM  {self._no_bound}")
         else:

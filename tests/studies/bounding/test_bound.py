@@ -55,6 +55,10 @@ def test_plants_within_the_ranges_keep_the_bound_and_others_do_not(tmp_path):
     scenario = load_scenario("two_link_wall", COMPLIANT)
     found = bound_errors(scenario, UNKNOWN, after=0.4, corners=16)
     assert set(found.shares) == {*UNKNOWN, "noise, jitter"}
+    # Contact of one point in a plane: A_nn is left by 1 - 0.5 / mu_crit, whatever way it slides.
+    margin = found.friction_margin
+    assert margin.reserve == pytest.approx(1.0 - 0.5 / margin.critical_friction["wall.friction"])
+    assert "the Painleve paradox is at wall.friction" in str(found)
     bounded = found.bounded_scenario
     # The law is written down: another stiffness of the plant does not change it.
     assert bounded.gains is not None
@@ -79,6 +83,7 @@ def test_a_run_that_fails_leaves_no_bound_and_its_cause_is_named():
         bound_errors(scenario, ranges, corners=8)
     ranges[START] = (0.0, 2.0)  # The tool reaches the middle, and not the end.
     found = bound_errors(scenario, ranges, corners=8)
+    assert found.friction_margin is None
     assert len(found.failed) == 1 + 4  # This end alone, and half of the corners.
     with pytest.raises(ModelError, match=f"no bound: 5 runs .* {START} at its high end"):
         _ = found.bound
