@@ -106,7 +106,8 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
         if not named:
             read()
         for entry, value in zip(rules, arguments, strict=False):
-            check(entry, value)
+            if (entry[0], type(value)) not in valid:  # As `check` does, without a call.
+                check(entry, value)
         for entry in rest:
             for value in arguments[len(rules) :]:
                 check(entry, value)

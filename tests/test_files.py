@@ -19,7 +19,7 @@ from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.scenario import read_scenario
+from drake_dae.scenario.scenario import read_scenario, scenario_data
 
 SIZE = (0.4, 0.3)
 
@@ -368,3 +368,11 @@ def test_plain_data_may_not_hold_it_either(data, key):
 def test_the_length_of_a_path_does_not_matter(tmp_path):
     with pytest.raises(DrakeDaeError):
         load_scenario(Path("a" * 5000))
+
+
+def test_half_a_letter_is_found_also_beside_parts_that_were_read_before():
+    data, known = scenario_data(scenario("two_link_wall")), dict[object, object]()
+    read_scenario(data, known=known)
+    read_scenario(data, known=known)
+    with pytest.raises(ScenarioError, match=r"description: .*half of a letter"):
+        read_scenario({**data, "description": "\ud800"}, known=known)

@@ -154,11 +154,12 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     """The gains of a scenario; those of the last run are reused if the design is the same."""
-    key, (last_key, design) = repr(gains), loop.memory.get("gains", ("", None))
-    if last_key != key:
-        law = loop.controller.law
-        design = law.design(gains.design(law.structure))
-        loop.memory["gains"] = key, design
+    last, last_key, design = loop.memory.get("gains", (None, "", None))
+    if last is not gains:
+        if last_key != (key := repr(gains)):
+            law = loop.controller.law
+            design = law.design(gains.design(law.structure))
+        loop.memory["gains"] = gains, key, design
     return cast(FeedbackGains, design)
 
 

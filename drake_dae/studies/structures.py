@@ -61,9 +61,16 @@ def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
     """
     own = {}
     for name, part in built_data(data, base).items():
-        if part is not base[name] and (text := _text(part)) != _text(base[name]):
+        if not _is_made_of(part, base[name]) and (text := _text(part)) != _text(base[name]):
             own[name] = text
     return _text(own)
+
+
+def _is_made_of(part: Any, other: Any) -> bool:
+    """Whether a part of data is another one, or a dictionary with the same objects, at once."""
+    if part is other or not (isinstance(part, dict) and isinstance(other, dict)):
+        return part is other
+    return part.keys() == other.keys() and all(part[key] is other[key] for key in part)
 
 
 def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:

@@ -101,6 +101,7 @@ class TrackingLaw:
         self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
+        self._last_gains: tuple[FeedbackGains | None, FloatArray] = None, np.empty(0)
         self.coordinates_function = self._trace_error_coordinates()
         self.function = self._trace()
 
@@ -236,6 +237,9 @@ class TrackingLaw:
         Raises:
             GainError: The gains do not fit, or couple outputs that the law does not.
         """
+        values = self.system.parameter_vector(parameters)
+        if gains is not None and gains is self._last_gains[0]:  # As in most runs of a study.
+            return np.concatenate([values, self._last_gains[1]])
         chosen = self.gains if gains is None else self.design(gains)
         has = self.gains.matrix != 0.0
         if np.any(chosen.matrix[~has]):
@@ -245,8 +249,10 @@ class TrackingLaw:
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
             )
-        values = self.system.parameter_vector(parameters)
-        return np.concatenate([values, chosen.matrix.T[has.T]])
+        entries = chosen.matrix.T[has.T]
+        if chosen is gains:
+            self._last_gains = chosen, entries
+        return np.concatenate([values, entries])
 
     @property
     def coordinate_signals(self) -> list[Signal]:

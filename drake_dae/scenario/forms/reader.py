@@ -9,7 +9,7 @@ import pydantic
 
 from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.forms import Form, ReadingContext
+from drake_dae.scenario.forms.forms import MOST_KNOWN, Form, ReadingContext
 from drake_dae.scenario.forms.problems import problem
 
 T = TypeVar("T")
@@ -45,8 +45,8 @@ class Reader(Generic[T]):
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
                 listed.
         """
-        # A fast test: repr shows half of a letter as \ud...
-        if "\\ud" in repr(data) and (unwritable := dict.fromkeys(_unwritable(data, ""))):
+        doubtful = _may_have_halves(data, {} if known is None else known)
+        if doubtful and (unwritable := dict.fromkeys(_unwritable(data, ""))):
             text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
             raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
@@ -61,6 +61,23 @@ class Reader(Generic[T]):
     def write(self, value: T) -> Any:
         """Converts a value to plain data, the inverse of `read`."""
         return self._adapter.dump_python(value, mode="json")
+
+
+def _may_have_halves(data: Any, known: dict[Any, Any]) -> bool:
+    """Whether a text in plain data may have half of a letter: repr shows it as a number.
+
+    Parts that were read before, by the cache of a `ReadingContext`, are not examined again.
+    """
+    if not isinstance(data, Mapping):
+        return "\\ud" in repr(data)
+    seen = known.setdefault("without halves", {})
+    if len(seen) >= MOST_KNOWN:
+        seen.clear()
+    new = {key: part for key, part in data.items() if seen.get(id(part), data) is not part}
+    if "\\ud" in repr(new):
+        return True
+    seen.update((id(part), part) for part in new.values())
+    return False
 
 
 def _unwritable(data: Any, key: str) -> Iterator[str]:
