@@ -101,8 +101,24 @@ A tool of a light arm has a third of the mass, so that it needs shorter samples 
 are rougher, and the gains that are smooth enough become slow.
 """
 
-UNBOUNDED = ["xarm7-soft", "xarm7-hard", "xarm7-steel"]
+UNBOUNDED = ["xarm7-hard", "xarm7-steel"]
 """Classes in which runs at some corners of the ranges diverge: they run only if they are named."""
+
+POSTURES = {
+    "xarm7-soft": (
+        "constraints.0.surface.point=[0.23, 0.22, 0.184]",
+        "references.link_eef.xy.center=[0.23, 0.22]",
+        "references.joint2=-1.03",
+        "references.joint7=-1.57",
+        "start.positions={joint1: -1.40, joint2: -1.03, joint3: 1.72, joint4: 0.82,"
+        " joint5: -1.90, joint6: -1.11, joint7: -1.57}",
+    )
+}
+"""Settings of a class for another place and posture than those that `drake-dae new` chooses.
+
+There the Painleve paradox of xarm7 is at a friction of 0.85, and runs at 12 of 128 corners diverge;
+here it is at 1.24.
+"""
 
 
 def scenario_of(name: str, kind: str, folder: Path) -> Scenario:
@@ -129,6 +145,7 @@ def scenario_of(name: str, kind: str, folder: Path) -> Scenario:
         f"plant_disturbances=[{{frame: {frame}, force: [0, 0, 0], start_time: {PUSHED},"
         f" end_time: {PUSHED + 0.1}}}]",
         f"duration={DURATION}",
+        *POSTURES.get(f"{name}-{kind}", ()),
     ]
     return for_rollout(dd.load_scenario(file, settings))[0]
 
