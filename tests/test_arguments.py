@@ -254,7 +254,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
     FailedRun: lambda: FailedRun({"link1.mass": 1.0}, "no start"),
     dd.BoundedErrors: lambda: dd.BoundedErrors(
-        (dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, scenario()
+        (dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, None, scenario()
     ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),

@@ -80,7 +80,7 @@ def add_observer(
     observer: Observer
     if observing.state_rate is None:
         observer = builder.AddSystem(
-            DisturbanceObserver(controller.law, observing, period, lag, delay)
+            DisturbanceObserver(controller.law, observing, period, lag, delay, plant.is_ideal)
         )
         builder.Connect(observed_state, observer.GetInputPort("estimated_state"))
     elif controller.observed is not None:
@@ -89,8 +89,10 @@ def add_observer(
             "springs; leave it out, and measure the velocities"
         )
     else:
-        timing = period, lag, delay
-        observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
+        timing = period, lag, delay, step
+        observer = builder.AddSystem(
+            _estimator(controller.law, observing, timing, encoders, plant.is_ideal)
+        )
         builder.Connect(state, observer.GetInputPort("measured_state"))
         state = observer.GetOutputPort("estimated_state")
     builder.Connect(state, controller.GetInputPort("estimated_state"))
@@ -121,9 +123,9 @@ def control_lag(plant: Plant, sampling: Sampling | None) -> float:
 def _estimator(
     law: TrackingLaw,
     observing: Observing,
-    timing: tuple[float, float, float],
-    step: float,
+    timing: tuple[float, float, float, float],
     encoders: Encoders | None,
+    is_ideal: bool,
 ) -> StateEstimator:
     if encoders is None:
         raise WiringError(
@@ -137,6 +139,6 @@ def _estimator(
         )
     noise = encoders.position_deviation, encoders.velocity_noise
     try:
-        return StateEstimator(law, observing, *timing, step, *noise)
+        return StateEstimator(law, observing, *timing, *noise, is_ideal)
     except ModelError as error:
         raise WiringError(str(error)) from None

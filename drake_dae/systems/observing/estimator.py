@@ -71,6 +71,7 @@ class StateEstimator(ObservingSystem):
         position_deviation: The standard deviation of a measured position, in rad or m, a number or
             shape (k,).
         velocity_deviation: That of a measured velocity, likewise; 0 if none is measured.
+        is_ideal: As of a `DisturbanceObserver`.
 
     Attributes:
         observation: The observed functions.
@@ -94,6 +95,7 @@ class StateEstimator(ObservingSystem):
         plant_step: float = 0.0,
         position_deviation: ArrayLike = 0.0,
         velocity_deviation: ArrayLike = 0.0,
+        is_ideal: bool = False,
     ) -> None:
         super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("state_estimator")
@@ -107,7 +109,9 @@ class StateEstimator(ObservingSystem):
         ]
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
-        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
+        self._functions = functions = EstimatorFunctions(
+            law, observing, *timing, filters, noise[0], is_ideal
+        )
         start = np.zeros(functions.now.arguments[functions.now.input_names.index("held")].size)
         start[0] = -1.0
         self._declare(law, functions, "measured_state", start)

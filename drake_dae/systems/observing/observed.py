@@ -15,8 +15,8 @@ from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 _SHARP = 10.0
-"""Friction here is that of a motion faster by this factor: it is fully developed from v_s / 10 on.
-"""
+"""Friction of a contact that gives way is taken as that of a motion faster by this factor: it is
+fully developed from v_s / 10 on. An ideal contact has the friction of the model."""
 
 
 class Estimates(Protocol):
@@ -84,14 +84,17 @@ class Observed:
         hold: (v, hold) -> 1 if integrals are not updated, otherwise 0.
 
     Args:
-        law, observing: The arguments of the observer.
+        law, observing, is_ideal: The arguments of the observer.
         period: Its sample period in s.
 
     Raises:
         ModelError: The law's system has no disturbance.
     """
 
-    def __init__(self, law: TrackingLaw, observing: Observing, period: float) -> None:
+    def __init__(
+        self, law: TrackingLaw, observing: Observing, period: float, is_ideal: bool
+    ) -> None:
+        self._sharpness = 1.0 if is_ideal else _SHARP
         self.observation = observation = Observation.of(law.structure, law.layout)
         self._system, self._observing, self._period = law.system, observing, period
         self._stops = [0, *accumulate(observation.widths)]
@@ -127,7 +130,7 @@ class Observed:
             moved = [function(state, d, parameters)[0] for d in ca.horzsplit(columns)]
             return ca.horzcat(ca.SX(columns.shape[0], 0), *moved)
 
-        is_slow = friction[1] < _SHARP * self._observing.least_speed
+        is_slow = friction[1] < self._sharpness * self._observing.least_speed
         sticks = ca.logic_and(is_slow, ca.logic_not(self._is_lost))
         held = self._side_by_side(planes, sticks)
         slides = ca.logic_not(ca.logic_or(is_slow, self._is_lost))
@@ -210,7 +213,7 @@ class Observed:
         return f(state, parameters) - f(state, without)
 
     def _faster(self, state: ca.SX) -> ca.SX:
-        """The state with velocities increased by `_SHARP`."""
+        """The state in whose motion the model's friction is that of the contact."""
         faster, rows = ca.SX(state), list(self.observation.rows)
-        faster[rows] = _SHARP * faster[rows]
+        faster[rows] = self._sharpness * faster[rows]
         return faster

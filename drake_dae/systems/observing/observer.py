@@ -78,6 +78,8 @@ class DisturbanceObserver(ObservingSystem):
             continuous plant.
         control_delay: tau in s, the mean time from a sample until its control acts: the delay, and
             half of T, for which it is held.
+        is_ideal: Whether the contacts of the plant are ideal, with the friction of the model. On a
+            contact that gives way friction is fully developed at a tenth of the speed.
 
     Attributes:
         observation: The observed functions.
@@ -98,11 +100,12 @@ class DisturbanceObserver(ObservingSystem):
         sample_period: float,
         control_lag: float = 0.0,
         control_delay: float = 0.0,
+        is_ideal: bool = False,
     ) -> None:
         super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("disturbance_observer")
         self._functions = functions = ObserverFunctions(
-            law, observing, sample_period, control_lag, control_delay
+            law, observing, sample_period, control_lag, control_delay, is_ideal
         )
         start = np.zeros(functions.memory.column.numel())
         start[start.size - functions.filter.start.size :] = functions.filter.start

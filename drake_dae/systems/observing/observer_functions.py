@@ -82,7 +82,7 @@ class ObserverFunctions(Observed):
             derivatives.
 
     Args:
-        law, observing: The arguments of the observer.
+        law, observing, is_ideal: The arguments of the observer.
         period, lag, delay: Its `sample_period`, `control_lag` and `control_delay`.
 
     Raises:
@@ -90,9 +90,15 @@ class ObserverFunctions(Observed):
     """
 
     def __init__(
-        self, law: TrackingLaw, observing: Observing, period: float, lag: float, delay: float
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        period: float,
+        lag: float,
+        delay: float,
+        is_ideal: bool,
     ) -> None:
-        super().__init__(law, observing, period)
+        super().__init__(law, observing, period, is_ideal)
         self._lag, self._delay, self._reference_size = lag, delay, law.layout.reference_size
         rates = observing.rate, observing.force_rate or observing.rate
         degree, size = disturbance_degree(law), len(self.observation.rows)
