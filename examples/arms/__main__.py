@@ -262,6 +262,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rollout", action="store_true", help="as one compiled function")
     parser.add_argument("--pegs", type=int, metavar="N", help="N pegs in random holes, by each arm")
     options = parser.parse_args(arguments)
+    if options.pegs is not None and options.pegs < 1:
+        parser.error(f"--pegs is their number, 1 or more, got {options.pegs}")
     runs = [run for run in RUNS if options.pegs is None or RUNS[run][0] is peg_in_hole]
     worst = 0
     for run in options.runs or runs:

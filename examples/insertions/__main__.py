@@ -164,6 +164,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--rollout", action="store_true", help="run the contact as it is traced")
     options = parser.parse_args(arguments)
+    if options.runs < 1:
+        parser.error(f"--runs is their number, 1 or more, got {options.runs}")
     peaks = predicted(options.scenario, options.set)
     print("predicted: " + ", ".join(f"{name} {peak:.3g} N" for name, peak in peaks.items()))
     (constraint,) = dd.load_scenario(options.scenario, options.set).constraints

@@ -57,6 +57,9 @@ def test_pegs_that_are_too_thick_are_counted_as_not_inserted(example, capsys):
     with pytest.raises(SystemExit):
         example.main(["flat_press-ur5", "--pegs", "1"])
     assert "no run 'flat_press-ur5'" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        example.main(["peg_in_hole-ur5", "--pegs", "0"])
+    assert "--pegs is their number, 1 or more, got 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
