@@ -89,10 +89,8 @@ def add_observer(
             "springs; leave it out, and measure the velocities"
         )
     else:
-        timing = period, lag, delay, step
-        observer = builder.AddSystem(
-            _estimator(controller.law, observing, timing, encoders, plant.is_ideal)
-        )
+        timing = period, lag, delay
+        observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
         builder.Connect(state, observer.GetInputPort("measured_state"))
         state = observer.GetOutputPort("estimated_state")
     builder.Connect(state, controller.GetInputPort("estimated_state"))
@@ -123,9 +121,9 @@ def control_lag(plant: Plant, sampling: Sampling | None) -> float:
 def _estimator(
     law: TrackingLaw,
     observing: Observing,
-    timing: tuple[float, float, float, float],
+    timing: tuple[float, float, float],
+    step: float,
     encoders: Encoders | None,
-    is_ideal: bool,
 ) -> StateEstimator:
     if encoders is None:
         raise WiringError(
@@ -139,6 +137,6 @@ def _estimator(
         )
     noise = encoders.position_deviation, encoders.velocity_noise
     try:
-        return StateEstimator(law, observing, *timing, *noise, is_ideal)
+        return StateEstimator(law, observing, *timing, step, *noise)
     except ModelError as error:
         raise WiringError(str(error)) from None

@@ -63,8 +63,8 @@ def in_words(margin: ContactMargin) -> str:
 def _friction(scenario: Scenario, names: list[str], system: DaeSystem) -> dict[str, float]:
     """The coefficient of friction of each contact of the plant of a scenario."""
     material = scenario.plant.material
-    if material is not None:
-        return dict.fromkeys(names, material.friction or 0.0)
+    if material is not None and material.friction is not None:
+        return dict.fromkeys(names, material.friction)
     values, own = system.parameter_values, scenario.plant_parameters
     of_law = {name: float(values[system.parameter_slice(name)].item()) for name in names}
     return {name: float(np.squeeze(own.get(name, of_law[name]))) for name in names}

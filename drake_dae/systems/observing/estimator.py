@@ -42,8 +42,9 @@ class StateEstimator(ObservingSystem):
     directions, M^-1 J^T A^-1 J e, the gains are those of k_n in place of k_o. Measured velocities,
     if their noise is given, correct likewise. Friction takes its share of r as in a
     `DisturbanceObserver`, and so does a contact that sticks. In the prediction friction is
-    implicit, and at most stops a contact. At its first break-away a contact has a filter of its
-    own, `BreakAway`.
+    implicit, and at most stops a contact; it is fully developed from v_s / 10 on also where
+    contacts are ideal, since an estimate with the model's own friction grew without bound there. At
+    its first break-away a contact has a filter of its own, `BreakAway`.
 
     Input ports:
         measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
@@ -71,7 +72,6 @@ class StateEstimator(ObservingSystem):
         position_deviation: The standard deviation of a measured position, in rad or m, a number or
             shape (k,).
         velocity_deviation: That of a measured velocity, likewise; 0 if none is measured.
-        is_ideal: As of a `DisturbanceObserver`.
 
     Attributes:
         observation: The observed functions.
@@ -95,7 +95,6 @@ class StateEstimator(ObservingSystem):
         plant_step: float = 0.0,
         position_deviation: ArrayLike = 0.0,
         velocity_deviation: ArrayLike = 0.0,
-        is_ideal: bool = False,
     ) -> None:
         super().__init__(law, observing, sample_period, control_lag, control_delay)
         self.set_name("state_estimator")
@@ -109,9 +108,7 @@ class StateEstimator(ObservingSystem):
         ]
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
-        self._functions = functions = EstimatorFunctions(
-            law, observing, *timing, filters, noise[0], is_ideal
-        )
+        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
         start = np.zeros(functions.now.arguments[functions.now.input_names.index("held")].size)
         start[0] = -1.0
         self._declare(law, functions, "measured_state", start)

@@ -33,7 +33,7 @@ class EstimatorFunctions(Observed):
             derivatives.
 
     Args:
-        law, observing, is_ideal: The arguments of the estimator.
+        law, observing: The arguments of the estimator.
         period, lag, delay, step: Its `sample_period`, `control_lag`, `control_delay` and
             `plant_step`.
         filters: Its filters along the free and the constrained directions, one for each position.
@@ -53,9 +53,8 @@ class EstimatorFunctions(Observed):
         step: float,
         filters: tuple[list[ChainFilter], list[ChainFilter]],
         deviations: FloatArray | float = 0.0,
-        is_ideal: bool = False,
     ) -> None:
-        super().__init__(law, observing, period, is_ideal)
+        super().__init__(law, observing, period)
         system = self._system
         _check_rigid(law, self.observation.rows)
         if self.observation.identified.parameters:

@@ -84,15 +84,16 @@ class Observed:
         hold: (v, hold) -> 1 if integrals are not updated, otherwise 0.
 
     Args:
-        law, observing, is_ideal: The arguments of the observer.
+        law, observing: The arguments of the observer.
         period: Its sample period in s.
+        is_ideal: Whether friction is that of the model at small speeds, too.
 
     Raises:
         ModelError: The law's system has no disturbance.
     """
 
     def __init__(
-        self, law: TrackingLaw, observing: Observing, period: float, is_ideal: bool
+        self, law: TrackingLaw, observing: Observing, period: float, is_ideal: bool = False
     ) -> None:
         self._sharpness = 1.0 if is_ideal else _SHARP
         self.observation = observation = Observation.of(law.structure, law.layout)

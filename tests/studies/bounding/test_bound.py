@@ -25,6 +25,11 @@ COMPLIANT = (
     "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}",
     "duration=0.8",
 )
+SENSED = (
+    "gains=",
+    "sampling={period: 0.001, delay: 0.001}",
+    "force_feedback=!MeasuredForce {sample_period: 0.001}",
+)
 UNKNOWN = {
     "plant.friction": (0.1, 0.5),
     "plant.stiffness": (3e4, 1e5),
@@ -73,6 +78,23 @@ def test_plants_within_the_ranges_keep_the_bound_and_others_do_not(tmp_path):
     again = tmp_path / "bounded.yaml"
     save_scenario(bounded, again)
     assert load_scenario(again).error_bound == bounded.error_bound
+
+
+@pytest.mark.parametrize(
+    ("settings", "friction"),
+    [
+        ((), 0.3),  # Of the constraint.
+        (("plant_parameters={wall.friction: 0.1}",), 0.1),
+        (("plant=!CompliantContact {time_step: 0.001}", *SENSED), 0.3),
+        (("plant=!CompliantContact {time_step: 0.001, friction: 0.2}", *SENSED), 0.2),
+    ],
+)
+def test_the_margin_of_friction_is_that_of_the_plant(settings, friction):
+    settings = (*TWO_LINK, "constraints.0.friction=0.3", "duration=0.1", *settings)
+    ranges = {"plant_parameters.link2.mass": (5.9, 6.1)}
+    margin = bound_errors(load_scenario("two_link_wall", settings), ranges, corners=8)
+    found = margin.friction_margin
+    assert found.reserve == pytest.approx(1.0 - friction / found.critical_friction["wall.friction"])
 
 
 def test_a_run_that_fails_leaves_no_bound_and_its_cause_is_named():
