@@ -4,10 +4,9 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain
 from threading import Lock
 from typing import Any, cast
 
@@ -106,20 +105,18 @@ class Runner:
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
         """Simulates runs; yields their results in the same order."""
-        for started in self._started(batch):
-            self._judge_together(started)
-            for run in started:
-                if isinstance(run, RunResult):
-                    yield run
-                else:
-                    yield run.result or self._timed(run.number, run.seconds, self._finish, run)
+        for run in self._started(batch):
+            if isinstance(run, RunResult):
+                yield run
+            else:
+                yield run.result or self._timed(run.number, run.seconds, self._finish, run)
 
     def records(self, batch: Batch) -> Iterator[tuple[Record | None, str]]:
         """Simulates runs; yields the record of each, and the reason if it ended early.
 
         The record is None if a run has no start.
         """
-        for run in chain.from_iterable(self._started(batch)):
+        for run in self._started(batch):
             if isinstance(run, RunResult):
                 yield None, run.reason
                 continue
@@ -134,7 +131,7 @@ class Runner:
             else:
                 yield record, "" if failure is None else str(failure)
 
-    def _started(self, batch: Batch) -> Iterator[list["_StartedRun | RunResult"]]:
+    def _started(self, batch: Batch) -> Iterator["_StartedRun | RunResult"]:
         """Starts runs, with their rollouts where these can be computed together."""
         size = 1 if self._lasting is None else TOGETHER
         for first in range(0, len(batch), size):
@@ -144,7 +141,7 @@ class Runner:
             ]
             rolled = [run for run in started if isinstance(run, _StartedRun)]
             self._roll_together(rolled)
-            yield started
+            yield from started
             if self._lasting is not None:
                 self._contexts += [run.context for run in rolled if run.loop is self._built]
 
@@ -188,33 +185,27 @@ class Runner:
         return unused
 
     def _roll_together(self, started: Sequence["_StartedRun"]) -> None:
-        """Computes the rollouts of runs with the same loop together; others stay None."""
+        """Computes rollouts and results of runs with the same loop together; others stay None."""
         if self._lasting is None:
             return
         from drake_dae.scenario.rolled import roll_together
 
         for loop in dict.fromkeys(run.loop for run in started):
-            runs = [run for run in started if run.loop is loop]
+            runs, began = [run for run in started if run.loop is loop], time.perf_counter()
             scenarios, contexts = [run.scenario for run in runs], [run.context for run in runs]
             # `_finish` repeats what fails, and reports it.
-            with _shared_time(runs), suppress(Exception), warnings.catch_warnings():
+            with suppress(Exception), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 for together in roll_together(scenarios, loop, contexts, self._lasting):
-                    for index, place in enumerate(together.places):
-                        runs[place].rolled = together, index
-
-    def _judge_together(self, started: Sequence["_StartedRun | RunResult"]) -> None:
-        """Computes the results of runs that were rolled out together."""
-        groups: dict[int, list[_StartedRun]] = {}
-        for run in started:
-            if isinstance(run, _StartedRun) and run.rolled is not None:
-                groups.setdefault(id(run.rolled[0]), []).append(run)
-        for runs in groups.values():
-            results: list[RunResult] = []
-            with _shared_time(runs), suppress(Exception):  # As above.
-                results = _results(cast(Any, runs[0].rolled)[0], runs)
-            for run, result in zip(runs, results, strict=False):
-                run.result = replace(result, seconds=run.seconds)
+                    some = [runs[place] for place in together.places]
+                    for index, run in enumerate(some):
+                        run.rolled = together, index
+                    for run, result in zip(some, _results(together, some), strict=True):
+                        run.result = result
+            seconds = (time.perf_counter() - began) / len(runs)
+            for run in runs:
+                run.seconds += seconds
+                run.result = run.result and replace(run.result, seconds=run.seconds)
 
     def _alone(self, run: "_StartedRun") -> tuple[Record, int, SimulationError | None]:
         """Simulates a run; returns record, steps, and failure if any."""
@@ -258,18 +249,6 @@ class _StartedRun:
     rolled: tuple[RunsTogether, int] | None = None
     seconds: float = 0.0
     result: RunResult | None = None
-
-
-@contextmanager
-def _shared_time(runs: Sequence[_StartedRun]) -> Iterator[None]:
-    """Adds the time of the block to that of runs, in equal parts."""
-    began = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds = (time.perf_counter() - began) / len(runs)
-        for run in runs:
-            run.seconds += seconds
 
 
 def _results(together: RunsTogether, runs: Sequence[_StartedRun]) -> list[RunResult]:
