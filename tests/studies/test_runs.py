@@ -298,19 +298,19 @@ def test_runs_side_by_side_are_those_of_a_batch_of_one():
     runs = [(i, {"gains.all": [gain]}) for i, gain in enumerate(gains)]
     runs += [(5, {"gains.all": [-14.0], "may_diverge": True, "duration": 1.8})]
     runner = Runner(base, 1e6)
-    together = list(runner.run_all(runs))
-    for run, result in zip(runs, together, strict=True):
-        (alone,) = runner.run_all([run])
-        assert replace(alone, seconds=0.0) == replace(result, seconds=0.0)
+    together, records = list(runner.run_all(runs)), list(runner.records(runs))
     assert [r.run for r in together if r.outcome == Outcome.FAILED] == [1, 3]
-    records = list(runner.records(runs))
-    for (record, reason), result in zip(records, together, strict=True):
+    for run, result, (record, reason) in zip(runs, together, records, strict=True):
+        if result.outcome == Outcome.FINISHED:  # Others enlarge the round-off of a step.
+            (alone,) = runner.run_all([run])
+            assert replace(alone, seconds=0.0) == replace(result, seconds=0.0)
         assert reason == result.reason
-        assert record.time[-1] == result.figures["end [s]"]
-        errors = np.abs(record["tracking_error"]).max(axis=0)
-        found = [value for name, value in result.figures.items() if "largest error" in name]
-        np.testing.assert_array_equal(errors, found)
-    assert "the run diverges" in records[3][1]
+        one, figures = indexed_record(record, None), dict(result.figures)
+        assert (figures.pop("steps", None) is None) == (result.outcome == Outcome.FAILED)
+        limits = Limits.of(runner.loop(base).plant.model)
+        assert figures == figures_of(one, margins(one, limits))[0]
+    for record, reason in (records[1], records[3]):
+        assert f"the run diverges: at t = {record.time[-1]:.6g} s" in reason
 
 
 def test_steps_do_not_begin_before_zero():
