@@ -1,15 +1,20 @@
 """A scenario, completed and built."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import outputs_named
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.signals import Signal, outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.forms.keys import at, violated
@@ -37,6 +42,14 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
+def complete_with_law(scenario: Scenario) -> Completed:
+    """Completes a scenario, also by gains, without building its loop.
+
+    Errors are as for `build_scenario`.
+    """
+    return _prepared(scenario, SceneGraph(), drawn=False).completed
+
+
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
 ) -> tuple[Completed, ClosedLoop]:
@@ -44,10 +57,45 @@ def build_completed(
 
     Arguments and errors are as for `build_scenario` and `build_loop`.
     """
+    scene_graph = SceneGraph()
+    prepared = _prepared(scenario, scene_graph)
+    check_error_bound(prepared.completed.scenario, prepared.model.dae.output_signals)
+    return prepared.completed, build_loop(
+        prepared.completed.scenario,
+        prepared.model,
+        prepared.structure,
+        scene_graph,
+        meshcat,
+        motion=prepared.motion,
+        commands=commands,
+    )
+
+
+def check_error_bound(scenario: Scenario, outputs: Sequence[Signal]) -> None:
+    """Checks that the `error_bound` of a scenario, if it has one, is one of its outputs.
+
+    Raises:
+        ScenarioError: It names another signal.
+    """
+    if scenario.error_bound is not None:
+        with at("error_bound"):
+            outputs_named(scenario.error_bound.outputs, outputs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A completed scenario, and what `build_loop` needs besides."""
+
+    completed: Completed
+    model: RobotModel
+    structure: Structure
+    motion: TimedScenario | None
+
+
+def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
     if scenario.task is not None:
         check_task(scenario)
-    scene_graph = SceneGraph()
-    completed, model = completed_model(scenario, scene_graph)
+    completed, model = completed_model(scenario, scene_graph, drawn=drawn)
     try:
         structure = scenario_structure(model, scenario.task)
     except AssumptionError as error:
@@ -57,16 +105,5 @@ def build_completed(
     in_time, motion = timed(slowed.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
     if (bound := in_time.scenario.error_bound) is not None:
-        with at("error_bound"):
-            outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
-    completed = Completed(in_time.scenario, notes)
-    return completed, build_loop(
-        completed.scenario,
-        model,
-        structure,
-        scene_graph,
-        meshcat,
-        motion=motion,
-        commands=commands,
-    )
+    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Lock
+from threading import Lock, local
 from typing import TYPE_CHECKING, Any, cast
 
 from pydrake.systems.framework import Context
@@ -22,7 +22,7 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
-from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.build import build_completed, check_error_bound
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import exceeded, margins, run_figures
@@ -30,7 +30,14 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.structures import TOGETHER, Batch, built_data, structure_key, study_data
+from drake_dae.studies.structures import (
+    TOGETHER,
+    Batch,
+    built_data,
+    data_text,
+    structure_key,
+    study_data,
+)
 from drake_dae.studies.variations import Variation
 
 if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
@@ -69,7 +76,7 @@ class Runner:
             self.builds += 1
             built = built_data(data, self._completed)
             try:
-                self._built = build_completed(read_scenario(built))[1]
+                self._built = _loop_of(built)
             except DrakeDaeError as error:
                 self._built = error
             self._key = key
@@ -229,6 +236,33 @@ class Runner:
         if failure is not None:
             return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
         return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
+
+
+class _LastLoop(local):
+    """The loop that was built last in this thread, and a text of the data that it was built from.
+
+    `bound_errors` and a study of the same scenario thus share a loop, and its machine code.
+    """
+
+    text, loop = "", cast(ClosedLoop | None, None)
+
+
+_last = _LastLoop()
+
+
+def _loop_of(built: Mapping[str, Any]) -> ClosedLoop:
+    """Builds the loop of complete data, unless it was the last one that was built.
+
+    Raises:
+        DrakeDaeError: It cannot be built.
+    """
+    text, scenario = data_text({**built, "error_bound": None}), read_scenario(built)
+    if _last.loop is None or text != _last.text:
+        _last.loop = None  # It takes memory while the other one is built.
+        _last.loop = build_completed(replace(scenario, error_bound=None))[1]
+        _last.text = text
+    check_error_bound(scenario, _last.loop.plant.dae.output_signals)
+    return _last.loop
 
 
 @dataclass(eq=False)

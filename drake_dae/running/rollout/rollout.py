@@ -192,8 +192,6 @@ def run_together(
     problems = problems_of(request.program, starts, parameters, request.times, seeds)
     rollouts: list[Rollout | None] = [None] * len(problems)
     for program, indices in _kinds(request.program, problems):
-        if request.machine_code(program, 1) is None:
-            continue
         lanes = request.lanes(program, len(problems))
         if lanes is None:
             continue
