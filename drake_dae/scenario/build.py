@@ -1,6 +1,5 @@
 """A scenario, completed and built."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pydrake.geometry import Meshcat, SceneGraph
@@ -8,7 +7,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import Signal, outputs_named
+from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -59,7 +58,6 @@ def build_completed(
     """
     scene_graph = SceneGraph()
     prepared = _prepared(scenario, scene_graph)
-    check_error_bound(prepared.completed.scenario, prepared.model.dae.output_signals)
     return prepared.completed, build_loop(
         prepared.completed.scenario,
         prepared.model,
@@ -69,17 +67,6 @@ def build_completed(
         motion=prepared.motion,
         commands=commands,
     )
-
-
-def check_error_bound(scenario: Scenario, outputs: Sequence[Signal]) -> None:
-    """Checks that the `error_bound` of a scenario, if it has one, is one of its outputs.
-
-    Raises:
-        ScenarioError: It names another signal.
-    """
-    if scenario.error_bound is not None:
-        with at("error_bound"):
-            outputs_named(scenario.error_bound.outputs, outputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,5 +92,7 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
     in_time, motion = timed(slowed.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
     if (bound := in_time.scenario.error_bound) is not None:
+        with at("error_bound"):
+            outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
     return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)

@@ -20,8 +20,7 @@ TOGETHER = 32
 _OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
 """The keys of a scenario that the closed loop does not depend on."""
 
-data_text = json.JSONEncoder(sort_keys=True).encode
-"""Returns a text of plain data that is equal for equal data."""
+_text = json.JSONEncoder(sort_keys=True).encode
 
 Batch = Sequence[tuple[int, Variation]]
 """(number, variation) of runs with one structure."""
@@ -62,9 +61,9 @@ def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
     """
     own = {}
     for name, part in built_data(data, base).items():
-        if not _is_made_of(part, base[name]) and (text := data_text(part)) != data_text(base[name]):
+        if not _is_made_of(part, base[name]) and (text := _text(part)) != _text(base[name]):
             own[name] = text
-    return data_text(own)
+    return _text(own)
 
 
 def _is_made_of(part: Any, other: Any) -> bool:

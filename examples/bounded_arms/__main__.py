@@ -35,10 +35,9 @@ import drake_dae as dd
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.rolled import for_rollout
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import USED
 from drake_dae.studies.processes import cores
-from drake_dae.studies.runs import Runner
 
 ROBOTS = Path(
     sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots"
@@ -218,13 +217,10 @@ def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict
     save_scenario(scenario, folder / "bounded.yaml")
     drawn = dd.random_variations(ranges, count, seed=seed + 1)
     variations = [{**run, **own} for run, own in zip(drawn, seeds(count, seed), strict=True)]
-    # In this process: it has the loop of the scenario, and the machine code, already.
-    runner = Runner(scenario_data(scenario), DURATION * (found.runs + count))
-    results = list(runner.run_all(list(enumerate(variations))))
+    study = found.study(variations)
     with open(folder / "runs.jsonl", "w", encoding="utf-8") as file:
-        for changes, result in zip(variations, results, strict=True):
+        for changes, result in zip(study.variations, study.results, strict=True):
             file.write(json.dumps({**result.to_dict(), "variation": changes}) + "\n")
-    study = dd.Study(tuple(variations), tuple(results), scenario, True)
     signals = scenario.error_bound.outputs
     units = {
         each: "m" if each.endswith((".x", ".y")) else "N" if each.endswith(".force") else "rad"
@@ -248,7 +244,7 @@ def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict
         "period": scenario.sampling.period,
         "resolution": scenario.encoders.resolution,
         "runs": count,
-        "failed": sum(str(result.outcome) != "finished" for result in results),
+        "failed": sum(str(result.outcome) != "finished" for result in study.results),
         "held": int(np.sum(used <= 1.0)),
         "worst": float(np.nanmax(used)),
         "ratios": ratios,
