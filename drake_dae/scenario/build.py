@@ -1,16 +1,20 @@
 """A scenario, completed and built."""
 
+from dataclasses import dataclass
+
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.forms.keys import at, violated
@@ -38,6 +42,14 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
+def complete_with_law(scenario: Scenario) -> Completed:
+    """Completes a scenario, also by gains, without building its loop.
+
+    Errors are as for `build_scenario`.
+    """
+    return _prepared(scenario, SceneGraph(), drawn=False).completed
+
+
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
 ) -> tuple[Completed, ClosedLoop]:
@@ -45,10 +57,36 @@ def build_completed(
 
     Arguments and errors are as for `build_scenario` and `build_loop`.
     """
+    scene_graph = SceneGraph()
+    prepared = _prepared(scenario, scene_graph)
+    scenario, model, structure = prepared.completed.scenario, prepared.model, prepared.structure
+    loop = build_loop(
+        scenario,
+        model,
+        structure,
+        scene_graph,
+        meshcat,
+        motion=prepared.motion,
+        commands=commands,
+    )
+    sticking = sticking_before(scenario, model, structure)
+    return Completed(scenario, (*prepared.completed.notes, *filter(None, [sticking]))), loop
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A completed scenario, and what `build_loop` needs besides."""
+
+    completed: Completed
+    model: RobotModel
+    structure: Structure
+    motion: TimedScenario | None
+
+
+def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
     if scenario.task is not None:
         check_task(scenario)
-    scene_graph = SceneGraph()
-    completed, model = completed_model(scenario, scene_graph)
+    completed, model = completed_model(scenario, scene_graph, drawn=drawn)
     try:
         structure = scenario_structure(model, scenario.task)
     except AssumptionError as error:
@@ -61,15 +99,4 @@ def build_completed(
         with at("error_bound"):
             outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
-    scenario = in_time.scenario
-    loop = build_loop(
-        scenario,
-        model,
-        structure,
-        scene_graph,
-        meshcat,
-        motion=motion,
-        commands=commands,
-    )
-    sticking = sticking_before(scenario, model, structure)
-    return Completed(scenario, (*notes, *filter(None, [sticking]))), loop
+    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)

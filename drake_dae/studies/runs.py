@@ -5,6 +5,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
@@ -83,6 +84,22 @@ class Runner:
             raise self._built
         return cast(ClosedLoop, self._built)
 
+    def of(self, base: Mapping[str, Any]) -> "Runner":
+        """Returns the runner of another scenario, with the loop of this one.
+
+        Args:
+            base: Its plain data, which differ in keys that the loop does not depend on, such as
+                `error_bound`.
+        """
+        other = copy(self)
+        other._base, other._read = base, {}
+        return other
+
+    @property
+    def is_rollout(self) -> bool:
+        """Whether the runs are rollouts."""
+        return self._lasting is not None
+
     @property
     def limits(self) -> Limits:
         """The limits of the robot whose loop was built last."""
@@ -95,14 +112,14 @@ class Runner:
         An unreachable start or a violated assumption is no such error: it is the outcome of a run.
         """
         try:
-            data = study_data(self._base, variation, self._lasting is not None)
+            data = study_data(self._base, variation, self.is_rollout)
             loop = self.loop(data)
             start_scenario(read_scenario(data), loop)
         except ScenarioError as error:
             return None if is_about_states(error) else error
         except DrakeDaeError:
             return None
-        if self._lasting is not None:
+        if self.is_rollout:
             from drake_dae.running.rollout.program import program_of
 
             try:
@@ -168,7 +185,7 @@ class Runner:
     def _start(self, number: int, variation: Variation) -> "_StartedRun | RunResult":
         """Reads the scenario of a run, builds its loop, and finds its initial state."""
         try:
-            data = study_data(self._base, variation, self._lasting is not None)
+            data = study_data(self._base, variation, self.is_rollout)
             scenario = read_scenario(data, known=self._read)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.

@@ -131,6 +131,14 @@ def find_compiler() -> Compiler:
     return compiler
 
 
+def gcc_options(*options: str) -> tuple[str, ...]:
+    """Returns options that only GCC knows; none of them if another compiler, or none, is found."""
+    with suppress(MachineCodeError):
+        if "Free Software Foundation" in find_compiler().identity:
+            return options
+    return ()
+
+
 def give_up(compiler: Compiler, error: MachineCodeError) -> None:
     """Marks a compiler that hung, so that this process does not wait for it again."""
     _HANGING[compiler.identity] = str(error)

@@ -1,27 +1,31 @@
 """Plants of four vendors' arms that no law knows: the bound of their errors beside the errors.
 
     python examples/bounded_arms [ur5-soft panda-soft ...] [--runs 1000] [--out FOLDER] [--seed 0]
+        [--workers 2]
 
 Each arm draws a circle on a table and presses on it with 40 N (kinova, whose joints bear less,
 with 20 N), on contact with the equations of Drake's. Ranges are declared: of friction, stiffness,
 place and tilt of the table, masses of links, payload, friction of each joint, bias and noise of the
 force sensor, and of a push along each axis; controls are late by a random half of a sample. Before
 the runs of a class of plants `bound_errors` prints the bound of each output with its causes. Then
-`sweep` draws plants from the ranges. The robots are those of the package example-robot-data.
+plants are drawn from the ranges and run. The robots are those of the package example-robot-data.
 
 Claim: all plants keep their bound, and the median of bound / largest error is at most 5 for
 positions and for forces.
-
-If it is killed, the same command continues.
 """
 
 import argparse
 import json
 import logging
+import os
+import subprocess
 import sys
 import sysconfig
 import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +33,11 @@ import numpy as np
 
 import drake_dae as dd
 from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.error_bound import USED
+from drake_dae.studies.processes import cores
 
 ROBOTS = Path(
     sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots"
@@ -121,13 +127,19 @@ here it is at 1.24.
 """
 
 
+@cache
+def nominal(name: str) -> tuple[Scenario, str]:
+    """What `drake-dae new` makes of an arm."""
+    return dd.new_scenario(str(ROBOTS / ARMS[name].file))
+
+
 def scenario_of(name: str, kind: str, folder: Path) -> Scenario:
     """The scenario of an arm on a table, with sensors, late controls and friction of joints."""
     arm, file = ARMS[name], folder / "task.yaml"
-    nominal, text = dd.new_scenario(str(ROBOTS / arm.file))
+    usual, text = nominal(name)
     file.write_text(text, encoding="utf-8")
-    frame = nominal.constraints[0].frame
-    joints = ", ".join(nominal.start.positions)
+    frame = usual.constraints[0].frame
+    joints = ", ".join(usual.start.positions)
     stiffness = STIFFNESSES[kind][1]
     period, resolution = SAMPLED[name][KINDS.index(kind)]
     half = period / 2.0
@@ -152,8 +164,7 @@ def scenario_of(name: str, kind: str, folder: Path) -> Scenario:
 
 def ranges_of(arm: Arm, scenario: Scenario, stiffness: tuple[float, float]) -> dict[str, Any]:
     """What is declared to be unknown, as for `random_variations`."""
-    loop, _ = dd.build_scenario(scenario)
-    model = loop.plant.robot("ranges")
+    model = scenario_model(scenario)
     values = {p.name: p.value for p in model.dae.parameters}
     x, y, z = values["table.position"].tolist()
     around = {f"{link}.mass": float(values[f"{link}.mass"][0]) for link in arm.links}
@@ -177,7 +188,7 @@ def ranges_of(arm: Arm, scenario: Scenario, stiffness: tuple[float, float]) -> d
     }
 
 
-def seeds(scenario: Scenario, count: int, seed: int) -> list[dict[str, int]]:
+def seeds(count: int, seed: int) -> list[dict[str, int]]:
     """Other seeds of sensors and jitter for each run."""
     own = np.random.default_rng(seed).integers(1, 2**31, count).tolist()
     keys = ("force_feedback.seed", "encoders.seed", "sampling.seed")
@@ -185,37 +196,32 @@ def seeds(scenario: Scenario, count: int, seed: int) -> list[dict[str, int]]:
 
 
 def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
-    """Bounds the errors of a class of plants, runs it, and returns its figures."""
+    """Bounds the errors of a class of plants, runs it, and returns its figures.
+
+    `bound.txt`, `bounded.yaml` and the results of all runs are in `folder` then.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    arm = ARMS[name]
-    file, causes = folder / "bounded.yaml", folder / "bound.txt"
-    ranges_file = folder / "ranges.json"
-    if not file.exists():
-        try:
-            scenario = scenario_of(name, kind, folder)
-            ranges = ranges_of(arm, scenario, STIFFNESSES[kind])
-        except dd.errors.ScenarioError as error:  # No gains are stable at this sample time.
-            print(f"{name}, {kind}: {error}", flush=True)
-            return {"arm": name, "kind": kind, "bounded": False}
-        ranges_file.write_text(json.dumps(ranges))
+    missing = {"arm": name, "kind": kind, "bounded": False}
+    try:
+        scenario = scenario_of(name, kind, folder)
+        ranges = ranges_of(ARMS[name], scenario, STIFFNESSES[kind])
         found = dd.bound_errors(scenario, ranges, after=AFTER)
-        causes.write_text(f"{found}\n", encoding="utf-8")
-        if found.failed:
-            print(f"{name}, {kind}\n\n{found}", flush=True)
-            return {"arm": name, "kind": kind, "bounded": False}
-        save_scenario(found.bounded_scenario, file)
-    print(f"{name}, {kind}\n\n{causes.read_text(encoding='utf-8')}", flush=True)
-    scenario = dd.load_scenario(file)
-    ranges = json.loads(ranges_file.read_text())
-    pairs = {key: tuple(v) if isinstance(v[0], float) else v for key, v in ranges.items()}
-    variations = dd.random_variations(pairs, count, seed=seed + 1)
-    variations = [
-        {**changes, **own}
-        for changes, own in zip(variations, seeds(scenario, count, seed), strict=True)
-    ]
-    study = dd.sweep(scenario, variations, folder / f"runs{count}.jsonl", rollout=True, workers=1)
-    study.save(folder)
-    signals = dict.fromkeys(scenario.error_bound.outputs)
+    except dd.errors.ScenarioError as error:  # No gains are stable at this sample time.
+        print(f"{name}, {kind}: {error}", flush=True)
+        return missing
+    (folder / "bound.txt").write_text(f"{found}\n", encoding="utf-8")
+    print(f"{name}, {kind}\n\n{found}\n", flush=True)
+    if found.failed:
+        return missing
+    scenario = found.bounded_scenario
+    save_scenario(scenario, folder / "bounded.yaml")
+    drawn = dd.random_variations(ranges, count, seed=seed + 1)
+    variations = [{**run, **own} for run, own in zip(drawn, seeds(count, seed), strict=True)]
+    study = found.study(variations)
+    with open(folder / "runs.jsonl", "w", encoding="utf-8") as file:
+        for changes, result in zip(study.variations, study.results, strict=True):
+            file.write(json.dumps({**result.to_dict(), "variation": changes}) + "\n")
+    signals = scenario.error_bound.outputs
     units = {
         each: "m" if each.endswith((".x", ".y")) else "N" if each.endswith(".force") else "rad"
         for each in signals
@@ -242,30 +248,49 @@ def run_class(name: str, kind: str, count: int, seed: int, folder: Path) -> dict
         "held": int(np.sum(used <= 1.0)),
         "worst": float(np.nanmax(used)),
         "ratios": ratios,
-        "bound": dict(scenario.error_bound.outputs),
+        "bound": dict(signals),
     }
 
 
-def main(arguments: list[str] | None = None) -> int:
+def run_classes(
+    counts: dict[str, int], seed: int, out: Path, workers: int
+) -> Iterator[dict[str, Any]]:
+    """Runs classes, those of an arm in one process; returns their figures in the given order."""
+    arms = dict.fromkeys(each.split("-")[0] for each in counts)
+    if workers > 1 and len(arms) > 1:
+        parts = [[each for each in counts if each.startswith(f"{arm}-")] for arm in arms]
+        with ThreadPoolExecutor(workers) as pool:
+            calls = [pool.submit(run_apart, part, counts, seed, out) for part in parts]
+            for call in calls:
+                print(call.result(), flush=True)
+    else:
+        for each, count in counts.items():
+            row = run_class(*each.split("-"), count, seed, out / each)
+            (out / each / "row.json").write_text(json.dumps(row))
+            print({key: value for key, value in row.items() if key != "ratios"}, flush=True)
+    for each in counts:
+        yield json.loads((out / each / "row.json").read_text())
+
+
+def run_apart(classes: Sequence[str], counts: dict[str, int], seed: int, out: Path) -> str:
+    """Runs classes in a process of their own; returns what it prints."""
+    asked = [f"{each}={counts[each]}" for each in classes]
+    command = [sys.executable, __file__, *asked, "--seed", str(seed), "--out", str(out)]
+    done = subprocess.run(
+        [*command, "--workers", "1", "--no-table"],
+        stdout=subprocess.PIPE,
+        env={"OMP_NUM_THREADS": "1", **os.environ},
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+def show_table(rows: Sequence[dict[str, Any]]) -> int:
     """Prints a table; returns 0 if every class has a bound, and all plants keep it.
 
     The median of bound / error is at most 5 then, both of positions and of forces.
     """
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--runs", type=int, default=1000, help="of all classes together")
-    parser.add_argument("--out", type=Path, default=Path("runs/unknowns"))
-    parser.add_argument("--seed", type=int, default=0)
-    classes = [f"{name}-{kind}" for name in ARMS for kind in STIFFNESSES]
-    parser.add_argument("classes", nargs="*", help=f"any of {', '.join(classes)}")
-    options = parser.parse_args(arguments)
-    usual = [each for each in classes if each not in UNBOUNDED]
-    chosen = [each.split("-") for each in options.classes or usual]
-    rows = []
-    for i, (name, kind) in enumerate(chosen):
-        count = options.runs // len(chosen) + (i < options.runs % len(chosen))
-        row = run_class(name, kind, count, options.seed, options.out / f"{name}-{kind}")
-        rows.append(row)
-        print({key: value for key, value in row.items() if key != "ratios"}, flush=True)
     print(
         f"\n{'arm':8}{'contact':9}{'samples':>9}{'encoder':>9}{'runs':>6}{'held':>6}"
         f"{'failed':>7}{'bound / error: m':>18}{'N':>6}{'rad':>6}"
@@ -293,6 +318,28 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{held} of {total} within their bound; median of bound / error: {median}")
     is_held = held == total and len(done) == len(rows)
     return 0 if is_held and max(median["m"], median["N"]) <= 5.0 else 1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the classes of the command line; returns what `show_table` returns."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=1000, help="of all classes together")
+    parser.add_argument("--out", type=Path, default=Path("runs/unknowns"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=cores(), help="processes; one has an arm")
+    parser.add_argument("--no-table", action="store_true", help="the runs alone")
+    classes = [f"{name}-{kind}" for name in ARMS for kind in STIFFNESSES]
+    text = f"any of {', '.join(classes)}; ur5-soft=63 has 63 runs"
+    parser.add_argument("classes", nargs="*", help=text)
+    options = parser.parse_args(arguments)
+    chosen = options.classes or [each for each in classes if each not in UNBOUNDED]
+    counts = {}
+    for i, each in enumerate(chosen):
+        name, _, count = each.partition("=")
+        share = options.runs // len(chosen) + (i < options.runs % len(chosen))
+        counts[name] = int(count) if count else share
+    rows = list(run_classes(counts, options.seed, options.out, options.workers))
+    return 0 if options.no_table else show_table(rows)
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ class RolloutRequest:
             program.library = machine.load(program, self.choice, make)
         return program.library
 
-    def lanes(self, program: RolloutProgram, count: int) -> machine.Library | None:
+    def lanes(self, program: RolloutProgram, count: int) -> lanes.Lanes | None:
         """Returns as `machine_code`, for runs side by side."""
         can_run = program.kept("can run side by side", lambda: lanes.can_run(program))
         make = self._pays(program, count, FASTER)

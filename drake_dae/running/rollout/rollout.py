@@ -22,6 +22,7 @@ from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
 from drake_dae.running.rollout.lanes.device import find_device, run_on_device
+from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems, problems_of
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
@@ -193,8 +194,6 @@ def run_together(
     problems = problems_of(request.program, starts, parameters, request.times, seeds)
     together = []
     for program, indices in _kinds(request.program, problems):
-        if request.machine_code(program, 1) is None:
-            continue
         lanes = request.lanes(program, len(problems))
         if lanes is None:
             continue
@@ -227,7 +226,7 @@ def _runs(
     problems: Problems,
     settings: Settings,
     code: machine.Library | None,
-    lanes: machine.Library | None,
+    lanes: Lanes | None,
 ) -> list[Run]:
     """Makes runs, by machine code if there is any, and side by side if there are lanes."""
     if code is not None and lanes is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, number
 from drake_dae.errors import ModelError
-from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.build import complete_with_law
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.figures import margins
 from drake_dae.simulation.records.record import Record
@@ -87,7 +87,7 @@ def bound_errors(
     names = numbers_that_vary(ranges)
     if not names:
         raise ModelError("no number varies in the ranges; write one as LOW..HIGH")
-    completed = build_completed(scenario)[0].scenario
+    completed = complete_with_law(scenario).scenario
     base = scenario_data(completed)
     middle = dict.fromkeys(names, 0.5)
     ends = [{**middle, name: end} for name in names for end in (0.0, 1.0)]
@@ -136,6 +136,7 @@ def bound_errors(
         events=dict(found.events),
         friction_margin=margin,
         scenario=completed,
+        runner=runner,
     )
 
 

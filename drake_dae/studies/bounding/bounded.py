@@ -1,6 +1,6 @@
 """The errors of a scenario for declared ranges of unknown numbers: their bound and its causes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -8,13 +8,17 @@ import numpy as np
 
 from drake_dae.analysis.contact_text import contact_margin_as_dict
 from drake_dae.analysis.tables import Part, Table, count_of, to_markdown, to_text
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.simulation.error_bound import ErrorBound
 from drake_dae.studies.bounding.declared_friction import in_words
+from drake_dae.studies.runs import Runner
+from drake_dae.studies.study import Study
+from drake_dae.studies.variations import plain
 
 MOST_CAUSES = 12
 """The largest number of causes with a row of their own."""
@@ -37,6 +41,7 @@ class FailedRun:
     reason: str
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class BoundedErrors:
     """A bound of the errors of a scenario, with the share of each cause.
@@ -56,6 +61,7 @@ class BoundedErrors:
             None without friction, with states besides those of rigid joints, or if the sliding
             velocities of a contact are not known.
         scenario: The scenario with its law, for which this is the bound.
+        runner: What simulated the runs; `study` uses its loop.
     """
 
     signals: tuple[Signal, ...]
@@ -69,6 +75,7 @@ class BoundedErrors:
     events: Mapping[str, int]
     friction_margin: ContactMargin | None
     scenario: Scenario = field(repr=False)
+    runner: Runner = field(repr=False)
 
     @property
     def bound(self) -> ErrorBound:
@@ -91,6 +98,23 @@ class BoundedErrors:
             ModelError: There is no bound.
         """
         return replace(self.scenario, error_bound=self.bound)
+
+    def study(self, variations: Sequence[Mapping[str, Any]]) -> Study:
+        """Runs the bounded scenario once for each variation, in this process.
+
+        The runs are those of `sweep`, without its file and its processes: they need no loop and no
+        machine code of their own, and a crash ends this process.
+
+        Args:
+            variations: As for `sweep`.
+
+        Raises:
+            ModelError: There is no bound.
+        """
+        scenario = self.bounded_scenario
+        chosen = tuple({k: plain(k, v) for k, v in changes.items()} for changes in variations)
+        results = self.runner.of(scenario_data(scenario)).run_all(list(enumerate(chosen)))
+        return Study(chosen, tuple(results), scenario, self.runner.is_rollout)
 
     @property
     def _no_bound(self) -> str:

@@ -16,7 +16,8 @@ from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running.rollout import rollout as module
 from drake_dae.running.rollout.lanes.emitter import emitted
-from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS
+from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS, source
+from drake_dae.running.rollout.program import program_of
 from drake_dae.trace.compiled import library
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -192,14 +193,15 @@ OPERATIONS = ca.vertcat(
     *(b / ca.sqrt(1e300 * b), b / ca.sqrt(1e-320 * b)),
 )
 ENTRY = """
-__attribute__((visibility("default"))) int evaluate(const double *x, const double *p, double *r) {
+__attribute__((visibility("default"))) int evaluate(
+    const double *c, const double *x, const double *p, double *r) {
   real own[3], shared[2], found[ROWS];
   int i, lane;
   for (lane = 0; lane < LANES; lane++) {
     for (i = 0; i < 3; i++) LANE(own[i], lane) = x[3 * lane + i];
     for (i = 0; i < 2; i++) LANE(shared[i], lane) = p[i];
   }
-  const mask far = operations(own, shared, found);
+  const mask far = operations(c, own, shared, found);
   for (lane = 0; lane < LANES; lane++) r[ROWS * LANES + lane] = LANE(far, lane) ? 1.0 : 0.0;
   for (lane = 0; lane < LANES; lane++) {
     for (i = 0; i < ROWS; i++) r[ROWS * lane + i] = LANE(found[i], lane);
@@ -261,13 +263,14 @@ def given_of(*arrays):
     return [each.ctypes.data_as(ctypes.c_void_p) for each in arrays]
 
 
+@pytest.mark.parametrize("constants", [None, []])
 @pytest.mark.parametrize("options", ["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"])
-def test_operations_are_those_of_casadi(options):
+def test_operations_are_those_of_casadi(options, constants):
     """To two units in the last place; sine and cosine have a series of their own."""
     function = ca.Function("operations", [X, P], [OPERATIONS], {"cse": False})
     rows = function.numel_out(0)
     header = (FOLDER / "lanes.h").read_text()
-    text = [header, emitted(function, "operations"), f"enum {{ ROWS = {rows} }};", ENTRY]
+    text = [header, emitted(function, "operations", constants), f"enum {{ ROWS = {rows} }};", ENTRY]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MachineCodeWarning)
         path = library("\n".join(text), 100, True, True, (*OPTIONS, options))
@@ -275,12 +278,12 @@ def test_operations_are_those_of_casadi(options):
         pytest.skip(f"the C compiler does not know {options}")
     code = ctypes.CDLL(str(path))
     random = np.random.default_rng(0)
-    shared = np.array([1.5, -0.5])
+    shared, table = np.array([1.5, -0.5]), np.array(constants or [np.nan])
     for _ in range(20):
         points = random.uniform([-2.0, 0.1, -0.9], [2.0, 2.0, 0.9], (8, 3))
         points[0, 0] = 0.0
         found = np.zeros((9, rows))
-        lanes = code.evaluate(*given_of(points, shared, found))
+        lanes = code.evaluate(*given_of(table, points, shared, found))
         assert lanes == (1 if options == "-DONE_LANE" else lanes)
         for point, values in zip(points[:lanes], found, strict=False):
             wanted = function(point, shared).full()[:, 0]
@@ -288,9 +291,26 @@ def test_operations_are_those_of_casadi(options):
         assert not found.ravel()[lanes * rows : lanes * (rows + 1)].any()
     # Angles are up to 2e8 a. One lane has libm's sine, for which none is too large.
     points[:, 0] = [0.0, 3.0, 1e3, -3.0, -1e20, 2.0, np.nan, 2.4]
-    code.evaluate(*given_of(points, shared, found))
+    code.evaluate(*given_of(table, points, shared, found))
     far = found.ravel()[lanes * rows : lanes * (rows + 1)]
     np.testing.assert_array_equal(far, np.abs(points[:lanes, 0]) > 2.5 if lanes > 1 else 0.0)
+
+
+def test_diagrams_that_differ_in_constants_share_their_code(monkeypatch):
+    """Sampled laws with other references and gains: one C source, and each has its own runs."""
+    settings = ["sampling={period: 0.002, delay: 0.001}", *FIXED]
+    others = ["references.tool.z.offset=0.25", "gains.all=[-3.0]"]
+    found, texts, tables = [], [], []
+    for more in ((), others):
+        loop, chosen, starts, rows = problem("two_link_wall", *settings, *more)
+        tables.append([])
+        texts.append(source(program_of(loop), tables[-1]))
+        times = np.linspace(0.0, 0.1, 6)
+        found.append(both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator))
+        assert_same(*found[-1], 1e-13)
+    assert texts[0] == texts[1]
+    assert tables[0] != tables[1]
+    assert np.abs(found[0][0][0].record["control"] - found[1][0][0].record["control"]).max() > 0.1
 
 
 def test_what_lanes_do_not_know_is_refused():

@@ -71,6 +71,10 @@ def test_plants_within_the_ranges_keep_the_bound_and_others_do_not(tmp_path):
     runs = [{**run, "force_feedback.seed": 100 + i} for i, run in enumerate(runs)]
     runs.append({"plant_parameters.link2.mass": 12.0})
     study = sweep(bounded, runs, tmp_path / "runs.jsonl", rollout=True, workers=1)
+    here = found.study(runs)
+    assert here.rollout
+    assert here.scenario == bounded
+    assert here.table() == study.table()
     used = study.values(USED)
     assert used[:12].max() <= 1.0
     assert used[12] > 1.0

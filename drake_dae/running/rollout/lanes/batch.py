@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
@@ -21,6 +22,9 @@ ENDLESS = 1 << 62
 """More steps than a run takes."""
 
 
+NO_CONSTANTS = np.zeros(0)
+
+
 class _Batch(ctypes.Structure):
     """The Batch of lanes.c."""
 
@@ -31,13 +35,13 @@ class _Batch(ctypes.Structure):
         *((name, ctypes.c_longlong) for name in ("num_rows", "num_events", "stages")),
         *((name, ctypes.c_void_p) for name in ("times", "events", "due", "rows")),
         *((name, ctypes.c_double) for name in ("longest", "relative")),
-        *((name, ctypes.c_void_p) for name in ("a", "b", "c", "absolute")),
+        *((name, ctypes.c_void_p) for name in ("a", "b", "c", "absolute", "constants")),
         *((name, ctypes.c_void_p) for name in ("runs", "endings", "next")),
     )
 
 
 def run_many(
-    lanes: Library, code: Library, program: RolloutProgram, problems: Problems, settings: Settings
+    lanes: Lanes, code: Library, program: RolloutProgram, problems: Problems, settings: Settings
 ) -> list[Run]:
     """Runs a diagram many times, on all cores.
 
@@ -48,12 +52,13 @@ def run_many(
         problems: The runs.
         settings: How to step; its `look` is not called.
     """
-    batch = RunBatch(program, problems, settings, ENDLESS)
+    batch = RunBatch(program, problems, settings, ENDLESS, lanes.constants)
     structure, count = batch.on_processor(), len(problems)
     threads = max(1, min(num_cores(), count // 8))
     with ThreadPoolExecutor(threads) as pool:
         try:  # Machine code releases Python's lock; Ctrl-C ends it.
-            calls = [pool.submit(lanes.run_lanes, ctypes.byref(structure)) for _ in range(threads)]
+            run = lanes.code.run_lanes
+            calls = [pool.submit(run, ctypes.byref(structure)) for _ in range(threads)]
             for call in calls:
                 call.result()
         except BaseException:
@@ -63,7 +68,7 @@ def run_many(
 
 
 def run_briefly(
-    lanes: Library, program: RolloutProgram, problems: Problems, settings: Settings, most: int
+    lanes: Lanes, program: RolloutProgram, problems: Problems, settings: Settings, most: int
 ) -> tuple[np.ndarray, list[int], FloatArray]:
     """Runs a diagram many times, on one core.
 
@@ -74,8 +79,8 @@ def run_briefly(
     Returns:
         The indices of the runs that end side by side, and their steps and rows.
     """
-    batch = RunBatch(program, problems, settings, most)
-    lanes.run_lanes(ctypes.byref(batch.on_processor()))
+    batch = RunBatch(program, problems, settings, most, lanes.constants)
+    lanes.code.run_lanes(ctypes.byref(batch.on_processor()))
     done, rows = np.flatnonzero(batch.arrays["endings"] == 0), batch.arrays["rows"]
     steps = [RunState.from_buffer(batch.arrays["runs"][index]).steps for index in done]
     return done, steps, rows if done.size == len(rows) else rows[done]
@@ -89,6 +94,7 @@ class RunBatch:
         problems: The runs.
         settings: How to step.
         most: The number of steps after which a run has to continue elsewhere.
+        constants: The constants of the functions that do not stand in the text of the code.
 
     Attributes:
         arrays: The arrays that C reads and writes, by their names in lanes.c. Of each run: "runs",
@@ -97,7 +103,12 @@ class RunBatch:
     """
 
     def __init__(
-        self, program: RolloutProgram, problems: Problems, settings: Settings, most: int
+        self,
+        program: RolloutProgram,
+        problems: Problems,
+        settings: Settings,
+        most: int,
+        constants: FloatArray = NO_CONSTANTS,
     ) -> None:
         self._problems, self._settings, self._most = problems, settings, most
         count = len(problems)
@@ -115,6 +126,7 @@ class RunBatch:
             "b": b,
             "c": c,
             "absolute": settings.absolute,
+            "constants": constants,
             "runs": np.zeros((count, ctypes.sizeof(RunState)), dtype=np.uint8),
             "endings": np.zeros(count, dtype=np.intc),
             "next": np.zeros(1, dtype=np.longlong),

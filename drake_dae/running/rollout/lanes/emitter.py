@@ -1,5 +1,7 @@
 """CasADi functions as C on `real`: a number, or several side by side; see lanes.h."""
 
+from math import copysign, inf
+
 import casadi as ca
 
 from drake_dae.errors import ModelError
@@ -56,36 +58,54 @@ def can_be_emitted(function: ca.Function) -> bool:
     return supported.issuperset(codes)
 
 
-def emitted(function: ca.Function, name: str) -> str:
+def emitted(function: ca.Function, name: str, constants: list[float] | None = None) -> str:
     """Returns a function as C, with its values in the order in which CasADi computes them.
+
+    With a list of constants, the text does not depend on their values: functions that differ in
+    them alone share their machine code.
 
     Args:
         function: A function of expressions (SX), whose inputs and outputs are dense columns.
-        name: The name of the C function, `mask name(const real *a0, ..., real *r0, ...)`. It
-            returns for which runs an angle is too large for `turn`.
+        name: The name of the C function, `mask name(const double *c, const real *a0, ..., real *r0,
+            ...)`. It returns for which runs an angle is too large for `turn`.
+        constants: The constants are appended to it, one for each use, and the C function reads them
+            from `c`; None for constants within the text, which does not read `c`.
 
     Raises:
         ModelError: An operation is not supported, see `can_be_emitted`.
     """
     if not can_be_emitted(function):
         raise ModelError(f"{function.name()} has an operation that lanes do not support")
-    places: dict[int, str] = {}
+    places: dict[int, str | float] = {}
+
+    def used(place: int, inverse: bool = False) -> str:
+        value = places[place]
+        if isinstance(value, str):
+            return value
+        if inverse:
+            value = 1.0 / value if value else copysign(inf, value)
+        if constants is None:
+            return f"K({_number(value)})"
+        constants.append(value)
+        return f"K(c[{len(constants) - 1}])"
+
     turned, inverted = set[str](), set[str]()
     often, roots = _divisors(function)
-    lines = []
+    lines, count = list[str](), 0
     for i in range(function.n_instructions()):
         code = function.instruction_id(i)
         operands, results = function.instruction_input(i), function.instruction_output(i)
-        value = f"v{i}"
         if code == ca.OP_OUTPUT:
-            lines.append(f"r{results[0]}[{results[1]}] = {places[operands[0]]};")
+            lines.append(f"r{results[0]}[{results[1]}] = {used(operands[0])};")
             continue
         if code == ca.OP_CONST:
-            text = f"K({_number(function.instruction_constant(i))})"
-        elif code == ca.OP_INPUT:
+            places[results[0]] = function.instruction_constant(i)
+            continue
+        value, count = f"v{count}", count + 1
+        if code == ca.OP_INPUT:
             text = f"a{operands[0]}[{operands[1]}]"
         elif code in _TURNS:
-            angle = places[operands[0]]
+            angle = used(operands[0])
             if angle not in turned:
                 turned.add(angle)
                 lines.append(f"real sin_{angle}, cos_{angle};")
@@ -95,22 +115,26 @@ def emitted(function: ca.Function, name: str) -> str:
         elif i in roots:
             inverted.add(value)
             lines.append(f"real {value}, over_{value};")
-            lines.append(f"root({places[operands[0]]}, &{value}, &over_{value});")
+            lines.append(f"root({used(operands[0])}, &{value}, &over_{value});")
             places[results[0]] = value
             continue
+        elif code == ca.OP_DIV and isinstance(places[operands[1]], float):
+            text = f"{used(operands[0])} * {used(operands[1], inverse=True)}"
         elif code == ca.OP_DIV and i in often:
-            divided, by = (places[place] for place in operands)
+            divided, by = used(operands[0]), used(operands[1])
             if by not in inverted:
                 inverted.add(by)
                 lines.append(f"const real over_{by} = K(1.0) / {by};")
             text = f"{divided} * over_{by}"
         else:
-            text = _OPERATIONS[code].format(*(places[place] for place in operands))
+            text = _OPERATIONS[code].format(*map(used, operands))
         lines.append(f"const real {value} = {text};")
         places[results[0]] = value
-    arguments = [f"const real *a{i}" for i in range(function.n_in())]
+    arguments = ["const double *c", *(f"const real *a{i}" for i in range(function.n_in()))]
     arguments += [f"real *r{i}" for i in range(function.n_out())]
-    unused = " ".join(f"(void)a{i};" for i in range(function.n_in()))
+    unused = " ".join(
+        f"(void){each};" for each in ("c", *(f"a{i}" for i in range(function.n_in())))
+    )
     body = "\n  ".join(["mask far = none();", unused, *lines, "return far;"])
     return f"ON_DEVICE static APART mask {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
 

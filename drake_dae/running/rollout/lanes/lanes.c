@@ -36,6 +36,7 @@ typedef struct {
   double longest, relative;
   const double *a, *b, *c;  /* of fixed steps */
   const double *absolute;   /* of error control */
+  const double *constants;  /* of the functions, where they do not stand in the text */
   Run *runs;
   int *endings;
   volatile long long *next; /* the first run that is not started yet */
@@ -45,6 +46,7 @@ typedef struct {
 typedef struct {
   real x[SIZE], held[HELD + 1], parameters[PARAMETERS + 1], given[GIVEN + 1];
   real time; /* of `given` */
+  const double *constants;
   mask far;  /* for which runs `given` has an angle that is too large */
   long long run[LANES], event[LANES];
 } Lanes;
@@ -52,6 +54,7 @@ typedef struct {
 ON_DEVICE static void load(const Batch *b, Lanes *l, int lane, long long run) {
   int i;
   l->run[lane] = run;
+  l->constants = b->constants;
   for (i = 0; i < SIZE; i++) LANE(l->x[i], lane) = b->states[run * SIZE + i];
   for (i = 0; i < HELD; i++) LANE(l->held[i], lane) = b->held[run * HELD + i];
   for (i = 0; i < PARAMETERS; i++) {
@@ -90,7 +93,7 @@ ON_DEVICE static long long take(const Batch *b, long long count) {
 
 ON_DEVICE static void set_time(real time, Lanes *l) {
   if (!GIVEN || !any(~SAME(time, l->time))) return;
-  l->far = dae_given(&time, l->parameters, l->given);
+  l->far = dae_given(l->constants, &time, l->parameters, l->given);
   l->time = time;
 }
 
@@ -99,7 +102,7 @@ ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
   real valid;
   mask far;
   set_time(time, l);
-  far = dae_rate(&time, x, l->held, l->parameters, l->given, rate, &valid);
+  far = dae_rate(l->constants, &time, x, l->held, l->parameters, l->given, rate, &valid);
   return is_number(valid) & ~(far | l->far);
 }
 
@@ -112,7 +115,7 @@ ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
   if (!PROJECTS || !any(wanted)) return wanted;
   set_time(time, l);
   for (attempt = 0; attempt < 8; attempt++) {
-    far = dae_newton(&time, from, l->held, l->parameters, l->given, found, &left);
+    far = dae_newton(l->constants, &time, from, l->held, l->parameters, l->given, found, &left);
     near = NOT_MORE(left, REACHED) & open & ~(far | l->far);
     for (i = 0; i < SIZE; i++) {
       at[i] = found[i];
@@ -132,7 +135,7 @@ ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, co
   mask far;
   int i, lane;
   set_time(time, l);
-  far = dae_row(&time, x, l->held, l->parameters, l->given, values, &valid);
+  far = dae_row(l->constants, &time, x, l->held, l->parameters, l->given, values, &valid);
   wanted &= is_number(valid) & ~(far | l->far);
   for (lane = 0; lane < LANES; lane++) {
     double *into = b->rows + (l->run[lane] * b->num_rows + row[lane]) * WIDTH;
