@@ -15,6 +15,8 @@ so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and 
 """
 
 from collections.abc import Sequence
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -315,20 +317,28 @@ class Derivatives:
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
 
 
-def _factors_of(system: DaeSystem, rows: Sequence[int]) -> Factors:
+_CHOSEN: WeakKeyDictionary[Any, tuple[list[int], ca.SX, Factors]] = WeakKeyDictionary()
+"""`DaeSystem.factorize` -> rows, E of these rows and columns, and factors: a robot's systems with
+and without a disturbance have the same."""
+
+
+def _factors_of(system: DaeSystem, rows: list[int]) -> Factors:
     """Returns factors of some rows and columns of E, by `DaeSystem.factorize` if they are shorter.
 
-    Args:
-        system: The system (1)-(3).
-        rows: The indices of the rows and columns.
+    They are those of another system with the same function, rows and E, if there is one.
     """
-    mass = system.mass_matrix[rows, rows]
-    triangle = PositiveDefiniteFactorization(mass)
-    other = None if system.factorize is None else system.factorize(rows)
-    if other is None:
-        return triangle
-    right = ca.SX.sym("right", len(rows))
-    solutions = other.solve(right), triangle.solve(right)
-    counts = [count_operations(solution) for solution in solutions]
-    is_chosen = counts[0] < counts[1] and agree(system, *solutions, right)
-    return other if is_chosen else triangle
+    mass, factorize = system.mass_matrix[rows, rows], system.factorize
+    if factorize is None:
+        return PositiveDefiniteFactorization(mass)
+    before, same, chosen = _CHOSEN.get(factorize, (None, mass, None))
+    if chosen is not None and before == rows and ca.is_equal(same, mass):
+        return chosen
+    chosen = triangle = PositiveDefiniteFactorization(mass)
+    if (other := factorize(rows)) is not None:
+        right = ca.SX.sym("right", len(rows))
+        solutions = other.solve(right), triangle.solve(right)
+        counts = [count_operations(solution) for solution in solutions]
+        if counts[0] < counts[1] and agree(system, *solutions, right):
+            chosen = other
+    _CHOSEN[factorize] = rows, mass, chosen
+    return chosen

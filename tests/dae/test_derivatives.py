@@ -8,6 +8,7 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative
 
@@ -152,6 +153,30 @@ def test_a_robot_with_a_mass_matrix():
         np.testing.assert_allclose(
             control_matrix, problem.known(state).control_matrix, rtol=1e-11, atol=1e-12
         )
+
+
+def test_factors_are_made_once_for_systems_with_the_same_e():
+    """Also for another f; not for another E, whose motion is by its own E, to round-off."""
+    system, made = with_inertia(PROBLEMS["two_link_arm"]().system), []
+
+    def factorize(rows):
+        made.append(rows)
+        return PositiveDefiniteFactorization(system.mass_matrix[rows, rows])
+
+    system = changed(system, factorize=factorize)
+    heavy = ca.diagcat(ca.SX.eye(2), 2 * system.mass_matrix[2:, 2:])
+    pulled = system.f + ca.vertcat(0, 0, 1, 2)
+    drawn = np.random.default_rng(0)
+    for each in (system, changed(system, f=pulled), changed(system, mass_matrix=heavy)):
+        motion = motion_of(each)
+        rate, force = motion.expand(motion.rate), motion.expand(motion.constraint_input)
+        balance = ca.mtimes(each.mass_matrix, rate) - each.f
+        balance -= ca.mtimes(each.g, force) + ca.mtimes(each.h, motion.control)
+        inputs = {"x": each.state, "u": motion.control}
+        numbers = TracedFunction("balance", inputs, {"balance": balance, "rate": rate})
+        left, moved = numbers(drawn.uniform(0.5, 1.0, 4), drawn.uniform(0.5, 1.0, 2))
+        assert np.abs(left).max() < 1e-12 * np.abs(moved).max()
+    assert made == [[2, 3], [2, 3]]
 
 
 def test_the_implicit_form_may_be_given_in_fewer_operations():
