@@ -185,7 +185,7 @@ class Runner:
     def _start(self, number: int, variation: Variation) -> "_StartedRun | RunResult":
         """Reads the scenario of a run, builds its loop, and finds its initial state."""
         try:
-            data = study_data(self._base, variation, self.is_rollout)
+            data = study_data(self._base, variation, self.is_rollout, self._read)
             scenario = read_scenario(data, known=self._read)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each worker would report the same.

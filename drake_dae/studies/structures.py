@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from operator import is_not
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ TOGETHER = 32
 _OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
 """The keys of a scenario that the closed loop does not depend on."""
 
+_OF_A_PLANT = ("plant", "plant_parameters", "constraints")
+"""The keys that the plant of a rollout depends on, and that it changes."""
+
 _OF_A_START = ("start", "description", "duration", "write", "error_bound")
 """The keys of a scenario that the numbers of a context besides its start do not depend on."""
 
@@ -30,7 +34,10 @@ Batch = Sequence[tuple[int, Variation]]
 
 
 def study_data(
-    base: Mapping[str, Any], variation: Variation, is_rollout: bool = False
+    base: Mapping[str, Any],
+    variation: Variation,
+    is_rollout: bool = False,
+    known: dict[Any, Any] | None = None,
 ) -> dict[str, Any]:
     """Returns the complete data of a run; for a rollout, with the plant that rollouts simulate.
 
@@ -38,6 +45,8 @@ def study_data(
         base: The plain data of the study's scenario.
         variation: Dotted key -> the value of this run.
         is_rollout: Whether the run is a rollout.
+        known: A cache for many runs; what a rollout changes is then the same object for runs with
+            the same plant.
 
     Raises:
         ScenarioError: The scenario does not accept a key or a value.
@@ -48,7 +57,13 @@ def study_data(
     if is_rollout:
         from drake_dae.scenario.rolled import rolled_data
 
-        data = rolled_data(data)
+        parts = [data[key] for key in _OF_A_PLANT]
+        last, rolled = ([], {}) if known is None else known.get("rolled", ([], {}))
+        if len(last) != len(parts) or any(map(is_not, parts, last)):
+            rolled = rolled_data(data)
+        if known is not None:
+            known["rolled"] = parts, {key: rolled[key] for key in _OF_A_PLANT}
+        data |= {key: rolled[key] for key in _OF_A_PLANT}
     return data
 
 
