@@ -195,5 +195,8 @@ def show_state(state: ArrayLike) -> str:
 
 
 def by_columns(values: FloatArray) -> FloatArray:
-    """Returns the columns of a table as contiguous rows, which NumPy sums many times faster."""
-    return np.ascontiguousarray(values.T)
+    """Returns the columns of a table as contiguous rows, which NumPy sums many times faster.
+
+    The values may be several tables of one shape, (..., k, n).
+    """
+    return np.ascontiguousarray(np.swapaxes(values, -1, -2))

@@ -48,6 +48,9 @@ STATEMENTS = (
 )
 """Assumptions (1) to (5), in a line each."""
 
+COUNT, SEED = 50, 0
+"""The number of random states that are examined by default, and the seed of their numbers."""
+
 
 @checked(ModelError)
 def analyze(
@@ -59,8 +62,8 @@ def analyze(
     times: ArrayLike | None = None,
     start: ArrayLike | None = None,
     exogenous: Sequence[Reference] = (),
-    count: int = 50,
-    seed: int = 0,
+    count: int = COUNT,
+    seed: int = SEED,
 ) -> Analysis:
     """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
@@ -119,16 +122,34 @@ def analyze(
         if states is None
         else ExaminedStates.given(system, states, random)
     )
+    analysis = examine(system, chosen)
+    if reference is None or times is None:
+        return _at_rest(analysis)
+    return along(analysis, reference, times, start, exogenous)
+
+
+def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
+    """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics.
+
+    Args:
+        system: The system (1)-(3).
+        chosen: The states to examine; those that `analyze` draws by default if None.
+
+    Raises:
+        InconsistentStateError, ModelError: As for `analyze`.
+    """
+    if chosen is None:
+        chosen = ExaminedStates.drawn(system, None, COUNT, np.random.default_rng(SEED))
     given_states = chosen.guesses[: chosen.num_given]
     try:
         check_system(system)
         constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
     except AssumptionError as error:
         where = chosen.describe(len(chosen.guesses), "state")
-        tried = given_states if states is not None else chosen.guesses
+        tried = given_states if chosen.num_given else chosen.guesses
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
     except InconsistentStateError as error:
-        if region is None:
+        if chosen.region is None:
             raise
         raise InconsistentStateError(
             f"{system.name}: no consistent state found with {chosen.describe_region()}; choose "
@@ -136,49 +157,70 @@ def analyze(
             error.residual,
         ) from error
     samples = around
-    if states is not None:
+    if chosen.num_given:
         # Degrees are decided also at states around them, margins only at them.
         samples = Samples(around.manifold, given_states)
         check_consistent(samples.manifold, given_states, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
-    analysis = _examine(constrained, around, samples, where, search=states is None)
-    analysis = replace(analysis, region=chosen.region)
+    analysis = _examine(constrained, around, samples, where, search=not chosen.num_given)
+    return replace(analysis, region=chosen.region)
+
+
+def _at_rest(analysis: Analysis) -> Analysis:
+    """Adds the zero dynamics at rest, where there is a structure."""
     if analysis.structure is None:
         return analysis
-    dynamics = ZeroDynamics(system, structure=analysis.structure)
-    if reference is None or times is None:
-        stability = dynamics.stability(samples.states[0])
-        return replace(
-            analysis,
-            zero_dynamics=stability,
-            equilibria=_equilibria(dynamics, stability, samples.states, None),
-        )
-    layout = analysis.structure.layout
+    dynamics, states = ZeroDynamics(analysis.system, structure=analysis.structure), analysis.states
+    stability = dynamics.stability(states[0])
+    equilibria = _equilibria(dynamics, stability, states, None)
+    return replace(analysis, zero_dynamics=stability, equilibria=equilibria)
+
+
+def along(
+    analysis: Analysis,
+    reference: Callable[[float], FloatArray],
+    times: ArrayLike,
+    start: ArrayLike | None,
+    exogenous: Sequence[Reference],
+) -> Analysis:
+    """Adds what `analyze` says along a reference, where there is a structure.
+
+    Args:
+        analysis: The result of `examine`.
+        reference, times, start, exogenous: As for `analyze`.
+
+    Raises:
+        ModelError: As for `analyze`.
+    """
+    system, states, structure = analysis.system, analysis.states, analysis.structure
+    if structure is None:
+        return analysis
+    dynamics = ZeroDynamics(system, structure=structure)
     with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion has the time.
-        check_reference(system, layout, reference, times)
-    guess = samples.states[0] if start is None else start
+        check_reference(system, structure.layout, reference, times)
+    guess = states[0] if start is None else start
     motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
-    rest, outputs = samples.states[0], None
+    rest, outputs = states[0], None
     if motion.times.size:
         # The state does not determine outputs with mu_i = 0: they are taken from the start of the
         # reference.
         rest = motion.states[0]
-        outputs = layout.values(reference(float(motion.times[0])))
+        outputs = structure.layout.values(reference(float(motion.times[0])))
     stability = dynamics.stability(rest, outputs=outputs)
-    along = None
+    stability_along = None
     if dynamics.dimension and motion.times.size > 1:
-        along = dynamics.stability_along(reference, motion, exogenous=exogenous)
+        stability_along = dynamics.stability_along(reference, motion, exogenous=exogenous)
     contact_margin_along = None
     if system.frictional_contacts and motion.times.size:
-        contacts = ContactMargins(system, analysis.structure.elimination.constraint_matrix)
+        contacts = ContactMargins(system, structure.elimination.constraint_matrix)
         contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
     return replace(
         analysis,
         motion=motion,
         contact_margin_along=contact_margin_along,
         zero_dynamics=stability,
-        equilibria=_equilibria(dynamics, stability, samples.states, outputs),
-        zero_dynamics_along=along,
+        equilibria=_equilibria(dynamics, stability, states, outputs),
+        zero_dynamics_along=stability_along,
     )
 
 

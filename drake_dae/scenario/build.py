@@ -8,6 +8,7 @@ from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.controllers.task_controller import check_task
@@ -60,9 +61,9 @@ def build_completed(
         with at("error_bound"):
             outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
-    completed = Completed(in_time.scenario, notes)
-    return completed, build_loop(
-        completed.scenario,
+    scenario = in_time.scenario
+    loop = build_loop(
+        scenario,
         model,
         structure,
         scene_graph,
@@ -70,3 +71,5 @@ def build_completed(
         motion=motion,
         commands=commands,
     )
+    sticking = sticking_before(scenario, model, structure)
+    return Completed(scenario, (*notes, *filter(None, [sticking]))), loop

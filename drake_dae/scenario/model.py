@@ -1,7 +1,8 @@
 """The robot model of a scenario: constraints, outputs and actuation."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import BodyIndex
 
+from drake_dae.analysis.analyze import examine
+from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.structure.structure import Structure, find_structure
@@ -31,7 +34,7 @@ from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.parts.written import WrittenForm, make
-from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.contacts.laws import latched_system
@@ -76,7 +79,7 @@ def complete_scenario(scenario: Scenario) -> Completed:
         ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
             are independent of those in the scenario; the message names the key.
     """
-    return _read(scenario, SceneGraph(), drawn=False).completed
+    return _build(scenario, *robot_links(scenario.robot, SceneGraph(), drawn=False)).completed
 
 
 def completed_model(
@@ -84,6 +87,7 @@ def completed_model(
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
     drawn: bool = True,
+    robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel]:
     """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
 
@@ -92,22 +96,25 @@ def completed_model(
         scene_graph: The scene graph of the robot's geometry, or None.
         payloads: The payloads.
         drawn: Whether the scene graph, if there is one, will be drawn.
+        robot: What `robot_links` made of the other arguments; None to read the robot.
     """
     drawn = drawn and scene_graph is not None
-    robot = _read(scenario, scene_graph or SceneGraph(), payloads, drawn)
-    scenario = robot.completed.scenario
-    outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
-    with at("actuation" if robot.stages else "outputs"):
+    if robot is None:
+        robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
+    built = _build(scenario, *robot)
+    scenario = built.completed.scenario
+    outputs = _outputs(scenario.outputs, built.constraints, built.links)
+    with at("actuation" if built.stages else "outputs"):
         model = RobotModel(
-            robot.links,
-            robot.constraints,
+            built.links,
+            built.constraints,
             outputs,
-            start_guess(scenario.start.positions, robot.links),
-            robot.name,
-            robot.stages,
+            start_guess(scenario.start.positions, built.links),
+            built.name,
+            built.stages,
             scenario.forces,
             tuple(scenario.exogenous),
-            robot.known_forces,
+            built.known_forces,
             scenario.compliances,
             scenario.control_weights or None,
             scenario.compiled,
@@ -116,7 +123,7 @@ def completed_model(
         model.dae = model.dae.with_values(scenario.parameters)
     with at("bounds"):
         model.dae = model.dae.with_bounds(scenario.bounds)
-    return robot.completed, model
+    return built.completed, model
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +138,11 @@ class _BuiltRobot:
     completed: Completed
 
 
-def _read(
-    scenario: Scenario,
-    scene_graph: SceneGraph,
-    payloads: Sequence[Payload] = (),
-    drawn: bool = True,
+def _build(
+    scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
 ) -> _BuiltRobot:
-    # The robot.
-    name = scenario.robot.title
-    links, loops = robot_links(scenario.robot, scene_graph, payloads, drawn)
-
     # The constraints.
+    name = scenario.robot.title
     constraints = _constraints(scenario.constraints, loops, links)
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
@@ -178,6 +179,27 @@ def scenario_structure(model: RobotModel, task: ScenarioTask | None = None) -> S
         AssumptionError: The robot violates an assumption of the theory.
         ScenarioError: The robot's start is not near its constraints.
     """
+    _check_outputs(model)
+    with at("task"):
+        plan = None if task is None else task.make().plan
+        latched = plan is not None and bool(plan.latches)
+        system = latched_system(plan, model.dae, 0) if plan is not None and latched else model.dae
+    with _near_constraints():
+        return find_structure(system)
+
+
+def examine_scenario(model: RobotModel) -> Analysis:
+    """What `analyze` finds of a scenario's robot, without its motion.
+
+    Raises:
+        ScenarioError: The robot's start is not near its constraints.
+    """
+    _check_outputs(model)
+    with _near_constraints():
+        return examine(model.dae)
+
+
+def _check_outputs(model: RobotModel) -> None:
     if model.dae.num_outputs == 0:
         actuators = model.dae.num_controls
         text = (
@@ -185,12 +207,13 @@ def scenario_structure(model: RobotModel, task: ScenarioTask | None = None) -> S
             f"name {actuators}, one for each actuator, or give references of some of them"
         )
         raise ScenarioError(("outputs", text))
-    with at("task"):
-        plan = None if task is None else task.make().plan
-        latched = plan is not None and bool(plan.latches)
-        system = latched_system(plan, model.dae, 0) if plan is not None and latched else model.dae
+
+
+@contextmanager
+def _near_constraints() -> Iterator[None]:
+    """Names the keys of a start that is not near the constraints."""
     try:
-        return find_structure(system)
+        yield
     except InconsistentStateError as error:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
 

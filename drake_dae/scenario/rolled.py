@@ -20,8 +20,9 @@ from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.plants import plant_kind
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import RecordWatch
+from drake_dae.simulation.divergence import RecordWatch, cannot_diverge
 from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.simulation.records.together import RunsTogether, indexed_record
 
 ROWS = 1000
 """The number of rows of a record of a rollout under error control, after the first."""
@@ -149,7 +150,7 @@ def roll_scenario(
 
 def roll_together(
     scenarios: Sequence[Scenario], loop: ClosedLoop, contexts: Sequence[Context], lasting: float
-) -> list[Rollout | None]:
+) -> list[RunsTogether]:
     """`roll_scenario` of several scenarios of one loop, those with the same times side by side.
 
     Args:
@@ -159,7 +160,7 @@ def roll_together(
         lasting: As for `roll_scenario`.
 
     Returns:
-        One run per scenario; None where `roll_scenario` has to be used, as for `run_together`.
+        The runs, as of `run_together`; one that diverges by itself, up to that time.
 
     Raises:
         ModelError: The loop cannot be rolled out.
@@ -167,7 +168,7 @@ def roll_together(
     groups: dict[str, list[int]] = {}
     for index, scenario in enumerate(scenarios):
         groups.setdefault(repr((scenario.duration, scenario.integrator)), []).append(index)
-    together: list[Rollout | None] = [None] * len(scenarios)
+    together: list[RunsTogether] = []
     for places in groups.values():
         first = scenarios[places[0]]
         starts, parameters = zip(*(start_values(loop, contexts[i]) for i in places), strict=True)
@@ -181,10 +182,35 @@ def roll_together(
                 seeds=[_seeds(scenarios[i]) for i in places],
                 lasting=lasting,
             )
-            for index, run in zip(places, runs, strict=True):
-                if run is not None:
-                    together[index] = _DivergenceWatch(scenarios[index], loop).judged(run)
+            for some in runs:
+                chosen = replace(some, places=[places[i] for i in some.places])
+                together += _judged(chosen, scenarios, loop)
     return together
+
+
+def _judged(
+    runs: RunsTogether, scenarios: Sequence[Scenario], loop: ClosedLoop
+) -> list[RunsTogether]:
+    """The runs; those that diverge by themselves, up to that time."""
+    failures: dict[int, SimulationError] = {}
+    for index in np.flatnonzero(~cannot_diverge(loop.plant, runs.record)).tolist():
+        scenario = scenarios[runs.places[index]]
+        if scenario.may_diverge:
+            continue
+        try:
+            watch = RecordWatch(loop.plant, scenario.duration)
+            watch.look(indexed_record(runs.record, index), is_last=True)
+        except SimulationError as error:
+            failures[index] = error
+    if not failures:
+        return [runs]
+    times = runs.record.time
+    ends = {i: int(np.searchsorted(times, e.time, side="right")) for i, e in failures.items()}
+    others = [index for index in range(len(runs.places)) if index not in failures]
+    return [
+        runs.chosen(others, None, None),
+        *(runs.chosen([i], ends[i], failure) for i, failure in failures.items()),
+    ]
 
 
 def _seeds(scenario: Scenario) -> dict[str, int]:

@@ -293,21 +293,22 @@ def _within_since(times: FloatArray, error: FloatArray, tolerance: float) -> flo
 
 
 def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
-    """Root mean squares over the second half of the time, shape (p,).
+    """Root mean squares over the second half of the time, shape (..., p).
 
     Args:
         times: The times in s, shape (k,), k >= 1.
-        errors: The errors at these times, shape (k, p); linear between them.
+        errors: The errors at these times, shape (..., k, p); linear between them.
     """
     values = by_columns(errors)
     middle = 0.5 * (times[0] + times[-1])
     first = int(np.searchsorted(times, middle, side="right"))
     if first == times.size:
-        return np.abs(values[:, -1])
-    before, after = values[:, first - 1], values[:, first]
+        return np.abs(values[..., -1])
+    before, after = values[..., first - 1], values[..., first]
     begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
-    courses = np.concatenate([(before + begin)[:, None], values[:, first:]], axis=1)
+    courses = np.concatenate([(before + begin)[..., None], values[..., first:]], axis=-1)
     steps = np.diff(np.concatenate([[middle], times[first:]]))
-    squares = (courses[:, :-1] ** 2 + courses[:, :-1] * courses[:, 1:] + courses[:, 1:] ** 2) / 3.0
+    begins, ends = courses[..., :-1], courses[..., 1:]
+    squares = (begins**2 + begins * ends + ends**2) / 3.0
     sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
     return sizes

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from pydrake.systems.framework import Context
 
@@ -25,16 +25,14 @@ from drake_dae.errors import (
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import exceeded, margins, run_figures
+from drake_dae.simulation.figures import figures_of, margins
 from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.together import RunsTogether, indexed_record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.structures import TOGETHER, Batch, built_data, structure_key, study_data
 from drake_dae.studies.variations import Variation
-
-if TYPE_CHECKING:  # It loads SciPy's integrators, which a study without rollouts does not need.
-    from drake_dae.running.rollout.rollout import Rollout
 
 
 class Runner:
@@ -108,10 +106,10 @@ class Runner:
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
         """Simulates runs; yields their results in the same order."""
         for run in self._started(batch):
-            if isinstance(run, _StartedRun):
-                yield self._timed(run.number, run.seconds, self._finish, run)
-            else:
+            if isinstance(run, RunResult):
                 yield run
+            else:
+                yield run.result or self._timed(run.number, run.seconds, self._finish, run)
 
     def records(self, batch: Batch) -> Iterator[tuple[Record | None, str]]:
         """Simulates runs; yields the record of each, and the reason if it ended early.
@@ -119,11 +117,15 @@ class Runner:
         The record is None if a run has no start.
         """
         for run in self._started(batch):
-            if not isinstance(run, _StartedRun):
+            if isinstance(run, RunResult):
                 yield None, run.reason
                 continue
             try:
-                record, _, failure = self._recorded(run)
+                if run.rolled is None:
+                    record, _, failure = self._alone(run)
+                else:
+                    together, index = run.rolled
+                    record, failure = indexed_record(together.record, index), together.failure
             except DrakeDaeError as error:
                 yield None, str(error)
             else:
@@ -183,52 +185,50 @@ class Runner:
         return unused
 
     def _roll_together(self, started: Sequence["_StartedRun"]) -> None:
-        """Computes the rollouts of runs with the same loop together; failed ones stay None."""
+        """Computes rollouts and results of runs with the same loop together; others stay None."""
         if self._lasting is None:
             return
         from drake_dae.scenario.rolled import roll_together
 
         for loop in dict.fromkeys(run.loop for run in started):
-            runs = [run for run in started if run.loop is loop]
+            runs, began = [run for run in started if run.loop is loop], time.perf_counter()
             scenarios, contexts = [run.scenario for run in runs], [run.context for run in runs]
-            began = time.perf_counter()
-            with warnings.catch_warnings():
+            # `_finish` repeats what fails, and reports it.
+            with suppress(Exception), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                with suppress(Exception):  # `_finish` repeats the rollout, and reports the error.
-                    rollouts = roll_together(scenarios, loop, contexts, self._lasting)
-                    for run, rollout in zip(runs, rollouts, strict=True):
-                        run.rollout = rollout
+                for together in roll_together(scenarios, loop, contexts, self._lasting):
+                    some = [runs[place] for place in together.places]
+                    for index, run in enumerate(some):
+                        run.rolled = together, index
+                    for run, result in zip(some, _results(together, some), strict=True):
+                        run.result = result
             seconds = (time.perf_counter() - began) / len(runs)
             for run in runs:
                 run.seconds += seconds
+                run.result = run.result and replace(run.result, seconds=run.seconds)
 
-    def _recorded(self, run: "_StartedRun") -> tuple[Record, int, SimulationError | None]:
-        """Simulates a run, unless its rollout exists; returns record, steps, and failure if any."""
+    def _alone(self, run: "_StartedRun") -> tuple[Record, int, SimulationError | None]:
+        """Simulates a run; returns record, steps, and failure if any."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if self._lasting is None:
                 return _stepped(run.scenario, run.loop, run.context)
             from drake_dae.scenario.rolled import roll_scenario
 
-            rollout = run.rollout or roll_scenario(
-                run.scenario, run.loop, run.context, self._lasting
-            )
+            rollout = roll_scenario(run.scenario, run.loop, run.context, self._lasting)
             return rollout.record, rollout.steps, rollout.failure
 
     def _finish(self, run: "_StartedRun") -> RunResult:
         """Simulates a run, unless its rollout exists, and returns its result."""
-        number, bound = run.number, run.scenario.error_bound
         try:
-            record, steps, failure = self._recorded(run)
-            rooms = margins(record, _limits(run.loop))
-            figures, beyond = run_figures(record, rooms), exceeded(rooms)
-            if bound is not None and record.time.size:
-                figures |= bound.figures(record)
+            if run.rolled is None:
+                record, steps, failure = self._alone(run)
+                alone = RunsTogether([0], indexed_record(record, None), [steps], failure)
+                run.rolled = alone, 0
+            (result,) = _results(run.rolled[0], [run])
         except DrakeDaeError as error:
-            return _not_started(number, error)
-        if failure is not None:
-            return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
-        return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
+            return _not_started(run.number, error)
+        return result
 
 
 @dataclass(eq=False)
@@ -237,16 +237,37 @@ class _StartedRun:
 
     Attributes:
         number: The number of the run in the study.
-        rollout: The rollout, if it was computed together with others.
+        rolled: The runs that it was computed together with, and its index among them.
         seconds: The time that the run has taken so far, in s.
+        result: Its result, if it was computed together with others.
     """
 
     number: int
     scenario: Scenario
     loop: ClosedLoop
     context: Context
-    rollout: "Rollout | None" = None
+    rolled: tuple[RunsTogether, int] | None = None
     seconds: float = 0.0
+    result: RunResult | None = None
+
+
+def _results(together: RunsTogether, runs: Sequence[_StartedRun]) -> list[RunResult]:
+    """The results of some runs that were computed together."""
+    record, failure = together.record, together.failure
+    rooms, results = margins(record, _limits(runs[0].loop)), []
+    figures, exceeded = figures_of(record, rooms), rooms.exceeded()
+    for run in runs:
+        assert run.rolled is not None
+        index = run.rolled[1]
+        own, bound = figures[index], run.scenario.error_bound
+        if bound is not None and record.time.size:
+            own |= bound.figures(indexed_record(record, index))
+        outcome, reason = Outcome.FAILED, str(failure)
+        if failure is None:
+            outcome, reason = Outcome.FINISHED, ""
+            own["steps"] = float(together.steps[index])
+        results.append(RunResult(run.number, outcome, reason, own, exceeded[index]))
+    return results
 
 
 def _limits(loop: ClosedLoop) -> Limits:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from math import isfinite
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
-from drake_dae.trace.compiled import Compiled, attempts, machine_code
+from drake_dae.trace.compiled import CompilationAttempt, Compiled, attempts, machine_code
 
 HUGE = 1e30
 """A number above this, in any unit, means that something grew without bound. Its powers cancel and
@@ -63,7 +64,8 @@ class TracedFunction:
 
     A call goes through CasADi's buffer interface and allocates nothing. It also computes one number
     that says whether its values are valid, see `is_valid`. Only here it is decided whether a
-    function is interpreted or compiled, by the choice `compiled` of the caller.
+    function is interpreted or compiled, by the choice `compiled` of the caller. CasADi's function
+    is made when it is first needed: many blocks run as parts of a whole, and a report needs few.
 
     Args:
         name: The name of the function in messages.
@@ -85,7 +87,6 @@ class TracedFunction:
     Attributes:
         arguments: The arrays that a call reads, for `run`.
         outputs: The arrays that a call writes.
-        num_operations: The number of scalar operations of one call.
         is_machine_code: Whether calls currently run machine code.
     """
 
@@ -117,14 +118,9 @@ class TracedFunction:
         if doubt is not None:
             checks.append(checks[-1] + ca.if_else(doubt >= 0, 0, np.nan))
         expressions = [*dense, regularity, *checks]
-        self._function = ca.Function(
-            _identifier(name),
-            list(inputs.values()),
-            ca.cse(expressions) if often and not lean else expressions,
-            {"cse": False},
-        )
-        self.num_operations = int(self._function.n_instructions())
-        self.arguments = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
+        self._expressions, self._symbols = expressions, list(inputs.values())
+        self._often, self._lean = often, lean
+        self.arguments = tuple(np.zeros(symbol.numel()) for symbol in self._symbols)
         self._num_inputs = len(self.arguments)
         self._results = results = [np.zeros(e.shape, order="F") for e in expressions]
         results, checks = results[: len(dense)], results[len(dense) :]
@@ -133,13 +129,35 @@ class TracedFunction:
             array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
         )
         self._compiled = compiled
-        self._attempts = attempts(compiled, self.num_operations) if often else []
+        self._attempts: list[CompilationAttempt] | None = None  # None before the first call.
+        self._calls_left = 0
+        self.is_machine_code = False
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The CasADi function: outputs, pivot, and a number that is finite if all outputs are.
+
+        With a pivot, a last number is finite if the pivot is large enough as well.
+        """
+        expressions = self._expressions
+        if self._often and not self._lean:
+            expressions = ca.cse(expressions)
+        return ca.Function(_identifier(self.name), self._symbols, expressions, {"cse": False})
+
+    @property
+    def num_operations(self) -> int:
+        """The number of scalar operations of one call."""
+        return int(self.function.n_instructions())
+
+    def _begin(self) -> None:
+        """Makes and binds the function, before the first call."""
+        self._attempts = attempts(self._compiled, self.num_operations) if self._often else []
         self._calls_left = self._attempts[0].calls if self._attempts else 0
-        self._bind(self._function)
+        self._bind(self.function)
 
     def _bind(self, function: ca.Function) -> None:
         """Binds the function that calls evaluate to the arrays."""
-        self.is_machine_code = function is not self._function
+        self.is_machine_code = function is not self.function
         self._buffer, self._evaluate = function.buffer()
         for index, array in enumerate(self.arguments):
             self._buffer.set_arg(index, array.data)
@@ -150,12 +168,13 @@ class TracedFunction:
 
     def _seek(self) -> None:
         """Tries to get machine code, after the number of calls of the next attempt."""
+        assert self._attempts  # There are calls left.
         attempt = self._attempts.pop(0)
-        code = machine_code(self._function, self._compiled, attempt.make)
+        code = machine_code(self.function, self._compiled, attempt.make)
         if code is None and self._attempts:
             self._calls_left = self._attempts[0].calls
         else:
-            self._bind(code or self._function)
+            self._bind(code or self.function)
 
     def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
         """Evaluates the function without allocation.
@@ -185,6 +204,9 @@ class TracedFunction:
         This is the fastest call, for callers that write the arguments in place. It is replaced by
         `_run` when there are no more attempts to compile.
         """
+        if self._attempts is None:
+            self._begin()
+            return self.run()
         self._calls_left -= 1
         if not self._calls_left:
             self._seek()
@@ -199,14 +221,6 @@ class TracedFunction:
     def sizes(self) -> tuple[int, ...]:
         """The number of entries of each input."""
         return tuple(array.size for array in self.arguments)
-
-    @property
-    def function(self) -> ca.Function:
-        """The CasADi function: outputs, pivot, and a number that is finite if all outputs are.
-
-        With a pivot, a last number is finite if the pivot is large enough as well.
-        """
-        return self._function
 
     @property
     def is_valid(self) -> bool:
@@ -249,7 +263,7 @@ class TracedFunction:
         """Returns the function of the derivatives of an output by some inputs, side by side."""
         names = self.input_names
         symbols = [ca.SX.sym(name, size) for name, size in zip(names, self.sizes, strict=True)]
-        value = ca.vec(self._function(*symbols)[output])
+        value = ca.vec(self.function(*symbols)[output])
         slope = ca.jacobian(value, ca.vertcat(*[symbols[i] for i in inputs]))
         return TracedFunction(
             f"{self.output_names[output]} of {self.name}, differentiated by "

@@ -11,7 +11,8 @@ from drake_dae.arrays import show_state
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.simulation.divergence import RecordWatch
+from drake_dae.simulation.divergence import RecordWatch, cannot_diverge
+from drake_dae.simulation.records.together import indexed_record
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
 
@@ -215,3 +216,9 @@ def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
     assert caught.value.time == record.time[first]
     # Before, a run ends by itself, and tells why.
     RecordWatch(loop.plant, duration).look(record)
+    # Of runs that were computed together, only those with large numbers are looked at.
+    whole = indexed_record(record, None)
+    grown = np.argmax(np.abs(record["control"]) > 1.0)
+    begin = indexed_record(whole, (slice(None), slice(grown)), record.time[:grown])
+    assert cannot_diverge(loop.plant, whole).tolist() == [False]
+    assert cannot_diverge(loop.plant, begin).tolist() == [True]

@@ -1,5 +1,8 @@
 """Runs of a study against the same scenarios run alone, and how each ends."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from runs import run_scenario, scenario
@@ -11,7 +14,8 @@ from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import margins, run_figures
+from drake_dae.simulation.figures import figures_of, margins
+from drake_dae.simulation.records.together import indexed_record
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.processes import next_place
 from drake_dae.studies.results import Outcome, RunResult
@@ -47,7 +51,8 @@ def alone(base, changes):
     """The figures of a variation in a closed loop of its own."""
     chosen = read_scenario(varied_data(base, changes))
     loop, _, record = run_scenario(chosen)
-    return run_figures(record, margins(record, Limits.of(loop.plant.model)))
+    one = indexed_record(record, None)
+    return figures_of(one, margins(one, Limits.of(loop.plant.model)))[0]
 
 
 def check(base, changes, result, tolerance=0.0):
@@ -281,6 +286,31 @@ def test_a_rollout_has_nothing_of_the_one_before_it():
     assert used.builds == 1
     assert after.outcome == Outcome.FINISHED
     assert after.figures == fresh.figures
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_runs_side_by_side_are_those_of_a_batch_of_one():
+    """Also where some of them diverge, here by samples that are too slow for their gains."""
+    chosen = scenario("two_link_wall", "duration=3", "sampling={period: 0.1}", "compiled=true")
+    base = scenario_data(chosen)
+    gains = [-1.0, -12.0, -2.0, -14.0, -10.0]
+    runs = [(i, {"gains.all": [gain]}) for i, gain in enumerate(gains)]
+    runs += [(5, {"gains.all": [-14.0], "may_diverge": True, "duration": 1.8})]
+    runner = Runner(base, 1e6)
+    together, records = list(runner.run_all(runs)), list(runner.records(runs))
+    assert [r.run for r in together if r.outcome == Outcome.FAILED] == [1, 3]
+    for run, result, (record, reason) in zip(runs, together, records, strict=True):
+        if result.outcome == Outcome.FINISHED:  # Others enlarge the round-off of a step.
+            (alone,) = runner.run_all([run])
+            assert replace(alone, seconds=0.0) == replace(result, seconds=0.0)
+        assert reason == result.reason
+        one, figures = indexed_record(record, None), dict(result.figures)
+        assert (figures.pop("steps", None) is None) == (result.outcome == Outcome.FAILED)
+        limits = Limits.of(runner.loop(base).plant.model)
+        assert figures == figures_of(one, margins(one, limits))[0]
+    for record, reason in (records[1], records[3]):
+        assert f"the run diverges: at t = {record.time[-1]:.6g} s" in reason
 
 
 def test_steps_do_not_begin_before_zero():

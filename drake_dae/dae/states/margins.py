@@ -59,18 +59,23 @@ def find_margin(
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
     candidates = list(samples.states)
     if matrix.is_square():
-        crossings = (_crossing(samples, scaled, there) for there in samples.states[1:])
+        start = scaled.sign(samples.states[0])
+        crossings = (_crossing(samples, scaled, start, there) for there in samples.states[1:])
         candidates += [state for state in crossings if state is not None]
+    distances = [scaled.distance(state) for state in candidates]
     if search:
         box = ConsistentRegion(samples.manifold, surroundings(samples))
-        starts = sorted(candidates, key=scaled.distance)[:3]
-        candidates += [box.descend(scaled.slope, start) for start in starts]
-    state = min(candidates, key=scaled.distance)
+        starts = np.argsort(distances, kind="stable")[:3]
+        lowest = [box.descend(scaled.slope, candidates[start]) for start in starts]
+        candidates += lowest
+        distances += [scaled.distance(state) for state in lowest]
+    relative = min(distances)
+    state = candidates[distances.index(relative)]
     length = np.linalg.norm(scaled(state), axis=1)
     least = samples.system.least_margin
     return RankMargin(
         singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
-        relative=scaled.distance(state),
+        relative=relative,
         state=state,
         matrix=scaled.plain(state),
         vanishing_row=int(np.argmin(length)) if length.min() < least else None,
@@ -97,15 +102,19 @@ def surroundings(samples: Samples) -> Region:
     return Region(low, high)
 
 
-def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> FloatArray | None:
-    """Returns a state where the determinant changes its sign on the way from the first state."""
+def _crossing(
+    samples: Samples, matrix: "_ScaledMatrix", start: float, there: FloatArray
+) -> FloatArray | None:
+    """Returns a state where the determinant changes its sign on the way from the first state.
+
+    Args:
+        samples: The states.
+        matrix: The matrix.
+        start: The sign at the first state.
+        there: The end of the way.
+    """
     here = samples.states[0]
-
-    def sign(state: FloatArray) -> float:
-        return float(np.linalg.slogdet(matrix(state))[0])
-
-    start, end = sign(here), sign(there)
-    if start == end:
+    if matrix.sign(there) == start:
         return None
     for _ in range(60):
         try:
@@ -114,7 +123,7 @@ def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> F
             return None
         if not np.all(np.isfinite(matrix(middle))):
             return None
-        if sign(middle) == start:
+        if matrix.sign(middle) == start:
             here = middle
         else:
             there = middle
@@ -137,6 +146,10 @@ class _ScaledMatrix:
 
     def __call__(self, state: FloatArray) -> FloatArray:
         return self.plain(state) / self._rows[:, None] / self._columns
+
+    def sign(self, state: FloatArray) -> float:
+        """The sign of the determinant."""
+        return float(np.linalg.slogdet(self(state))[0])
 
     def distance(self, state: FloatArray) -> float:
         """The smallest singular value; infinite where the matrix is not finite."""

@@ -25,6 +25,7 @@ from drake_dae.robots.links.joints import (
 )
 from drake_dae.robots.links.kinematics import ORIGIN, Reaction
 from drake_dae.robots.links.recursions import (
+    LinkKinematics,
     frame_jacobian,
     inverse_dynamics,
     link_kinematics,
@@ -151,8 +152,9 @@ class MultibodyExpressions:
     def kinematics(self, acceleration: ca.SX | None = None) -> TreeKinematics:
         """The frames in motion with v' = `acceleration`, a symbol if None."""
         if acceleration is None:
-            acceleration = ca.SX.sym("acceleration", self.v.numel())
-        moving = link_kinematics(self._links, self.v, acceleration, self._gravity)
+            acceleration, moving = self._moving
+        else:
+            moving = link_kinematics(self._links, self.v, acceleration, self._gravity)
         return TreeKinematics(
             self._frames,
             self.q,
@@ -163,6 +165,12 @@ class MultibodyExpressions:
             moving,
             self._gravity,
         )
+
+    @cached_property
+    def _moving(self) -> tuple[ca.SX, list[LinkKinematics]]:
+        """A symbol for v', and how each link moves with it."""
+        acceleration = ca.SX.sym("acceleration", self.v.numel())
+        return acceleration, link_kinematics(self._links, self.v, acceleration, self._gravity)
 
     def generalized_force(self, kinematics: TreeKinematics, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction, shape (nv, k)."""

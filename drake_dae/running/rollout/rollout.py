@@ -28,6 +28,7 @@ from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
 from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.simulation.records.together import RunsTogether
 from drake_dae.trace.compiled import Compiled
 
 SEVERAL = 8
@@ -176,32 +177,32 @@ def run_together(
     config: SimulatorConfig,
     seeds: Sequence[Seed],
     lasting: float,
-) -> list[Rollout | None]:
+) -> list[RunsTogether]:
     """Runs a loop from several starts at once, in the vector registers of one core.
 
     The arguments are those of `run_loop`.
 
     Returns:
-        A run for each start. It is None if the run fails, if it takes more than `USUAL` steps, or
-        if there is no machine code for several runs at once; use `run_loop` for these starts.
+        The runs that reached their end. Others fail, take more than `USUAL` steps, or have no
+        machine code for several runs at once; use `run_loop` for these starts.
 
     Raises:
         InconsistentStateError: A start is not on N*.
     """
     request = RolloutRequest.of(loop, times, config, None, lasting)
     problems = problems_of(request.program, starts, parameters, request.times, seeds)
-    rollouts: list[Rollout | None] = [None] * len(problems)
+    together = []
     for program, indices in _kinds(request.program, problems):
         if request.machine_code(program, 1) is None:
             continue
         lanes = request.lanes(program, len(problems))
         if lanes is None:
             continue
-        runs = run_briefly(lanes, program, problems.chosen(indices), request.settings, USUAL)
-        for index, run in zip(indices.tolist(), runs, strict=True):
-            if run is not None:
-                rollouts[index] = _rollout(request.program, problems, index, run)
-    return rollouts
+        some = problems.chosen(indices)
+        done, steps, rows = run_briefly(lanes, program, some, request.settings, USUAL)
+        record = record_of(request.program, problems.times, rows)
+        together.append(RunsTogether(indices[done].tolist(), record, steps))
+    return together
 
 
 def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutProgram, np.ndarray]]:

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Touch
@@ -145,14 +146,24 @@ class Postures:
         moving = [b for b in ca.horzsplit(bodies) if ca.depends_on(b, links.q)]
         clearances = [touch.clearance(body) for touch, _ in touches for body in moving]
         motors = LoopState.of(bound, links).motors
+        inputs = {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])}
+        constraint_slopes = ca.jacobian(residual, links.q)
+        # Newton's method needs neither M nor the bodies.
+        self._equations = TracedFunction(
+            "equations of postures", inputs, {"values": ca.vertcat(residual, rows)}
+        )
+        self._equation_slopes = TracedFunction(
+            "slopes of postures", inputs, {"slopes": ca.vertcat(constraint_slopes, slopes)}
+        )
+        self._count = residual.numel()
         self._function = TracedFunction(
             "postures",
-            {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])},
+            inputs,
             {
                 "rows": rows,
                 "left": residual,
                 "slopes": slopes,
-                "constraint_slopes": ca.jacobian(residual, links.q),
+                "constraint_slopes": constraint_slopes,
                 "gradients": ca.mtimes(slopes, links.velocity_map),
                 "constraints": ca.jacobian(rate, links.v),
                 "forces": forces,
@@ -198,16 +209,14 @@ class Postures:
         Returns:
             q, shape (nq,). It may not be a solution: check it with `left`.
         """
-        chosen = list(rows)
+        chosen, goal = self._goal(rows, wanted)
 
         def residual(q: FloatArray) -> FloatArray:
-            values = self._values(q)
-            return np.concatenate([values["left"], values["rows"][chosen] - wanted])
+            return self._equations.evaluate(q, self._parameters)[0][chosen] - goal
 
         def linearize(q: FloatArray) -> NewtonModel | None:
-            values = self._values(q)
-            gradients = np.vstack([values["constraint_slopes"], values["slopes"][chosen]])
-            return shortest_steps(gradients, residual)
+            slopes = self._equation_slopes.evaluate(q, self._parameters)[0]
+            return shortest_steps(slopes.reshape(-1, q.size)[chosen], residual)
 
         q = newton(guess, linearize, _NEWTON_STEPS)[0]
         turned = self._turned_back(q)
@@ -216,8 +225,13 @@ class Postures:
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
         """The residual of the equations of `solve`, shape (k + len(rows),)."""
-        values = self._values(q)
-        return np.concatenate([values["left"], values["rows"][list(rows)] - wanted])
+        chosen, goal = self._goal(rows, wanted)
+        return self._equations.evaluate(q, self._parameters)[0][chosen] - goal
+
+    def _goal(self, rows: Sequence[int], wanted: FloatArray) -> tuple[Indices, FloatArray]:
+        """The entries of the equations in which constraints hold and rows have given values."""
+        chosen = np.concatenate([np.arange(self._count), self._count + np.array(rows, dtype=int)])
+        return chosen, np.concatenate([np.zeros(self._count), wanted])
 
     def _turned_back(self, q: FloatArray) -> FloatArray:
         """Removes whole turns from a configuration, as far as the limits permit."""

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from pydrake.geometry import SceneGraph
 
-from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
@@ -19,16 +19,18 @@ from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
 from drake_dae.scenario.loop import build_loop, exogenous_references
-from drake_dae.scenario.model import completed_model, scenario_structure
+from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts.parts import Poles, Tracking
 from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.summary import Limits
@@ -66,23 +68,36 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         ScenarioError: The scenario is not valid; the message names the key. A violated assumption
             is no error: the analysis reports it.
     """
-    return complete_and_examine(scenario)[1]
+    return complete_and_examine(scenario, SceneGraph())[1]
 
 
-def complete_and_examine(scenario: Scenario) -> tuple[Scenario, Feasibility]:
+def complete_and_examine(
+    scenario: Scenario, scene_graph: SceneGraph, robot: RobotLinks | None = None
+) -> tuple[Scenario, Feasibility]:
     """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds.
 
-    The arguments and exceptions are those of `find_feasibility`.
+    Args:
+        scenario: The scenario.
+        scene_graph: The scene graph of the robot's geometry.
+        robot: What `robot_links` made of the robot with this scene graph; None to read it.
+
+    Raises:
+        ScenarioError: As for `find_feasibility`.
     """
-    scene_graph = SceneGraph()
-    completed, model = completed_model(scenario, scene_graph, drawn=False)
+    completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
     return completed.scenario, _feasibility(completed.scenario, model, scene_graph)
 
 
 def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph) -> Feasibility:
     """The feasibility of a completed scenario with its model."""
+    examined = None
     try:
-        structure = scenario_structure(model, scenario.task)
+        if scenario.task is None and not scenario.is_cascade:
+            examined = examine_scenario(model)
+        if examined is None or examined.structure is None or examined.problems:
+            structure = scenario_structure(model, scenario.task)
+        else:
+            structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
     if scenario.task is not None:
@@ -95,6 +110,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             *_ranges(needs, model),
             behind=behind,
             task=needs,
+            sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
         )
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
@@ -138,9 +154,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     exogenous = exogenous_references(
         scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
     )
-    analysis = analyze(
-        model.dae, reference=reference, times=times, start=start, exogenous=exogenous
-    )
+    analysis = along(examined or examine(model.dae), reference, times, start, exogenous)
     motion = analysis.motion
     return Feasibility(
         analysis,
@@ -149,6 +163,11 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         is_resolved=is_resolved,
         behind=() if motion is None else _in_the_way(motion, model, scene_graph),
         laws=laws,
+        sticking=(
+            ""
+            if motion is None
+            else sticking_note(scenario, model, motion.states, motion.constraint_inputs)
+        ),
     )
 
 

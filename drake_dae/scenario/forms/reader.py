@@ -16,10 +16,15 @@ T = TypeVar("T")
 
 
 class Reader(Generic[T]):
-    """Reads a dataclass from plain data, and converts it to plain data."""
+    """Reads a dataclass from plain data, and converts it to plain data.
 
-    def __init__(self, form: type[T]) -> None:
-        whole = Annotated[form, Form(is_part=False)]  # type: ignore[valid-type]
+    Args:
+        form: The dataclass.
+        keys: The fields that are read and written; all if empty.
+    """
+
+    def __init__(self, form: type[T], keys: tuple[str, ...] = ()) -> None:
+        whole = Annotated[form, Form(is_part=False, keys=keys)]  # type: ignore[valid-type]
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(whole)
 
     @cached_property

@@ -1,7 +1,6 @@
 """Makes a scenario for a robot from nothing but its file."""
 
 import os
-import warnings
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -12,7 +11,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
-from drake_dae.errors import DrakeDaeError, RobotFileWarning, ScenarioError
+from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.robots.constraints import PointOnSurface
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.outputs import PointCoordinates
@@ -72,16 +71,16 @@ def new_scenario(
     """
     is_url = file.startswith("package://")
     robot = new_robot(file if is_url or not file else os.path.realpath(file), tip, point)
-    links, _ = robot_links(robot.robot, SceneGraph(), drawn=False)
+    scene_graph = SceneGraph()
+    read = robot_links(robot.robot, scene_graph, drawn=False)
+    links = read[0]
     tried: list[str] = []
     usable: tuple[Scenario, NewTask, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
     for fraction, place in product(_FRACTIONS, places):
         task = circle(place, surface, fraction)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RobotFileWarning)  # The links are reported.
-                whole, report = complete_and_examine(_scenario(robot, task, links))
+            whole, report = complete_and_examine(_scenario(robot, task, links), scene_graph, read)
             problems = report.problems
             deeper = usable is not None and _depth(report) >= _depth(usable[2])
             if not deeper and not set(problems) - {*_beside(report), *report.wrong_sides}:

@@ -21,6 +21,20 @@ _PATH = (TAG, "center", "radius", "period", "offset", "amplitudes", "frequencies
 
 _WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 
+_KEYS = (
+    "description",
+    "robot",
+    "constraints",
+    "outputs",
+    "tool_axis",
+    "gains",
+    "references",
+    "start",
+    "duration",
+    "integrator",
+)
+"""The keys of the text."""
+
 _WIDTH = 100
 
 _WHOLE: Any = {"break_long_words": False, "break_on_hyphens": False}
@@ -42,7 +56,7 @@ def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Pa
         task: Its task.
         folder: Its folder.
     """
-    data = scenario_data(scenario)
+    data = scenario_data(scenario, _KEYS)
     file = Path(data["robot"]["file"])
     if file.is_relative_to(folder):
         data["robot"]["file"] = file.relative_to(folder).as_posix()

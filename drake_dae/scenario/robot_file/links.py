@@ -19,6 +19,9 @@ from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
+RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
+"""The links of a robot, and its loop-closing joints as constraints."""
+
 _MASSLESS = 1e-12
 """An eigenvalue of M(q) below this fraction of the largest one is zero up to round-off."""
 
@@ -53,7 +56,7 @@ def robot_links(
     scene_graph: SceneGraph,
     payloads: Sequence[Payload] = (),
     drawn: bool = True,
-) -> tuple[MultibodyExpressions, list[Constraint]]:
+) -> RobotLinks:
     """The links of a scenario's robot, and its loop-closing joints as constraints.
 
     Args:

@@ -37,7 +37,7 @@ class Recorded:
     def extremes(self) -> tuple[FloatArray, FloatArray]:
         """The least and the largest number in each column, of at least one row."""
         columns = by_columns(self.values)
-        return columns.min(axis=1), columns.max(axis=1)
+        return columns.min(axis=-1), columns.max(axis=-1)
 
     @cached_property
     def sizes(self) -> FloatArray:

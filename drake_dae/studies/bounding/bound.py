@@ -11,8 +11,9 @@ from drake_dae.arrays import FloatArray, check_whole_number, number
 from drake_dae.errors import ModelError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
-from drake_dae.simulation.figures import exceeded, margins
+from drake_dae.simulation.figures import margins
 from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.together import indexed_record
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.bounding.bounded import BoundedErrors, FailedRun
 from drake_dae.studies.bounding.declared_friction import declared_margin
@@ -184,7 +185,8 @@ def _events(record: Record, begin: int, limits: Limits) -> set[str]:
         if force <= 0.0 and not limits.can_pull(signal)
     }
     pressing = {signal.name for signal in record.signals["constraint_force"].signals}
-    beyond = (name for name in exceeded(margins(record, limits)) if name not in pressing)
+    (exceeded,) = margins(indexed_record(record, None), limits).exceeded()
+    beyond = (name for name in exceeded if name not in pressing)
     events |= {f"{name}: beyond its limit" for name in beyond}
     if "excess" in record and record["excess"].any():
         events.add("drives saturated")

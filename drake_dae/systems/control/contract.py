@@ -137,7 +137,8 @@ class Controller(System):
             context: The context of this system after the run, or None.
             times: The times of the record, in s, shape (k,).
             values: The other signals of the record, and "parameters": those of the law's system as
-                the plant has them; one row for each time.
+                the plant has them; one row for each time. Without a context they may be those of
+                several runs, shape (runs, k, size), and so are the derived ones.
         """
         return {}
 
@@ -189,7 +190,7 @@ class Controller(System):
 
 def output_errors(law: TrackingLaw, values: Mapping[str, FloatArray]) -> Derived:
     """`desired_output` r and `tracking_error` z - r (29), from "reference" and z of a record."""
-    desired, signals = values["reference"][:, law.layout.lowest], law.system.output_signals
+    desired, signals = values["reference"][..., law.layout.lowest], law.system.output_signals
     error = values["controlled_output"] - desired
     return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
 

@@ -255,14 +255,14 @@ class PinnedOutputs:
 
     def regularity(self, point: PinnedPoint) -> Regularity:
         """Determines whether the motion is determined at a point."""
-        if not (np.all(np.isfinite(point.A)) and np.all(np.isfinite(point.B))):
+        if not (np.isfinite(point.A).all() and np.isfinite(point.B).all()):
             return Regularity.MATRIX_NOT_FINITE
         pairs = zip(point.margins, self._usual_margins, strict=True)
         vanished = any(now < VANISHED * usual for now, usual in pairs)
         if vanished or not point.pivot[0] > SINGULAR_PIVOT:
             return Regularity.SINGULAR
         moving = np.concatenate([point.rate, point.control, point.constraint_input])
-        return Regularity.REGULAR if np.all(np.isfinite(moving)) else Regularity.RATE_NOT_FINITE
+        return Regularity.REGULAR if np.isfinite(moving).all() else Regularity.RATE_NOT_FINITE
 
     @cached_property
     def _usual_margins(self) -> tuple[float, float]:

@@ -64,17 +64,21 @@ def run_many(
 
 def run_briefly(
     lanes: Library, program: RolloutProgram, problems: Problems, settings: Settings, most: int
-) -> list[Run | None]:
-    """Runs a diagram many times, on one core; returns None for runs that do not end side by side.
+) -> tuple[np.ndarray, list[int], FloatArray]:
+    """Runs a diagram many times, on one core.
 
     Args:
         lanes, program, problems, settings: As of `run_many`.
         most: The number of steps after which a run does not continue.
+
+    Returns:
+        The indices of the runs that end side by side, and their steps and rows.
     """
     batch = RunBatch(program, problems, settings, most)
     lanes.run_lanes(ctypes.byref(batch.on_processor()))
-    endings = batch.arrays["endings"].tolist()
-    return [None if ending else batch.done(index) for index, ending in enumerate(endings)]
+    done, rows = np.flatnonzero(batch.arrays["endings"] == 0), batch.arrays["rows"]
+    steps = [RunState.from_buffer(batch.arrays["runs"][index]).steps for index in done]
+    return done, steps, rows if done.size == len(rows) else rows[done]
 
 
 class RunBatch:
