@@ -12,6 +12,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
@@ -58,15 +59,18 @@ def build_completed(
     """
     scene_graph = SceneGraph()
     prepared = _prepared(scenario, scene_graph)
-    return prepared.completed, build_loop(
-        prepared.completed.scenario,
-        prepared.model,
-        prepared.structure,
+    scenario, model, structure = prepared.completed.scenario, prepared.model, prepared.structure
+    loop = build_loop(
+        scenario,
+        model,
+        structure,
         scene_graph,
         meshcat,
         motion=prepared.motion,
         commands=commands,
     )
+    sticking = sticking_before(scenario, model, structure)
+    return Completed(scenario, (*prepared.completed.notes, *filter(None, [sticking]))), loop
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import SLACK, Limits
 
 
-class Rooms(NamedTuple):
+class Margins(NamedTuple):
     """Distances of signals from their limits.
 
     Attributes:
@@ -30,12 +30,12 @@ class Rooms(NamedTuple):
     def exceeded(self) -> list[tuple[str, ...]]:
         """For each run, the names of the signals beyond their limits."""
         return [
-            tuple(s.name for s, room in zip(self.signals, rooms, strict=True) if room < 0.0)
-            for rooms in self.values
+            tuple(s.name for s, margin in zip(self.signals, of_run, strict=True) if margin < 0.0)
+            for of_run in self.values
         ]
 
 
-def figures_of(record: Record, rooms: Rooms) -> list[dict[str, float]]:
+def figures_of(record: Record, found: Margins) -> list[dict[str, float]]:
     """The figures of each run: name with unit, such as "largest error of tool.z [m]" -> number.
 
     For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
@@ -46,10 +46,10 @@ def figures_of(record: Record, rooms: Rooms) -> list[dict[str, float]]:
     Args:
         record: A record of runs, with tracking_error, constraint_force, control,
             constraint_residual and state; runs with an empty one have no figures.
-        rooms: Its `margins`.
+        found: Its `margins`.
     """
     if not record.time.size:
-        return [{} for _ in rooms.values]
+        return [{} for _ in found.values]
     names = ("tracking_error", "constraint_force", "control")
     errors, forces, controls = (record.signals[name] for name in names)
     late = late_rms(record.time, errors.values)
@@ -66,10 +66,10 @@ def figures_of(record: Record, rooms: Rooms) -> list[dict[str, float]]:
     columns = [np.stack(each, axis=-1).reshape(len(late), -1) for *_, each in groups]
     known = set(labels)  # The margin of a force that may not pull is its least value.
     margin_labels = [
-        _label("margin of", s) if _label("least", s) not in known else "" for s in rooms.signals
+        _label("margin of", s) if _label("least", s) not in known else "" for s in found.signals
     ]
     residuals = np.max(record.signals["constraint_residual"].sizes, axis=-1, initial=0.0)
-    rows = zip(np.hstack(columns).tolist(), rooms.values, residuals.tolist(), strict=True)
+    rows = zip(np.hstack(columns).tolist(), found.values, residuals.tolist(), strict=True)
     return [
         {
             **dict(zip(labels, row, strict=True)),
@@ -85,7 +85,7 @@ def figures_of(record: Record, rooms: Rooms) -> list[dict[str, float]]:
     ]
 
 
-def margins(record: Record, limits: Limits) -> Rooms:
+def margins(record: Record, limits: Limits) -> Margins:
     """The distance of each signal from its limits, in its unit; negative beyond a limit.
 
     The limit of a control is on |u|, the lower limit of a unilateral force is 0, and positions and
@@ -98,21 +98,21 @@ def margins(record: Record, limits: Limits) -> Rooms:
     """
     runs = len(record["control"])
     if not record.time.size:
-        return Rooms([], [[] for _ in range(runs)])
+        return Margins([], [[] for _ in range(runs)])
     forces, controls = record.signals["constraint_force"], record.signals["control"]
-    signals, rooms = list(controls.signals), []
-    rooms.append((np.inf if limits.control is None else limits.control) - controls.sizes)
+    signals, distances = list(controls.signals), []
+    distances.append((np.inf if limits.control is None else limits.control) - controls.sizes)
     pushing = [i for i, signal in enumerate(forces.signals) if not limits.can_pull(signal)]
     signals += [forces.signals[i] for i in pushing]
-    rooms.append(forces.extremes[0][:, pushing])
+    distances.append(forces.extremes[0][:, pushing])
     for name, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and name in record.signals:
             (low, high), recorded = bounds, record.signals[name]
             least, largest = (values[:, : low.size] for values in recorded.extremes)
             room = np.minimum(least - low, high - largest)
             signals += recorded.signals[: low.size]
-            rooms.append(np.where((room >= -SLACK) & (room < 0.0), 0.0, room))
-    return Rooms(signals, np.hstack(rooms).tolist())
+            distances.append(np.where((room >= -SLACK) & (room < 0.0), 0.0, room))
+    return Margins(signals, np.hstack(distances).tolist())
 
 
 def _label(what: str, signal: Signal) -> str:

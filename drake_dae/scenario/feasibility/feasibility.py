@@ -19,6 +19,7 @@ from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
@@ -109,6 +110,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             *_ranges(needs, model),
             behind=behind,
             task=needs,
+            sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
         )
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
@@ -161,6 +163,11 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         is_resolved=is_resolved,
         behind=() if motion is None else _in_the_way(motion, model, scene_graph),
         laws=laws,
+        sticking=(
+            ""
+            if motion is None
+            else sticking_note(scenario, model, motion.states, motion.constraint_inputs)
+        ),
     )
 
 

@@ -84,6 +84,7 @@ class Feasibility:
             and `collisions`.
         laws: The requirements of two laws for springs; None without springs or samples.
         task: The requirements of a task, phase by phase; None without a task.
+        sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
     """
 
     analysis: Analysis
@@ -96,6 +97,7 @@ class Feasibility:
     behind: tuple[LinkBehind | Collision, ...] = ()
     laws: SpringLaws | None = None
     task: TaskNeeds | None = None
+    sticking: str = ""
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -141,6 +143,7 @@ class Feasibility:
             "behind": [asdict(link) for link in self.behind],
             "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "task": None if self.task is None else self.task.to_dict(),
+            "sticking": self.sticking,
             "problems": list(self.problems),
         }
 
@@ -165,6 +168,8 @@ class Feasibility:
             parts.append(self.laws.lines)
         if self.task is not None:
             parts += [self.task.table(), self.task.lines]
+        if self.sticking:
+            parts.append([self.sticking])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
         return parts
 

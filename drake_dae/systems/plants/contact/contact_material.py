@@ -113,7 +113,8 @@ class PointMaterial:
         stiction_tolerance: v_s of Drake's regularized friction, m/s. In a continuous plant, fixed
             steps of an explicit scheme must not exceed m v_s / (mu f_n), with the mass m that
             slides and the normal force f_n: the slope of friction over velocity is 15/8 mu f_n /
-            v_s, and the velocity of a point that sticks would alternate from step to step.
+            v_s, and the velocity of a point that sticks would alternate from step to step. Where
+            the steps of a scenario are longer, `analyze` says so, and `simulate` before the run.
         radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
             constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
             radius.
