@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_dae.arrays import brief, numbers
+from drake_dae.arrays import all_finite, brief, numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -277,7 +277,7 @@ def _is_bool(value: Any) -> bool:
 
 def _is_array(value: Any, finite: bool = True) -> bool:
     if type(value) is np.ndarray and value.dtype.kind == "f":  # The most frequent, at once.
-        return not finite or bool(np.isfinite(value).all())
+        return not finite or all_finite(value)
     try:
         array = numbers("", value, ValueError)
     except ValueError:

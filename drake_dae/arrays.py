@@ -20,6 +20,11 @@ MEANINGFUL = 1e12
 """The largest meaningful number in a state, in any units."""
 
 
+def all_finite(array: np.ndarray) -> bool:
+    """Returns whether all numbers are finite; of a few, in less time than NumPy's `all`."""
+    return bool(np.count_nonzero(np.isfinite(array)) == array.size)
+
+
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
     """Converts real numbers to a new array; refuses text and masked entries, accepts nan and inf.
 
@@ -113,7 +118,7 @@ def vector(
         ModelError: The numbers have another shape, or one of them is not finite.
     """
     array = numbers(what, value, error)
-    if array.ndim != 1 or size not in (None, array.size) or not np.all(np.isfinite(array)):
+    if array.ndim != 1 or size not in (None, array.size) or not all_finite(array):
         expected = "one-dimensional" if size is None else f"of shape ({size},)"
         got = f"shape {array.shape}" if array.shape != (size,) else show(array)
         raise error(f"{what} must be finite and {expected}, got {got}")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.arrays import FloatArray, listed, vector
 from drake_dae.dae.structure.shared_forces import share_forces
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -92,6 +92,7 @@ class RobotModel:
         control_limits: The largest |u| per actuator; infinite without a limit or if u is not a
             joint force. Those in joints that close loops come last.
         loop_joints: The joints that close loops, with their coordinates and limits.
+        placing, balance: The equations of `configuration` and `rest_state`.
 
     Raises:
         ModelError: There are too many or too few outputs, M is not positive definite, stages do not
@@ -172,9 +173,11 @@ class RobotModel:
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
-        self._placing = StaticPlacement(self.dae, links.q, phi, h_1)
+        self.placing = StaticPlacement(self.dae, links.q, phi, h_1)
         chosen = self.dae.m[h_1.numel() :, :]
-        self._balance = StaticBalance(self.dae, links, self.friction.state, chosen)
+        self.balance = StaticBalance(
+            self.dae, links, self.friction.state, chosen, bool(self.stages)
+        )
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -260,16 +263,7 @@ class RobotModel:
         of_outputs = values
         if output_parameters is not None:
             of_outputs = self.dae.parameter_vector(output_parameters)
-        solution, residual = self._placing.solve(wanted, q, values, of_outputs)
-        size = float(np.max(np.abs(residual), initial=0.0))
-        if size < 1e-10:
-            return solution
-        raise InconsistentStateError(
-            f"{self.name}: no configuration near the guess satisfies the constraints with "
-            f"outputs {show(wanted)}; {size:.2g} is left. They may be out "
-            "of reach",
-            residual,
-        )
+        return self.placing.solve(wanted, q, values, of_outputs)
 
     def rest_state(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
@@ -293,15 +287,7 @@ class RobotModel:
         values = self.dae.parameter_vector(parameters)
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        if not self.stages:  # Forces enter no state.
-            return np.concatenate([q, np.zeros(self.dae.num_states - q.size)])
-        state, _, left = self._balance.rest(q, load, values)
-        if left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
-            raise ModelError(
-                f"{self.name}: no control holds the robot at rest at q = {show(q)} with forces "
-                f"{load}; {left:.2g} N m is left. It has fewer actuators than joints"
-            )
-        return state
+        return self.balance.state(q, load, values)
 
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
@@ -319,7 +305,7 @@ class RobotModel:
         values = self.dae.parameter_vector(parameters)
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self._balance.rest(q, load, values)[1]
+        return self.balance.rest(q, load, values)[1]
 
     def _check_exogenous(self) -> None:
         """Refuses exogenous parameters of nonholonomic constraints: their rate is incomplete."""
@@ -342,4 +328,4 @@ class RobotModel:
         with suppress(InconsistentStateError):
             nominal = self.configuration(None, nominal)
         forces = np.zeros(self._num_forces)
-        return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
+        return self.balance.rest(nominal, forces, self.dae.parameter_values)[0]

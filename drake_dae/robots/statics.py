@@ -5,8 +5,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.links.links import Links
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
@@ -41,7 +42,7 @@ class StaticPlacement:
             "J": ca.jacobian(phi, q),
             "P": ca.jacobian(h_1, q),
         }
-        rows = phi.numel() + h_1.numel()
+        self._robot, rows = dae.name, phi.numel() + h_1.numel()
         self._is_traced = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
         self._function = TracedFunction(self._name, self._inputs, self._outputs)
 
@@ -62,14 +63,17 @@ class StaticPlacement:
         guess: FloatArray,
         parameters: FloatArray,
         of_outputs: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """A solution near a guess, and the remaining residual.
+    ) -> FloatArray:
+        """A solution near a guess; arguments are not checked.
 
         Args:
             outputs: The first components of z_1; the others are free.
             guess: Where to start, shape (nq,).
             parameters: Values of all parameters, for phi.
             of_outputs: The same for h_1.
+
+        Raises:
+            InconsistentStateError: There is none near the guess.
         """
         count = outputs.size
         is_traced = self._is_traced and count == self._outputs["h_1"].numel()
@@ -81,16 +85,33 @@ class StaticPlacement:
 
         def linearize(q: FloatArray) -> NewtonModel | None:
             if is_traced:
-                given = q, parameters, of_outputs, outputs
-                self._step.evaluate(*given, q)
-                if self._step.is_valid:
-                    return NewtonModel(lambda x: self._step.evaluate(*given, x)[0].copy(), True)
+                step = self._step
+                first = step.evaluate(q, parameters, of_outputs, outputs, q)[0].copy()
+                at, run, (found,) = step.arguments[-1], step.run, step.outputs
+
+                def step_from(x: FloatArray) -> FloatArray:
+                    if x is q:
+                        return first
+                    at[...] = x  # The other arguments are still there.
+                    run()
+                    return found.copy()
+
+                if step.is_valid:
+                    return NewtonModel(step_from, True)
             _, _, J, P = evaluated(q)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
 
         q, _ = newton(guess, linearize)
-        return q, residual(q)
+        left = residual(q)
+        size = float(np.max(np.abs(left), initial=0.0))
+        if size < 1e-10:
+            return q
+        raise InconsistentStateError(
+            f"{self._robot}: no configuration near the guess satisfies the constraints with "
+            f"outputs {show(outputs)}; {size:.2g} is left. They may be out of reach",
+            left,
+        )
 
 
 class StaticBalance:
@@ -104,9 +125,13 @@ class StaticBalance:
         friction: The states of friction, shape (c, 1), which are zero here.
         S: The matrix of the given combinations of lambda, shape (k, m); without redundant
             constraints.
+        has_stages: Whether there are stages; without them any state of the links is one at rest.
     """
 
-    def __init__(self, dae: DaeSystem, robot: Links, friction: ca.SX, S: ca.SX) -> None:
+    def __init__(
+        self, dae: DaeSystem, robot: Links, friction: ca.SX, S: ca.SX, has_stages: bool
+    ) -> None:
+        self._has_stages = has_stages
         q, v = robot.q, robot.v
         links, still = q.numel() + v.numel(), ca.vertcat(v, friction)
         end = dae.num_states - friction.numel()
@@ -127,7 +152,7 @@ class StaticBalance:
         free = [i for i in range(dae.num_constraints) if i not in determined]
         unknown = ca.vertcat(dae.state[links:end], control, force[free])
         self._unknowns = unknown.numel()
-        self._stages = end - links
+        self._robot, self._stages = dae.name, end - links
         self._still, self._unbent = np.zeros(v.numel()), np.zeros(friction.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
@@ -138,6 +163,22 @@ class StaticBalance:
                 "constraint_force": all_forces,
             },
         )
+
+    def state(self, q: FloatArray, forces: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The state at rest; arguments are those of `rest`.
+
+        Raises:
+            ModelError: No drive holds the robot there.
+        """
+        if not self._has_stages:  # Forces enter no state.
+            return np.concatenate([q, self._still, self._unbent])
+        state, _, left = self.rest(q, forces, parameters)
+        if left > 1e-6 * (1.0 + float(np.max(np.abs(forces), initial=0.0))):
+            raise ModelError(
+                f"{self._robot}: no control holds the robot at rest at q = {show(q)} with forces "
+                f"{forces}; {left:.2g} N m is left. It has fewer actuators than joints"
+            )
+        return state
 
     def rest(
         self, q: FloatArray, forces: FloatArray, parameters: FloatArray

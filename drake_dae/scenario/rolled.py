@@ -18,7 +18,7 @@ from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.plants import plant_kind
+from drake_dae.scenario.plants import ScenarioPlant, plant_kind
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.divergence import RecordWatch, cannot_diverge
 from drake_dae.simulation.records.record import Record, RecordAfter
@@ -56,6 +56,8 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
 def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
     """The plain data of a scenario with a plant that rollouts support, as for `for_rollout`."""
     kind = plant_kind(data["plant"])
+    if kind.rolled is ScenarioPlant.rolled:
+        return data  # As most: rollouts support it.
     own = {key: value for key, value in data["plant"].items() if key != TAG}
     pegs = own.pop("pegs", ())  # Still data.
     try:

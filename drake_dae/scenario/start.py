@@ -27,25 +27,26 @@ _TURNS = np.array([0.0, -1.0, 1.0])
 """The whole turns that are tried, relative to the number of turns nearest to a guess."""
 
 
-def start_scenario(scenario: Scenario, loop: ClosedLoop, unused: Context | None = None) -> Context:
-    """A context of a closed loop at a scenario's start.
+def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
+    """A context of a closed loop at a scenario's start: `prepare`, and then `begin`."""
+    context = loop.diagram.CreateDefaultContext()
+    prepare(scenario, loop, context)
+    begin(scenario, loop, context)
+    return context
 
-    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
-    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
-    it.
+
+def prepare(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
+    """Sets all numbers of a context of a closed loop but those that `start` gives.
 
     Args:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
         loop: What `build_completed` made.
-        unused: A context of the loop with its defaults, which becomes the result; None for a new
-            one, which takes Drake up to a millisecond.
+        context: A context of the loop with its defaults.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    context = loop.diagram.CreateDefaultContext() if unused is None else unused
     if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
         with at("integrator.start_time"):
             raise ModelError(
@@ -53,7 +54,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop, unused: Context | None 
                 f"{scenario.integrator.start_time:g} s"
             )
     context.SetTime(scenario.integrator.start_time)
-    plant = loop.plant
+    plant, controller = loop.plant, loop.controller
     at_plant = plant.GetMyMutableContextFromRoot(context)
     if not scenario.plant.carries:
         with at("plant_parameters"):
@@ -66,17 +67,33 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop, unused: Context | None 
         with at("force_feedback"):
             at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
             scenario.force_feedback.begin(loop.sensor, at_sensor)
-    if loop.controller.takes_over:
-        _begin_at_rest(scenario, loop, context)
-    else:
-        _begin_with_references(scenario, loop, context)
+    if scenario.gains is not None and not controller.takes_over:  # Advised gains are in the law.
+        with at("gains"):
+            at_controller = controller.GetMyMutableContextFromRoot(context)
+            controller.set_gains(at_controller, _designed(scenario.gains, loop))
     loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
     for link in (loop.link, loop.packets):
         if link is not None and scenario.sampling is not None:
             link.set_seed(context, scenario.sampling.seed)
-    return context
+
+
+def begin(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
+    """Sets the start of a run in a context that is prepared for its scenario.
+
+    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
+    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
+    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
+    it.
+
+    Raises:
+        ScenarioError: There is no such start; the message names the key.
+    """
+    if loop.controller.takes_over:
+        _begin_at_rest(scenario, loop, context)
+    else:
+        _begin_with_references(scenario, loop, context)
 
 
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
@@ -113,21 +130,17 @@ def _begin_sensor(loop: ClosedLoop, context: Context, q: FloatArray, forces: Flo
 
 def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
     """Starts plant and sensor at the references plus the errors."""
-    plant, controller = loop.plant, loop.controller
-    model = plant.robot("a scenario")
-    if scenario.gains is not None:  # Recommended gains are in the law.
-        with at("gains"):
-            at_controller = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(at_controller, _designed(scenario.gains, loop))
-    at_plant = plant.GetMyMutableContextFromRoot(context)
+    plant = loop.plant
+    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
     parameters = plant.current_parameters(at_plant)
     outputs = _outputs_at_start(scenario.start.errors, loop, context.get_time())
-    positions, forces = np.split(outputs, [len(model.position_signals)])
+    count = len(model.position_signals)
+    positions, forces = outputs[:count], outputs[count:]
     with at("start"):
         # By default near the start of the completion, which is not reported elsewhere.
         guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
         q = _configuration(model, positions, guess, parameters, _of_law(loop, parameters))
-        state = model.rest_state(q, forces, parameters)
+        state = model.balance.state(q, forces, parameters)
         if scenario.exogenous:
             state = _in_motion(loop, context, outputs, state)
         plant.set_consistent_state(at_plant, state)
@@ -147,9 +160,12 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
         for p in dae.parameters:
             if p.name not in moving and sizes.get(p.name) == p.value.size:
                 known[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
-        loop.memory["of law"] = known
-    known = loop.memory["of law"]
-    return np.where(np.isnan(known), parameters, known)
+        places = np.flatnonzero(~np.isnan(known))
+        loop.memory["of law"] = places, known[places]
+    places, known = loop.memory["of law"]
+    of_law = parameters.copy()
+    of_law[places] = known
+    return of_law
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
@@ -205,7 +221,7 @@ def _configuration(
     """
 
     def solve(start: FloatArray) -> FloatArray:
-        return model.configuration(positions, start, parameters, of_law)
+        return model.placing.solve(positions, start, parameters, of_law)
 
     try:
         q = _unwound(model, solve, solve(guess), guess)
@@ -252,7 +268,10 @@ def _unwound(
     q, turn = solution, 2 * np.pi
     limits = model.links.position_limits
     is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
-    for index in np.flatnonzero(~is_inside | (np.abs(q - guess) >= np.pi)):
+    is_wound = ~is_inside | (np.abs(q - guess) >= np.pi)
+    if not is_wound.any():
+        return q
+    for index in np.flatnonzero(is_wound):
         if model.links.position_signals[index].unit != "rad":
             continue
         low, high = limits[0][index], limits[1][index]

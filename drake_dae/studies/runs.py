@@ -16,23 +16,28 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import (
-    AssumptionError,
     DrakeDaeError,
-    InconsistentStateError,
     ModelError,
     ScenarioError,
     SimulationError,
 )
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.scenario import Scenario, read_scenario
-from drake_dae.scenario.start import start_scenario
+from drake_dae.scenario.start import begin, prepare, start_scenario
 from drake_dae.simulation.figures import figures_of, margins
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.records.together import RunsTogether, indexed_record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
-from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.structures import TOGETHER, Batch, built_data, structure_key, study_data
+from drake_dae.studies.results import Outcome, RunResult, is_about_states, not_started
+from drake_dae.studies.structures import (
+    TOGETHER,
+    Batch,
+    built_data,
+    only_starts_differ,
+    structure_key,
+    study_data,
+)
 from drake_dae.studies.variations import Variation
 
 
@@ -54,6 +59,7 @@ class Runner:
         self._key, self._read = "", dict[Any, Any]()
         self._built: ClosedLoop | DrakeDaeError | None = None
         self._contexts: list[Context] = []
+        self._prepared: tuple[Mapping[str, Any], Context] | None = None
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
@@ -62,9 +68,11 @@ class Runner:
         Raises:
             ScenarioError: The loop cannot be built; the message names the key.
         """
+        if self._starts_elsewhere(data, with_positions=False):
+            return cast(ClosedLoop, self._built)
         key = structure_key(data, self._completed)
         if key != self._key:
-            self._key, self._built, self._contexts = "", None, []
+            self._key, self._built, self._contexts, self._prepared = "", None, [], None
             self.builds += 1
             built = built_data(data, self._completed)
             try:
@@ -108,7 +116,7 @@ class Runner:
             loop = self.loop(data)
             start_scenario(read_scenario(data), loop)
         except ScenarioError as error:
-            return None if _is_about_states(error) else error
+            return None if is_about_states(error) else error
         except DrakeDaeError:
             return None
         if self.is_rollout:
@@ -185,21 +193,38 @@ class Runner:
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
         try:
-            context = start_scenario(scenario, loop, self._unused(loop))
+            if self._lasting is None:
+                context = start_scenario(scenario, loop)
+            else:
+                context = self._context(data, scenario, loop)
+                begin(scenario, loop, context)
         except DrakeDaeError as error:
-            return _not_started(number, error)
+            return not_started(number, error)
         return _StartedRun(number, scenario, loop, context)
 
-    def _unused(self, loop: ClosedLoop) -> Context:
-        """A context of a loop with its defaults: one of an earlier rollout, or a new one."""
+    def _context(self, data: Mapping[str, Any], scenario: Scenario, loop: ClosedLoop) -> Context:
+        """A context that is prepared for a rollout: one of an earlier rollout, or a new one."""
+        new = loop.diagram.CreateDefaultContext
         if not self._contexts:
-            self._contexts = [loop.diagram.CreateDefaultContext()]
-        default = self._contexts[0]
-        if len(self._contexts) == 1:
-            return loop.diagram.CreateDefaultContext()
-        unused = self._contexts.pop()
-        unused.SetTimeStateAndParametersFrom(default)
-        return unused
+            self._contexts = [new()]
+        context = self._contexts.pop() if len(self._contexts) > 1 else new()
+        if self._prepared is not None and self._starts_elsewhere(data):
+            context.SetTimeStateAndParametersFrom(self._prepared[1])
+            return context
+        context.SetTimeStateAndParametersFrom(self._contexts[0])
+        prepare(scenario, loop, context)
+        prepared = new() if self._prepared is None else self._prepared[1]
+        prepared.SetTimeStateAndParametersFrom(context)
+        self._prepared = data, prepared
+        return context
+
+    def _starts_elsewhere(self, data: Mapping[str, Any], with_positions: bool = True) -> bool:
+        """Whether the data of a run differ only in their start from those of the prepared one."""
+        if self._prepared is None:
+            return False
+        last = self._prepared[0]
+        keys = [each["start"].get("positions") for each in (data, last)]
+        return (with_positions or keys[0] == keys[1]) and only_starts_differ(data, last)
 
     def _roll_together(self, started: Sequence["_StartedRun"]) -> None:
         """Computes rollouts and results of runs with the same loop together; others stay None."""
@@ -244,7 +269,7 @@ class Runner:
                 run.rolled = alone, 0
             (result,) = _results(run.rolled[0], [run])
         except DrakeDaeError as error:
-            return _not_started(run.number, error)
+            return not_started(run.number, error)
         return result
 
 
@@ -292,20 +317,6 @@ def _limits(loop: ClosedLoop) -> Limits:
     if "limits" not in loop.memory:
         loop.memory["limits"] = Limits.of(loop.plant.robot("a study"))
     return cast(Limits, loop.memory["limits"])
-
-
-def _not_started(number: int, error: DrakeDaeError) -> RunResult:
-    outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
-    return RunResult(number, outcome, str(error))
-
-
-def _is_about_states(error: BaseException | None) -> bool:
-    """Whether an error is about states or assumptions, and not about keys of the scenario."""
-    while error is not None:
-        if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
-            return True
-        error = error.__cause__
-    return False
 
 
 def _stepped(

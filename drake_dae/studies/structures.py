@@ -20,6 +20,9 @@ TOGETHER = 32
 _OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
 """The keys of a scenario that the closed loop does not depend on."""
 
+_OF_A_START = ("start", "description", "duration", "write", "error_bound")
+"""The keys of a scenario that the numbers of a context besides its start do not depend on."""
+
 _text = json.JSONEncoder(sort_keys=True).encode
 
 Batch = Sequence[tuple[int, Variation]]
@@ -64,6 +67,13 @@ def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
         if not _is_made_of(part, base[name]) and (text := _text(part)) != _text(base[name]):
             own[name] = text
     return _text(own)
+
+
+def only_starts_differ(data: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether data of two runs are the same objects but for the start; False if unsure."""
+    return data.keys() == other.keys() and all(
+        part is other[key] or key in _OF_A_START for key, part in data.items()
+    )
 
 
 def _is_made_of(part: Any, other: Any) -> bool:

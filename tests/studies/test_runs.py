@@ -279,13 +279,16 @@ def test_a_rollout_has_nothing_of_the_one_before_it():
         "start.errors.tool.z": 0.01,
         "force_feedback.seed": 3,
     }
-    base, runs = scenario_data(chosen), [(0, other), (1, {})]
+    # The last two begin elsewhere, and have all other numbers of the run before them.
+    starts = {"start.errors.tool.z": 0.02}, {"start.errors.tool.z": 0.01, "duration": 0.05}
+    base, runs = scenario_data(chosen), list(enumerate([other, {}, *starts]))
     used = Runner(base, 1.0)
-    (_,), (after,) = (list(used.run_all([run])) for run in runs)
-    (fresh,) = Runner(base, 1.0).run_all(runs[1:])
+    found = [next(used.run_all([run])) for run in runs]
     assert used.builds == 1
-    assert after.outcome == Outcome.FINISHED
-    assert after.figures == fresh.figures
+    for run, after in zip(runs[1:], found[1:], strict=True):
+        (fresh,) = Runner(base, 1.0).run_all([run])
+        assert after.outcome == Outcome.FINISHED
+        assert after.figures == fresh.figures
 
 
 @pytest.mark.slow

@@ -210,22 +210,22 @@ class DaeSystem:
         outputs = {"f": e.f, "g": e.g, "h": e.h, "l": e.l, "m": e.m}
         return self.trace("fields", outputs, often=False)
 
-    @property
+    @cached_property
     def num_states(self) -> int:
         """n, the number of states."""
         return int(self.state.numel())
 
-    @property
+    @cached_property
     def num_constraints(self) -> int:
         """m, the number of constraints."""
         return int(self.k.numel())
 
-    @property
+    @cached_property
     def num_controls(self) -> int:
         """p, the number of controls."""
         return int(self.h.shape[1])
 
-    @property
+    @cached_property
     def num_outputs(self) -> int:
         """The number of controlled outputs. The law (28) needs as many outputs as controls."""
         return int(self.l.numel())

@@ -1,9 +1,10 @@
 """Reads dataclasses from plain data and writes them, with all problems at once."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import make_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import pydantic
 
@@ -25,6 +26,7 @@ class Reader(Generic[T]):
 
     def __init__(self, form: type[T], keys: tuple[str, ...] = ()) -> None:
         whole = Annotated[form, Form(is_part=False, keys=keys)]  # type: ignore[valid-type]
+        self._form, self._parts = form, dict[str, Reader[Any]]()
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(whole)
 
     @cached_property
@@ -62,6 +64,15 @@ class Reader(Generic[T]):
                 problem(self.schema, details, data) for details in error.errors()
             )
             raise ScenarioError(*problems) from None
+
+    def read_part(
+        self, name: str, data: Any, folder: Path | None, known: dict[Any, Any] | None
+    ) -> Any:
+        """Reads the data of one field alone; other arguments and errors are those of `read`."""
+        if name not in self._parts:
+            hint = get_type_hints(self._form, include_extras=True)[name]
+            self._parts[name] = Reader(make_dataclass("Part", [(name, hint)]))
+        return getattr(self._parts[name].read({name: data}, folder, known), name)
 
     def write(self, value: T) -> Any:
         """Converts a value to plain data, the inverse of `read`."""
