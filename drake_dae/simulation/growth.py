@@ -133,6 +133,10 @@ class ErrorGrowth:
             return None
         weights = -np.expm1(-np.diff(times, prepend=self._time) / self._window)
         logs = np.log(np.maximum(ratios, 1.0))
+        if max(logs.max(), self._mean.max()) <= np.log(LASTING):
+            # No mean becomes larger than the largest number that it is a mean of.
+            self._average(times, weights, logs)
+            return None
         for row, time in enumerate(times.tolist()):
             self._mean += weights[row] * (logs[row] - self._mean)
             self._since[ratios[row] <= 1.0] = self._time = time
@@ -149,6 +153,15 @@ class ErrorGrowth:
                 states[row],
             )
         return None
+
+    def _average(self, times: FloatArray, weights: FloatArray, logs: FloatArray) -> None:
+        """Updates the means for several times at once, up to which no error diverges."""
+        left = np.exp((times - times[-1]) / self._window)
+        self._mean *= np.exp((self._time - times[-1]) / self._window)
+        self._mean += (left * weights) @ logs
+        last = len(times) - 1 - np.argmax(logs[::-1] <= 0.0, axis=0)
+        self._since = np.where((logs <= 0.0).any(axis=0), times[last], self._since)
+        self._time = float(times[-1])
 
     def _decay(self, time: float) -> None:
         """Updates the means for a time up to which no error was larger than its size."""

@@ -3,12 +3,14 @@
 import json
 from collections.abc import Generator, Sequence
 from concurrent.futures import CancelledError
+from functools import lru_cache
+from threading import Lock
 from typing import Any
 
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import run_batch
+from drake_dae.studies.runs import Runner
 from drake_dae.studies.structures import Batch
 
 WAIT = 30.0
@@ -100,3 +102,23 @@ class Cluster:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+_ALONE = Lock()
+"""Threads of a worker share one loop, so that only one of them simulates at a time."""
+
+
+def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
+    """Simulates runs in a worker of a cluster, and returns their results as plain data.
+
+    Args:
+        base: The arguments of `Runner` as JSON.
+        batch: The runs.
+    """
+    with _ALONE:
+        return [result.to_dict() for result in _runner(base).run_all(batch)]
+
+
+@lru_cache(maxsize=1)
+def _runner(base: str) -> Runner:
+    return Runner(*json.loads(base))

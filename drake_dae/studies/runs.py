@@ -1,14 +1,11 @@
 """The runs of a study in one process, and their results."""
 
-import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from threading import Lock
 from typing import Any, cast
 
 from pydrake.systems.framework import Context
@@ -338,23 +335,3 @@ def _stepped(
     except SimulationError as error:
         failure = error
     return loop.record(context), steps, failure
-
-
-_ALONE = Lock()
-"""Threads of a worker share one loop, so that only one of them simulates at a time."""
-
-
-def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
-    """Simulates runs in a worker of a cluster, and returns their results as plain data.
-
-    Args:
-        base: The arguments of `Runner` as JSON.
-        batch: The runs.
-    """
-    with _ALONE:
-        return [result.to_dict() for result in _runner(base).run_all(batch)]
-
-
-@lru_cache(maxsize=1)
-def _runner(base: str) -> Runner:
-    return Runner(*json.loads(base))

@@ -8,10 +8,12 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.arrays import show_state
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.divergence import RecordWatch, cannot_diverge
+from drake_dae.simulation.growth import ErrorGrowth
 from drake_dae.simulation.records.together import indexed_record
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
@@ -222,3 +224,28 @@ def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
     begin = indexed_record(whole, (slice(None), slice(grown)), record.time[:grown])
     assert cannot_diverge(loop.plant, whole).tolist() == [False]
     assert cannot_diverge(loop.plant, begin).tolist() == [True]
+
+
+def test_many_rows_at_once_leave_the_means_of_rows_one_by_one():
+    """Errors up to 50 sizes, which are no divergence, and then a part that diverges."""
+    random, signals = np.random.default_rng(0), [Signal("tool.z", "m"), Signal("wall.force", "N")]
+    times = np.cumsum(random.uniform(0.001, 0.01, 400))
+    errors = np.exp(random.uniform(-2.0, np.log(50.0), (400, 2)))
+    errors[:, 1] *= times < 1.0
+    errors[300:] *= 40.0
+
+    def growth():
+        return ErrorGrowth(signals, 0.0, 0.05, {"m": 1.0, "N": 1.0}, {})
+
+    def ends(parts):
+        watch, states = growth(), np.zeros((400, 1))
+        for part in parts:
+            error = watch.look(times[part], errors[part], np.zeros_like(errors)[part], states[part])
+            if error is not None:
+                return str(error)
+        return ""
+
+    rows = [slice(i, i + 1) for i in range(400)]
+    together = ends([slice(0, 300), slice(300, 400)])
+    assert "the error of tool.z" in together
+    assert ends(rows) == together
