@@ -125,16 +125,18 @@ diverge, 12 of 128 on soft contact; here it is at 1.24.
 
 
 @cache
-def nominal(name: str) -> tuple[Scenario, str]:
-    """What `drake-dae new` makes of an arm."""
-    return dd.new_scenario(str(ROBOTS / ARMS[name].file))
+def nominal(name: str, folder: Path) -> tuple[Scenario, Path]:
+    """What `drake-dae new` makes of an arm, and its file in a folder."""
+    file = folder / f"{name}.yaml"
+    scenario, text = dd.new_scenario(str(ROBOTS / ARMS[name].file), folder=folder)
+    file.write_text(text, encoding="utf-8")
+    return scenario, file
 
 
 def scenario_of(name: str, kind: str, folder: Path) -> Scenario:
     """The scenario of an arm on a table, with sensors, late controls and friction of joints."""
-    arm, file = ARMS[name], folder / "task.yaml"
-    usual, text = nominal(name)
-    file.write_text(text, encoding="utf-8")
+    arm = ARMS[name]
+    usual, file = nominal(name, folder.parent)
     frame = usual.constraints[0].frame
     joints = ", ".join(usual.start.positions)
     stiffness = STIFFNESSES[kind][1]

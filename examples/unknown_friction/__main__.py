@@ -187,7 +187,7 @@ def rows(robot: Path | None) -> list[Condition]:
     found = [*TUNED, *OTHERS, FIRST]
     if robot is not None:
         folder = Path(tempfile.mkdtemp())
-        _, text = dd.new_scenario(str(robot))
+        _, text = dd.new_scenario(str(robot), folder=folder)
         (folder / "task.yaml").write_text(text)
         found.append(Condition(robot.stem, folder / "task.yaml", UNKNOWN))
     return found
