@@ -39,7 +39,7 @@ help:
 	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
 	@echo 'make test        lint, types and tests'
 	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
-	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
+	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
@@ -75,7 +75,7 @@ processor: $(VENV)/installed-dev
 	$(OLD) $(PYTEST) -m 'not slow and not thorough' $(addprefix tests/, \
 		analysis dae literature robots systems trace test_symbolic.py)
 
-benchmark: $(VENV)/installed-dev
+benchmark: $(VENV)/installed-benchmark
 	$(BIN)/python -m pytest tests/benchmarks -q
 
 campaign: $(VENV)/installed-dev
@@ -176,14 +176,8 @@ $(VENV)/installed: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --disable-pip-version-check --editable .
 	touch $@
 
-$(VENV)/installed-dev: pyproject.toml | $(BIN)/python
+$(VENV)/installed-%: pyproject.toml | $(BIN)/python
 	$(WHOLE)
-	@echo 'Installing drake_dae and its tools into $(VENV): the first time this takes minutes.'
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
-	touch $(VENV)/installed $@
-
-$(VENV)/installed-docs: pyproject.toml | $(BIN)/python
-	$(WHOLE)
-	@echo 'Installing drake_dae and what makes its book into $(VENV): the first time this takes minutes.'
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev,docs]'
-	touch $(VENV)/installed $@
+	@echo 'Installing drake_dae and tools ($*) into $(VENV): the first time this takes minutes.'
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev,$*]'
+	touch $(VENV)/installed $(VENV)/installed-dev $@
