@@ -209,10 +209,8 @@ def _judged(
     times = runs.record.time
     ends = {i: int(np.searchsorted(times, e.time, side="right")) for i, e in failures.items()}
     others = [index for index in range(len(runs.places)) if index not in failures]
-    return [
-        runs.chosen(others, None, None),
-        *(runs.chosen([i], ends[i], failure) for i, failure in failures.items()),
-    ]
+    failed = [runs.chosen([i], ends[i], failure) for i, failure in failures.items()]
+    return [runs.chosen(others, None, None), *failed] if others else failed
 
 
 def _seeds(scenario: Scenario) -> dict[str, int]:

@@ -335,6 +335,8 @@ def main(arguments: list[str] | None = None) -> int:
     counts = {}
     for i, each in enumerate(chosen):
         name, _, count = each.partition("=")
+        if name not in classes or not (count or "1").isdecimal():
+            parser.error(f"{each} is no class of plants; it must be {text}")
         share = options.runs // len(chosen) + (i < options.runs % len(chosen))
         counts[name] = int(count) if count else share
     rows = list(run_classes(counts, options.seed, options.out, options.workers))

@@ -316,6 +316,21 @@ def test_runs_side_by_side_are_those_of_a_batch_of_one():
         assert f"the run diverges: at t = {record.time[-1]:.6g} s" in reason
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_runs_that_all_diverge_are_computed_once(monkeypatch):
+    """None of them is repeated alone."""
+    chosen = scenario("two_link_wall", "duration=3", "sampling={period: 0.1}", "compiled=true")
+    runner = Runner(scenario_data(chosen), 1e6)
+    repeated = []
+    monkeypatch.setattr(Runner, "_alone", lambda _, run: repeated.append(run.number))
+    results = list(
+        runner.run_all([(i, {"gains.all": [gain]}) for i, gain in enumerate([-12, -14])])
+    )
+    assert [result.outcome for result in results] == [Outcome.FAILED] * 2
+    assert repeated == []
+
+
 def test_steps_do_not_begin_before_zero():
     """Drake's periodic events do not, so such a plant would stand still until then."""
     found = scenario("wall_point_contact", "compiled=false", "integrator.start_time=-1")

@@ -199,8 +199,9 @@ def run_together(
             continue
         some = problems.chosen(indices)
         done, steps, rows = run_briefly(lanes, program, some, request.settings, USUAL)
-        record = record_of(request.program, problems.times, rows)
-        together.append(RunsTogether(indices[done].tolist(), record, steps))
+        if done.size:
+            record = record_of(request.program, problems.times, rows)
+            together.append(RunsTogether(indices[done].tolist(), record, steps))
     return together
 
 

@@ -21,8 +21,8 @@ STOPPED = 1 << 62
 ENDLESS = 1 << 62
 """More steps than a run takes."""
 
-
 NO_CONSTANTS = np.zeros(0)
+"""Those of code whose constants stand in its text."""
 
 
 class _Batch(ctypes.Structure):
