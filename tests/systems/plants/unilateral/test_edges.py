@@ -213,7 +213,7 @@ def test_thrown_points_bounce_off_the_face_alone(step):
     turned = RollPitchYaw(*angles).ToRotationMatrix().matrix()
     for seed in range(6):
         random = np.random.default_rng(seed)
-        start = turned @ random.uniform([-0.4, -0.3, 0.01], [0.4, 0.3, 0.2])
+        start = turned @ random.uniform([-0.35, -0.25, 0.01], [0.35, 0.25, 0.1])
         speed, restitution = random.uniform(-1.0, 1.0, 3), random.uniform(0.7, 1.0)
         times, end = bounces(start, speed, turned, restitution, 0.6)
         simulator = Simulator(plant)
@@ -230,7 +230,7 @@ def test_thrown_points_bounce_off_the_face_alone(step):
         assert_allclose(plant.state(context), end, rtol=0.0, atol=10.0 * EXACT)
         counts.append(len(times))
     assert min(counts) == 0
-    assert max(counts) > 2
+    assert max(counts) > 1
 
 
 def test_from_under_a_point_at_rest_a_plate_is_drawn_away():
