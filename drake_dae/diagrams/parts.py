@@ -1,6 +1,7 @@
 """The parts of a closed loop: adding them to a diagram, and checks."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -150,7 +151,7 @@ def add_feasible(
     Args:
         builder: The builder of the diagram, with the controller in it.
         controller: The controller.
-        governed: The limits of forces.
+        governed: The limits of joints and forces.
         control_limits: The largest |u|, shape (p,).
         state: The state that the controller gets.
 
@@ -165,8 +166,7 @@ def add_feasible(
         )
     controls = {signal.name: (-size, size) for signal, size in zip(names, sizes, strict=True)}
     try:
-        limits = MotionLimits(controls, forces=governed.forces, cones=governed.cones)
-        block = builder.AddSystem(FeasibleControl(structure, limits))
+        block = builder.AddSystem(FeasibleControl(structure, replace(governed, controls=controls)))
     except ModelError as error:
         raise WiringError(str(error)) from None
     builder.Connect(controller.GetOutputPort("control"), block.GetInputPort("control"))

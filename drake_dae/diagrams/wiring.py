@@ -252,6 +252,7 @@ def wire_loop(
         observer,
         link,
         packets,
+        feasible,
     )
 
 

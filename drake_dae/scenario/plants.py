@@ -69,11 +69,12 @@ class ScenarioPlant(ABC):
     5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
-    6. With `knows_ends` its contacts end where surfaces do, such as those of a `Plate`.
+    6. With `has_sides` its contacts include the sides of a body that ends, as those of a hole in a
+       `Plate`, and not only its face.
     """
 
     carries: ClassVar[bool] = False
-    knows_ends: ClassVar[bool] = True
+    has_sides: ClassVar[bool] = True
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
 
@@ -107,7 +108,7 @@ class ScenarioPlant(ABC):
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
-    knows_ends = False
+    has_sides = False
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         if robot.latches:
@@ -140,7 +141,7 @@ class Unilateral(ScenarioPlant):
 
     restitution: dict[str, float] = field(default_factory=dict)
     settling_time: float = 1e-3
-    knows_ends = False
+    has_sides = False
 
     def __post_init__(self) -> None:
         positive("settling_time", self.settling_time)

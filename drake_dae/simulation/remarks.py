@@ -8,7 +8,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
@@ -16,6 +15,7 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits
 from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.trace.functions import TracedFunction
 
 _AT_ONCE, _AWAY = 0.1, 1e-3
@@ -106,14 +106,14 @@ def ball_remarks(radius: float | None) -> list[str]:
     ]
 
 
-def departure_remarks(record: Record, limits: FloatArray | None) -> list[str]:
+def departure_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
     """A remark on the times at which limits made the error deviate from its prediction.
 
     Args:
         record: A record; with "departure" where limits hold by `FeasibleControl`.
-        limits: The largest |u|, shape (p,); None where there is none.
+        feasible: That block; None where there is none.
     """
-    if "departure" not in record.signals:
+    if feasible is None:
         return []
     values, signals = record["departure"], record.signals["departure"].signals
     is_off = np.abs(values).max(axis=1, initial=0.0) > 0.0
@@ -126,15 +126,12 @@ def departure_remarks(record: Record, limits: FloatArray | None) -> list[str]:
         for signal, size in zip(signals, np.abs(values).max(axis=0), strict=True)
         if size > 0.0
     )
-    control = record["control"][is_off]
-    names = [signal.name for signal in record.signals["control"].signals]
-    most = np.full(len(names), np.inf) if limits is None else limits
-    reached = np.any(np.abs(control) >= most * (1.0 - 1e-9), axis=0)
-    cause = ", ".join(name for name, yes in zip(names, reached, strict=True) if yes)
+    states, commanded = record["state"][is_off], record["control"] + record["excess"]
+    causes = ", ".join(feasible.causes(states, commanded[is_off]))
     return [
         f"Between {times[0]:.4g} and {times[-1]:.4g} s, for {share:.2g} s in all, no motion along "
-        f"the path was within the limits ({cause or 'a contact force'}): the highest derivatives "
-        f"of the errors left their prediction, of {amounts}."
+        f"the path was within the limits{f' ({causes})' if causes else ''}: the highest "
+        f"derivatives of the errors left their prediction, of {amounts}."
     ]
 
 

@@ -67,18 +67,3 @@ def test_an_insertion_refuses_an_observer():
     for settings in (["observer={rate: 20}"], ["gains=null", "task.gains=null"]):
         with pytest.raises(ScenarioError, match="observer: an Insert lets the hole push"):
             build_scenario(scenario("peg_in_hole", *settings))
-
-
-@pytest.mark.parametrize(
-    ("name", "plant", "phase"),
-    [
-        ("peg_in_hole", "!Unilateral {}", "Search"),
-        ("edge_search", "!IdealConstraints {}", "side"),
-        ("edge_search", "!Unilateral {restitution: {wall: 0}}", "side"),
-    ],
-)
-def test_an_ideal_contact_without_edges_and_holes_is_refused_before_the_run(name, plant, phase):
-    """Formerly the search came to its end, and the run failed there."""
-    with pytest.raises(ScenarioError, match=r"plant: .* is that of a whole plane") as caught:
-        build_scenario(scenario(name, f"plant={plant}"))
-    assert f"{phase} waits for an edge or a hole" in str(caught.value)

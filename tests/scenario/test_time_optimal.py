@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from drake_dae import Record, build_scenario, load_scenario
+from drake_dae import Record, build_scenario, load_scenario, shipped_model
 from drake_dae.cli import main
 from drake_dae.dae.timing.profile import TimeOptimalReference
 from drake_dae.errors import ScenarioError
@@ -76,6 +76,17 @@ def test_robots_without_a_profile_are_refused_in_a_sentence(name):
     with pytest.raises(ScenarioError, match=r"^time_optimal: ") as error:
         build_scenario(scenario)
     assert len(error.value.problems) == 1
+
+
+def test_a_drive_without_a_limit_is_told_since_the_control_is_then_not_limited(tmp_path):
+    file = tmp_path / "free.urdf"
+    text = shipped_model("two_link_arm.urdf").read_text("utf-8")
+    file.write_text(text.replace('effort="120"', 'effort="0"'))
+    settings = [f"robot.file={file}", "robot.actuators=[joint1, joint2]"]
+    completed, loop = build_completed(loaded("time_optimal={}", *settings))
+    assert loop.feasible is None
+    assert any(note.startswith("joint2 has no effort limit: ") for note in completed.notes)
+    assert build_completed(loaded("time_optimal={}"))[1].feasible is not None
 
 
 @pytest.mark.slow

@@ -1,16 +1,16 @@
 """What a run says of what is approximate in it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from arms import arm, consistent_states, numbers
 
-from drake_dae import Record
+from drake_dae import Record, robot_motion_limits
 from drake_dae.cli import main
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.remarks import departure_remarks, limit_remarks
 from drake_dae.simulation.summary import Limits
+from drake_dae.systems.governing.feasible_control import FeasibleControl
 
 SHORT = ("--set", "duration=0.02", "--set", "write={plots: false, animation: false}")
 
@@ -32,23 +32,36 @@ def test_a_run_on_drakes_contact_says_that_its_ball_rolls(name, settings, told, 
 
 
 def test_a_run_says_when_limits_made_errors_leave_their_prediction():
-    times = np.array([0.0, 1.0, 2.0, 3.0])
-    control = np.array([[1.0, 0.0], [2.0, 0.0], [2.0, -1.0], [1.0, 0.0]])
-    departure = np.array([[0.0, 0.0], [-0.3, 0.0], [0.1, 0.0], [0.0, 0.0]])
-    of_control = (Signal("left", "N m"), Signal("right", "N m"))
-    of_departure = (Signal("departure of x", "m/s^2"), Signal("departure of f", "N"))
-    record = Record(
-        times,
-        {"control": Recorded(control, of_control), "departure": Recorded(departure, of_departure)},
-    )
-    (text,) = departure_remarks(record, np.array([2.0, 5.0]))
-    assert text.startswith("Between 1 and 2 s, for 2 s in all, no motion along the path")
-    assert "within the limits (left)" in text
-    assert text.endswith("left their prediction, of x by up to 0.3 m/s^2.")
-    still = Recorded(0.0 * departure, of_departure)
-    held = replace(record, signals={**record.signals, "departure": still})
-    assert departure_remarks(held, None) == []
-    assert departure_remarks(Record(times, {"control": Recorded(control, of_control)}), None) == []
+    """The second control is beyond the first drive's limit, the third beyond the second's."""
+    found = arm("two_link")
+    feasible = FeasibleControl(found.structure, robot_motion_limits(found.model))
+    (state,) = consistent_states("two_link", 1)
+    state[2:] = 0.0
+    there = numbers("two_link", state[:2], np.zeros(2))
+    still = there.bias - 20.0 * there.constraint_jacobian[0]  # At rest, with 20 N.
+    commanded = np.tile(still, (5, 1))
+    commanded[1, 0], commanded[3, 1] = 330.0, -140.0
+    parameters = found.model.dae.parameter_values
+    values = [feasible.function(state, u, parameters)[:3] for u in commanded]
+    columns = [np.array(column) for column in zip(*values, strict=True)]
+    times, signals = np.arange(5.0), found.model.dae.control_signals
+    kinds = (signals, signals, feasible.departure_signals)
+    recorded = {
+        name: Recorded(values, of)
+        for name, values, of in zip(("control", "excess", "departure"), columns, kinds, strict=True)
+    }
+    recorded["state"] = Recorded(np.tile(state, (5, 1)), found.model.dae.state_signals)
+    (text,) = departure_remarks(Record(times, recorded), feasible)
+    # What else exceeds a limit depends on the posture.
+    assert text.startswith("Between 1 and 3 s, for 2 s in all, no motion along the path was within")
+    assert "largest joint1_motor" in text
+    assert "least joint2_motor" in text
+    assert "largest joint2_motor" not in text
+    size = np.abs(columns[2][:, 0]).max()
+    assert f"left their prediction, of tool.z by up to {size:.2g} m/s^2" in text
+    recorded["departure"] = Recorded(0.0 * columns[2], feasible.departure_signals)
+    assert departure_remarks(Record(times, recorded), feasible) == []
+    assert departure_remarks(Record(times, {}), None) == []
 
 
 def test_the_nearest_limits_are_named_with_what_is_left():

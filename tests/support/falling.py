@@ -47,6 +47,22 @@ def ball(restitution, mass=1.0):
     return UnilateralRobotPlant(ball_model(mass), {"floor": restitution})
 
 
+def mass_point(plates, restitution=0.0, rpy=None):
+    """A mass point of 2 kg in space over plates, each of which it touches from the face alone."""
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    links = LinkExpressions(
+        q,
+        v,
+        MASS * ca.SX.eye(3),
+        ca.SX([0.0, 0.0, MASS * GRAVITY]),
+        {"point": q},
+        actuation_matrix=np.zeros((3, 0)),
+    )
+    faces = [PointOnSurface("point", plate, name=name, rpy=rpy) for name, plate in plates.items()]
+    model = RobotModel(links, faces, [], forces=[])
+    return UnilateralRobotPlant(model, dict.fromkeys(plates, restitution))
+
+
 def planar_box(constraints, driven=True):
     """A box in the x-z plane: x, z, and its angle about y; pushed along x and turned."""
     q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
@@ -65,9 +81,9 @@ def planar_box(constraints, driven=True):
     return RobotModel(links, constraints, [], forces=[])
 
 
-def box(contacts: Mapping[str, float], driven=True):
+def box(contacts: Mapping[str, float], driven=True, floor=FLOOR):
     """A box some of whose corners touch a smooth floor."""
-    feet = [PointOnSurface("box", FLOOR, CORNERS[name], name=name) for name in contacts]
+    feet = [PointOnSurface("box", floor, CORNERS[name], name=name) for name in contacts]
     return UnilateralRobotPlant(planar_box(feet, driven), contacts)
 
 

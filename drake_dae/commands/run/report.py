@@ -101,7 +101,7 @@ def report_run(
         lines += ["", *bound_words(bounded), ""]
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
-    lines += departure_remarks(record, limits.control)
+    lines += departure_remarks(record, loop.feasible)
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
     lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]

@@ -1,8 +1,11 @@
 """The control within limits by which the error leaves its prediction least."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.governing.quadratic import nearest_within
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.timing.limited_signals import LimitedSignals
@@ -12,6 +15,9 @@ from drake_dae.trace.functions import TracedFunction
 
 SOFTNESS = 1e-8
 """How far forces give way where drives cannot hold them, for a multiplier of one."""
+
+SOFTER = 1e-6
+"""The same for speeds and accelerations of joints, which give way before forces."""
 
 WITHIN = 1e-9
 """An excess over a limit, as a share of it, that is round-off."""
@@ -25,14 +31,16 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
         min |W (ubar - ubar_d)|^2 = |W B (u - u_d)|^2   with   |u_j| <= U_j,
         least <= v = alpha + beta u <= largest,
 
-    where W divides each output by the length of its row of B diag(U). Limits of u hold always;
-    those of v, and of cones, as far as they allow it. u is u_d where that is within all limits.
+    and with the limits of states x and their rates x', where W divides each output by the length of
+    its row of B diag(U). Limits of u hold always; those of v and of cones as far as they allow it;
+    those of states and rates, the speeds and accelerations of joints, as far as these allow it. A
+    speed stays within its limits by v' <= APPROACH (V - v). u is u_d where that is within all
+    limits.
     ubar - ubar_d is by how much the derivative e^(mu) of the error leaves (30).
 
     Args:
         structure: The structure of the system, with as many controls as outputs.
-        limits: Symmetric limits of all controls, and limits of forces and cones; others are not
-            used.
+        limits: Symmetric limits of all controls, and others.
 
     Returns:
         (state, control, parameters) -> control, excess, departure, is_limited: excess is u_d - u,
@@ -63,10 +71,10 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     effect = ca.mtimes(ca.diag(ca.DM(weights)), matrix) @ ca.diag(scale)
     metric = ca.mtimes(effect.T, effect)
     metric /= ca.trace(metric) / high.size
-    rows, bounds = _forces(structure, limits, scale)
+    rows, sides, bounds, softness = _soft(structure, limits, scale)
     goal = desired / scale
-    nearest = nearest_within(metric, goal, rows, bounds, SOFTNESS)
-    over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(rows, goal) - bounds)
+    nearest = nearest_within(metric, goal, rows, sides, bounds, softness)
+    over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(sides, ca.mtimes(rows, goal)) - bounds)
     is_limited = ca.mmax(over) > WITHIN
     limited_control = ca.if_else(is_limited, nearest * scale, desired)
     control = ca.fmax(-scale, ca.fmin(scale, limited_control))
@@ -82,16 +90,83 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     return TracedFunction(name, inputs, outputs, compiled=system.compiled)
 
 
-def _forces(structure: Structure, limits: MotionLimits, scale: ca.DM) -> tuple[ca.SX, ca.SX]:
-    """Returns A and b of A x <= b for u = U x, with rows of length one."""
-    limited = LimitedSignals(structure, MotionLimits(forces=limits.forces, cones=limits.cones))
-    free, by = limited.by_control()
-    slopes, rows, bounds = ca.mtimes(by, ca.diag(scale)), [], []
-    for i, (low, high) in enumerate(zip(limited.low, limited.high, strict=True)):
-        length = ca.norm_2(slopes[i, :]) + np.finfo(float).tiny
-        for bound, sign in ((high, 1.0), (low, -1.0)):
-            if np.isfinite(bound):
-                rows.append(sign * slopes[i, :] / length)
-                bounds.append(sign * (bound - free[i]) / length)
+def _soft(
+    structure: Structure, limits: MotionLimits, scale: ca.DM
+) -> tuple[ca.SX, ca.DM, ca.SX, FloatArray]:
+    """Returns A, S, b and the softness of S A x <= b for u = U x, with rows of A of length one.
+
+    Of the limits of a rate and those by which its state stays within its own, see
+    `LimitedSignals.approach`, the nearer one counts. b is cut off where no x is near it.
+    """
+    limited = LimitedSignals(structure, replace(limits, controls={}))
+    free, by = (ca.vertsplit(part) for part in limited.by_control())
+    low, high = ca.vertsplit(ca.SX(limited.low)), ca.vertsplit(ca.SX(limited.high))
+    place = {signal.name: i for i, signal in enumerate(limited.signals)}
+    of_rates, by_rates = (ca.vertsplit(part) for part in limited.rates_of_states())
+    slowest, fastest = (ca.vertsplit(part) for part in limited.approach())
+    rates = {signal.derivative(1).name for signal in structure.system.state_signals}
+    softness = [SOFTER if signal.name in rates else SOFTNESS for signal in limited.signals]
+    for i, signal in enumerate(limited.state_signals):
+        row = place.get(signal.derivative(1).name)
+        if row is not None:
+            low[row], high[row] = ca.fmax(low[row], slowest[i]), ca.fmin(high[row], fastest[i])
+            continue
+        free.append(of_rates[i])
+        by.append(by_rates[i])
+        low.append(slowest[i])
+        high.append(fastest[i])
+        softness.append(SOFTER)
     columns = structure.system.num_controls
-    return ca.vertcat(ca.SX(0, columns), *rows), ca.vertcat(ca.SX(0, 1), *bounds)
+    rows, bounds, soft, sides = [], [], [], []
+    nearest = -(columns**0.5) - 1.0
+    for i, slope in enumerate(by):
+        slope = ca.sparsify(ca.mtimes(slope, ca.diag(scale)))
+        if not slope.nnz():
+            continue  # The rate of a position, which no control changes at once.
+        length = ca.norm_2(slope) + np.finfo(float).tiny
+        rows.append(slope / length)
+        for bound, sign in ((high[i], 1.0), (low[i], -1.0)):
+            if _is_finite(bound):
+                sides.append((len(rows) - 1, sign))
+                bounds.append(ca.fmax(sign * (bound - free[i]) / length, nearest))
+                soft.append(softness[i])
+    chosen = np.zeros((len(sides), len(rows)))
+    for i, (row, sign) in enumerate(sides):
+        chosen[i, row] = sign
+    matrix, column = ca.vertcat(ca.SX(0, columns), *rows), ca.vertcat(ca.SX(0, 1), *bounds)
+    return matrix, ca.sparsify(ca.DM(chosen)), column, np.array(soft)
+
+
+def _is_finite(bound: ca.SX) -> bool:
+    return not bound.is_constant() or bool(np.isfinite(float(bound)))
+
+
+def limits_reached(
+    structure: Structure, limits: MotionLimits
+) -> tuple[TracedFunction, tuple[str, ...]]:
+    """Builds the function that says which limits a control exceeds.
+
+    Args:
+        structure: The structure of the system.
+        limits: The limits.
+
+    Returns:
+        (state, control, parameters) -> excess over each limit, positive beyond it, shape (k,); and
+        the name of each, such as "largest joint1_motor".
+    """
+    system, limited = structure.system, LimitedSignals(structure, limits)
+    control = ca.SX.sym("control", system.num_controls)
+    free, by = limited.by_control()
+    of_states, by_states = limited.rates_of_states()
+    values = ca.vertcat(free + ca.mtimes(by, control), of_states + ca.mtimes(by_states, control))
+    slowest, fastest = limited.approach()
+    low, high = ca.vertcat(ca.SX(limited.low), slowest), ca.vertcat(ca.SX(limited.high), fastest)
+    over, names = [], list[str]()
+    for i, signal in enumerate([*limited.signals, *limited.state_signals]):
+        for bound, sign, side in ((high[i], 1.0, "largest"), (low[i], -1.0, "least")):
+            if _is_finite(bound):
+                over.append(sign * (values[i] - bound))
+                names.append(f"{side} {signal.name}")
+    inputs = {"state": system.state, "control": control, "parameters": system.parameter_symbol}
+    outputs = {"over": ca.vertcat(ca.SX(0, 1), *over)}
+    return TracedFunction(f"{system.name} limits", inputs, outputs), tuple(names)

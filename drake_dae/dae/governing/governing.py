@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.reference import Reference, with_degrees
-from drake_dae.dae.timing.limited_signals import LimitedSignals
+from drake_dae.dae.timing.limited_signals import APPROACH, LimitedSignals
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ReferenceSignalError
@@ -17,9 +17,6 @@ from drake_dae.trace.functions import TracedFunction
 
 RATE = 20.0
 """The rate in 1/s at which s' returns to 1, and the largest at which it falls to 0."""
-
-APPROACH = 100.0
-"""The largest rate at which speeds approach their limits, in 1/s."""
 
 AHEAD = 0.02
 """Limits are satisfied at a time that is ahead by this, in s."""
@@ -142,12 +139,10 @@ class Governing:
         at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
         later = _interval(values, slopes, *bounds, sizes)
         free, by = limited.rates_of_states()
-        speeds = self.law.system.state[limited.states]
-        low = APPROACH * (limited.state_low - speeds)
-        high = APPROACH * (limited.state_high - speeds)
+        low, high = limited.approach()
         sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
         values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope_now)
-        return [_interval(values, slopes, ca.SX(low), ca.SX(high), sizes), later, at_once]
+        return [_interval(values, slopes, low, high, sizes), later, at_once]
 
 
 def _within(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:

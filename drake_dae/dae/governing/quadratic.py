@@ -1,6 +1,8 @@
 """Small quadratic programs as expressions: a fixed number of steps, no branches."""
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
@@ -19,9 +21,14 @@ BOUNDARY = 0.995
 
 
 def nearest_within(
-    metric: ca.SX, goal: ca.SX, rows: ca.SX, bounds: ca.SX, softness: float
+    metric: ca.SX,
+    goal: ca.SX,
+    rows: ca.SX,
+    sides: ca.DM,
+    bounds: ca.SX,
+    softness: ArrayLike,
 ) -> ca.SX:
-    """Returns x close to g: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and A x <= b + d z.
+    """Returns x close to g: min (x - g)^T H (x - g) / 2 with |x_i| <= 1 and S A x <= b + d z.
 
     The last bounds are soft: each gives way by d times its multiplier z. By Mehrotra's primal-dual
     interior-point method (Nocedal and Wright, Numerical Optimization, 2006, section 16.6) from
@@ -30,19 +37,22 @@ def nearest_within(
     Args:
         metric: H, shape (n, n), symmetric positive definite, with entries of about one.
         goal: g, shape (n, 1).
-        rows: A, shape (k, n), with rows of length about one.
+        rows: A, shape (m, n), with rows of length about one.
+        sides: S, shape (k, m): the row that each bound is for, with 1 for an upper bound and -1 for
+            a lower one, so that both together cost little more than one.
         bounds: b, shape (k, 1).
-        softness: d, positive.
+        softness: d, positive, one or shape (k,).
 
     Returns:
         x, shape (n, 1).
     """
     size, count = goal.numel(), bounds.numel()
     state = {"x": size, "s": count, "u": size, "l": size, "z": count}
-    shapes = {"H": (size, size), "g": (size, 1), "A": (count, size), "b": (count, 1)}
+    shapes = {"H": (size, size), "g": (size, 1), "A": rows.shape, "b": (count, 1)}
     shapes |= {name: (length, 1) for name, length in state.items()}
     symbols = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
-    after = _step(**symbols, softness=softness)
+    given = ca.DM(np.broadcast_to(softness, count))
+    after = _step(**symbols, S=sides, softness=given)
     step = ca.Function("step", list(symbols.values()), after, {"cse": True})
     iterate = [ca.SX.zeros(size), ca.fmax(bounds, 0.1), *(ca.SX.ones(size) for _ in range(2))]
     iterate.append(ca.SX.ones(count))
@@ -61,24 +71,25 @@ def _step(
     u: ca.SX,
     l: ca.SX,  # noqa: E741 - lower
     z: ca.SX,
-    softness: float,
+    S: ca.DM,
+    softness: ca.DM,
 ) -> list[ca.SX]:
-    """x, the slacks s of soft bounds, and the multipliers of x <= 1, x >= -1 and A x <= b."""
+    """x, the slacks s of soft bounds, and the multipliers of x <= 1, x >= -1 and S A x <= b."""
     count = 2 * x.numel() + s.numel()
     above, below = ca.fmax(1.0 - x, CLOSEST), ca.fmax(1.0 + x, CLOSEST)
-    dual = ca.mtimes(H, x - g) + u - l + ca.mtimes(A.T, z)
-    primal = ca.mtimes(A, x) + s - b - softness * z
+    dual = ca.mtimes(H, x - g) + u - l + ca.mtimes(A.T, ca.mtimes(S.T, z))
+    primal = ca.mtimes(S, ca.mtimes(A, x)) + s - b - softness * z
     weights, to_upper, to_lower = z / (s + softness * z), u / above, l / below
     matrix = H + ca.diag(to_upper + to_lower)
-    for i in range(s.numel()):
-        matrix += ca.mtimes(A[i, :].T, weights[i] * A[i, :])
+    for row, weight in zip(ca.vertsplit(A), ca.vertsplit(ca.mtimes(S.T**2, weights)), strict=True):
+        matrix += ca.mtimes(row.T, weight * row)
     factors = PositiveDefiniteFactorization(matrix)
 
     def direction(ps: ca.SX, pu: ca.SX, pl: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         """Newton's step by which these products of slacks and multipliers vanish."""
         excess, of_u, of_l = weights * (primal - ps / z), pu / above, pl / below
-        dx = factors.solve(-dual + of_u - of_l - ca.mtimes(A.T, excess))
-        along = ca.mtimes(A, dx)
+        dx = factors.solve(-dual + of_u - of_l - ca.mtimes(A.T, ca.mtimes(S.T, excess)))
+        along = ca.mtimes(S, ca.mtimes(A, dx))
         dz = weights * along + excess
         ds = -primal - along + softness * dz
         return dx, ds, to_upper * dx - of_u, -to_lower * dx - of_l, dz

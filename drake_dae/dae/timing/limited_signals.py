@@ -7,6 +7,10 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.timing.motion_limits import MotionLimits
 
+APPROACH = 100.0
+"""The largest rate at which states, such as speeds, approach their limits while a motion runs, in
+1/s."""
+
 
 class LimitedSignals:
     """The controls, rates of states, constraint forces and friction cones that have limits.
@@ -78,6 +82,21 @@ class LimitedSignals:
         motion = self._structure.derivatives
         free, by = motion.by_control(motion.rate)
         return ca.densify(free[self.states, :]), ca.densify(by[self.states, :])
+
+    def approach(self) -> tuple[ca.SX, ca.SX]:
+        """Returns the least and the largest rates of the limited states, or infinity, (k, 1).
+
+        States x stay between their limits if APPROACH (low - x) <= x' <= APPROACH (high - x).
+        """
+        state = ca.vertsplit(self._structure.system.state[self.states])
+        low, high = (
+            [
+                APPROACH * (bound - x) if np.isfinite(bound) else ca.SX(bound)
+                for bound, x in zip(bounds.tolist(), state, strict=True)
+            ]
+            for bounds in (self.state_low, self.state_high)
+        )
+        return ca.vertcat(ca.SX(0, 1), *low), ca.vertcat(ca.SX(0, 1), *high)
 
     def _chosen(self, free: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
         system, cones = self._structure.system, ca.DM(self._cones)

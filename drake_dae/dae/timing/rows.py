@@ -19,6 +19,10 @@ LINEAR = 1e-7
 SLOW = 0.01
 """The slowest speed at which friction is evaluated, as a share of the largest."""
 
+TANGENT = 0.9
+"""The largest part of friction that grows with the speed, as a share of the room in slow motion,
+for which its tangent is used: the tangent takes half of it where nothing moves."""
+
 CHECKED = 20
 """Every n-th point is tested, with this n."""
 
@@ -96,13 +100,8 @@ class LimitRows:
         """
         by_a, by_b, still = self.by_a, self.by_b, self.still
         if not self.is_linear:
-            # At rest as in slow motion.
             now = np.full(len(still), self.scale**2) if before is None else before
-            speed = np.maximum(np.sqrt(now), SLOW * np.sqrt(now.max()))
-            zero = np.zeros(len(still))
-            values = self._values(speed, zero)
-            by_a = (self._values(speed, zero + self.scale**2) - values) / self.scale**2
-            still = values - speed[:, None] ** 2 * by_b
+            by_a, by_b, still = self._about(np.sqrt(now))
         low, high = self.along.limited.low, self.along.limited.high
         up, down = np.isfinite(high), np.isfinite(low)
         above, below = high[up] - still[:, up], still[:, down] - low[down]
@@ -112,6 +111,23 @@ class LimitRows:
         of_a = [by_a[:, up] / above, -by_a[:, down] / below, *(t.of_a for t in tools), none]
         of_b = [by_b[:, up] / above, -by_b[:, down] / below, *(t.of_b for t in tools), none]
         return LinearLimits(np.hstack(of_a), np.hstack(of_b))
+
+    def _about(self, speed: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """n, m and c of signals with friction, exact at given speeds; rest counts as slow motion.
+
+        The part of friction that grows with the speed, d sqrt(b), is replaced by its tangent, or
+        where that leaves too little room by the line from rest, on which rest is possible.
+        """
+        slow = np.full(len(speed), SLOW * speed.max())
+        speed, zero = np.maximum(speed, slow), np.zeros(len(speed))
+        values = self._values(speed, zero)
+        by_a = (self._values(speed, zero + self.scale**2) - values) / self.scale**2
+        still = self._values(slow, zero) - slow[:, None] ** 2 * self.by_b
+        grown = values - speed[:, None] ** 2 * self.by_b - still
+        limited = self.along.limited
+        room = np.where(grown > 0.0, limited.high - still, still - limited.low)
+        share = np.where(np.abs(grown) < room * TANGENT, 0.5, 1.0)
+        return by_a, self.by_b + share * grown / speed[:, None] ** 2, still + (1.0 - share) * grown
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
         """Returns the largest b at each point, and its cause as an index into `names`.
@@ -170,8 +186,9 @@ def rows_along(
     still = values(0.0, 0.0)
     _check_rest(along, piece, at_rest, still)
     by_a = (values(0.0, speed**2) - still) / speed**2
-    # Without friction, which does not grow with b.
-    by_b = (values(2.0 * speed, 0.0) - values(speed, 0.0)) / (3.0 * speed**2)
+    # Without friction, which is constant or grows with the speed.
+    once, double, triple = (values(k * speed, 0.0) for k in (1.0, 2.0, 3.0))
+    by_b = (triple - 2.0 * double + once) / (2.0 * speed**2)
     twice = values(2.0 * speed, speed**2, CHECKED)
     expected = still + speed**2 * (4.0 * by_b + by_a)
     off = np.abs(twice - expected[::CHECKED]).max(axis=0, initial=0.0)

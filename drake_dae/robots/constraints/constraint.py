@@ -137,7 +137,8 @@ class Constraint(ABC):
     14. `solids` and `layer` are the geometry for Drake's own contact: objects in the world that act
         on frame B of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
-        clearance of that point, except beyond the ends of a body that the law does not know.
+        clearance of that point, except beyond the ends of a body that the law does not know. With
+        `ends`, `edges` are the distances of the foot of that point from the edges of the face.
     16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
     17. `friction_state` are the states of its friction and their rates; they do not depend on
         constraint forces.
@@ -244,8 +245,12 @@ class Constraint(ABC):
 
     @property
     def ends(self) -> bool:
-        """Whether its surface has edges or holes, which only compliant contact knows."""
+        """Whether its surface has edges or holes, which the law does not know."""
         return False
+
+    def edges(self, frames: Frames) -> ca.SX:
+        """The distances of its point from the edges of its surface in m; see `Surface.edges`."""
+        return ca.SX(0, 1)
 
     @property
     def remark(self) -> str:

@@ -220,6 +220,9 @@ class PointOnSurface(Constraint):
     def ends(self) -> bool:
         return self.surface.ends
 
+    def edges(self, frames: Frames) -> ca.SX:
+        return self.surface.edges(self.offset(frames))
+
     @property
     def remark(self) -> str:
         return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""

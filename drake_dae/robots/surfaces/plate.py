@@ -64,9 +64,12 @@ class Hole:
 class Plate(Plane):
     """A rectangular plate with a plane face, and with a hole if given: a plane that ends.
 
-    Laws, ideal plants and unilateral plants use the whole plane, phi = n . (p - point): they know
-    neither its edges nor its hole. Compliant plants and Drake's contact use the plate itself: a
-    tool beyond an edge, or in the hole, touches nothing or its sides.
+    Laws and constraints that stay closed have the whole plane, phi = n . (p - point), without
+    edges and without a hole. Unilateral plants have its face: a contact opens where its point
+    leaves the face by an edge or over the hole, and closes on the face alone; there the sides of
+    the plate are no contact, unless a constraint of their own has them. Compliant plants and
+    Drake's contact have the whole plate: a tool beyond an edge, or in the hole, touches nothing or
+    its sides.
 
     Attributes:
         point: The middle of the face, m, shape (3,).
@@ -101,7 +104,7 @@ class Plate(Plane):
     @property
     def remark(self) -> str:
         ends = "edges" if self.hole is None else "edges and the hole"
-        return f"only compliant plants and Drake's contact know the {ends} of this Plate"
+        return f"the law has the whole plane of this Plate, without the {ends}"
 
     def clearance(self, offset: ca.SX) -> ca.SX:
         (x, y), z = ca.vertsplit(self.coordinates(offset)), self.distance(offset)
@@ -114,6 +117,15 @@ class Plate(Plane):
         center = self.hole.center
         inward = self.hole.radius - _length(x - center[0], y - center[1])
         return ca.fmax(box, _from_rim(inward, z, self.hole.chamfer))
+
+    def edges(self, offset: ca.SX) -> ca.SX:
+        (x, y), (a, b) = ca.vertsplit(self.coordinates(offset)), self.half_widths
+        sides = [a - x, a + x, b - y, b + y]
+        if (hole := self.hole) is None:
+            return ca.vertcat(*sides)
+        rim, (u, v) = hole.radius + hole.chamfer, hole.center
+        # To first order around the rim, and smooth also at its center.
+        return ca.vertcat(*sides, ((x - u) ** 2 + (y - v) ** 2 - rim**2) / (2.0 * rim))
 
     def solids(self) -> tuple[PosedShape, ...]:
         # Drake finds balls in boxes exactly. Near edges of convex meshes its depth is off by a

@@ -50,7 +50,8 @@ class Surface(ABC):
        own contact; convex if there are several. A surface may have none. `layer` is a mesh below a
        piece of any smooth surface, for hydroelastic contact. `clearance` is the signed distance
        from the body that compliant plants use. It differs from `distance` where a body ends, which
-       laws and ideal plants do not know; then `ends` is true.
+       laws do not know; then `ends` is true, and `edges` are the distances of the foot of a point
+       from the edges of its face: smooth, and all positive on the face.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
        which it is defined, if that is bounded.
     """
@@ -157,6 +158,14 @@ class Surface(ABC):
             offset: As for `distance`.
         """
         return self.distance(offset)
+
+    def edges(self, offset: ca.SX) -> ca.SX:
+        """The distances of the foot of a point from the edges in m; none without an edge.
+
+        Args:
+            offset: As for `distance`.
+        """
+        return ca.SX(0, 1)
 
     def _lengths(self, size: float) -> Pair:
         """The lengths of the sides of a piece in m: `size`, if the surface is unbounded."""

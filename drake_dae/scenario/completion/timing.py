@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from drake_dae.dae.references import references_by_name
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.timing.motion_limits import MotionLimits
@@ -96,5 +98,12 @@ def timed(
     notes = [note]
     if why_not and settings.governor is None:
         notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
+    pairs = zip(model.dae.control_signals, model.control_limits, strict=True)
+    free = [signal.name for signal, limit in pairs if np.isinf(limit)]
+    if is_governed and free:
+        notes.append(
+            f"{', '.join(free)} has no effort limit: where no motion along the path is within the "
+            "limits, the error stays as predicted and they are exceeded"
+        )
     governed = robot_motion_limits(model, **contacts) if is_governed else None
     return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)

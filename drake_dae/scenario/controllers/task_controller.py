@@ -33,11 +33,11 @@ def check_task(scenario: Scenario) -> None:
         if task.make().plan.latches:
             problems += [(key, text) for key, own in gains.items() if isinstance(own, Impedance)]
         ending = [c.name for c in scenario.constraints if isinstance(c, Constraint) and c.ends]
-        feeling = [phase.name for phase in task.phases if phase.feels_ends]
-        if ending and feeling and not scenario.plant.knows_ends:
+        entering = [phase.name for phase in task.phases if phase.enters_holes]
+        if ending and entering and not scenario.plant.has_sides:
             text = (
-                f"{feeling[0]} waits for an edge or a hole, and the ideal contact of '{ending[0]}' "
-                "is that of a whole plane; take !MultibodyPlant or !CompliantContact"
+                f"{entering[0]} enters a hole, and the ideal contact of '{ending[0]}' has a face "
+                "that ends, and no sides; take !MultibodyPlant or !CompliantContact"
             )
             problems.append(("plant", text))
     if scenario.start.errors:

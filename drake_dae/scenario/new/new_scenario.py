@@ -42,7 +42,7 @@ def new_scenario(
     surface: SurfaceKind = "plane",
     tip: str = "",
     point: Vector = (0.0, 0.0, 0.0),
-    folder: str | Path = "",
+    folder: str | Path | None = None,
 ) -> tuple[Scenario, str]:
     """Makes a scenario in which a robot presses on a surface and moves in a circle on it.
 
@@ -59,7 +59,8 @@ def new_scenario(
         surface: The surface: "plane", "cylinder" or "sphere".
         tip: The frame in contact; found if empty.
         point: The point in that frame, m, shape (3,).
-        folder: The folder of the text: a robot's file below it gets a relative name.
+        folder: The folder in which the text will be saved: a robot's file below it gets a name
+            relative to it. Without one the name is absolute, and the text may be saved anywhere.
 
     Returns:
         The scenario, and its text with a comment on each choice; `load_scenario` reads the same
@@ -88,7 +89,7 @@ def new_scenario(
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
-            return whole, scenario_text(whole, robot, task, Path(os.path.realpath(folder)))
+            return whole, scenario_text(whole, robot, task, folder)
         x, y, z = task.center
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
@@ -98,7 +99,7 @@ def new_scenario(
         if report.wrong_sides:
             remarks["constraints"] = "; ".join(map(str, report.behind))
         robot = replace(robot, remarks={**robot.remarks, **remarks})
-        return whole, scenario_text(whole, robot, task, Path(os.path.realpath(folder)))
+        return whole, scenario_text(whole, robot, task, folder)
     text = (
         f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
         + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")

@@ -1,6 +1,7 @@
 """A new scenario as text: every number with its unit and reason."""
 
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from math import pi
@@ -47,19 +48,22 @@ _WHY = {
 }
 
 
-def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Path) -> str:
+def scenario_text(
+    scenario: Scenario, robot: NewRobot, task: NewTask, folder: str | Path | None
+) -> str:
     """The text of a new scenario.
 
     Args:
         scenario: The scenario, completed.
         robot: Its robot, with remarks.
         task: Its task.
-        folder: Its folder.
+        folder: The folder in which it will be saved, if it is known.
     """
     data = scenario_data(scenario, _KEYS)
-    file = Path(data["robot"]["file"])
-    if file.is_relative_to(folder):
-        data["robot"]["file"] = file.relative_to(folder).as_posix()
+    if folder is not None:
+        file, saved = Path(data["robot"]["file"]), os.path.realpath(folder)
+        if file.is_relative_to(saved):
+            data["robot"]["file"] = file.relative_to(saved).as_posix()
     return "\n".join(_lines(data, robot, task)) + "\n"
 
 

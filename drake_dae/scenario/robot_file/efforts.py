@@ -23,7 +23,6 @@ def read_efforts(models: Mapping[str, Path]) -> Efforts:
     """
     efforts: dict[tuple[str, str], float] = {}
     for instance, file in models.items():
-        # Drake reads some files that are not XML, with undeclared prefixes; these have no limits.
         root = parsed(file.read_bytes())
         for joint in root.iterfind("joint") if file.suffix == ".urdf" else ():
             limit = joint.find("limit")

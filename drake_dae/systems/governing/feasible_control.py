@@ -1,10 +1,13 @@
 """A control within limits that changes the outputs' derivatives least, as a LeafSystem."""
 
+from functools import cached_property
+
+import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.governing.feasible import feasible_control
+from drake_dae.dae.governing.feasible import feasible_control, limits_reached
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.timing.motion_limits import MotionLimits
@@ -13,6 +16,7 @@ from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation
 from drake_dae.systems.blocks.trials import StepWatch
+from drake_dae.trace.functions import TracedFunction
 
 OUTPUTS = ("control", "excess", "departure", "is_limited")
 """The output ports, in the order of the function's results."""
@@ -40,7 +44,7 @@ class FeasibleControl(LeafSystem):
 
     Args:
         structure: The structure of the law's system.
-        limits: Limits of all controls, and of forces and cones.
+        limits: Limits of all controls, and others.
 
     Raises:
         ModelError: As of `feasible_control`.
@@ -52,7 +56,7 @@ class FeasibleControl(LeafSystem):
         super().__init__()
         self.set_name("feasible_control")
         system = structure.system
-        self._degrees = structure.output_degrees
+        self._structure, self._limits = structure, limits
         self.dae, self.function = system, feasible_control(structure, limits)
         self._steps = StepWatch(self)
         self.DeclareNumericParameter(BasicVector(system.parameter_values))
@@ -68,8 +72,27 @@ class FeasibleControl(LeafSystem):
         """Names and units of the departure."""
         return tuple(
             Signal(f"departure of {signal.name}", signal.derivative(degree).unit)
-            for signal, degree in zip(self.dae.output_signals, self._degrees, strict=True)
+            for signal, degree in zip(
+                self.dae.output_signals, self._structure.output_degrees, strict=True
+            )
         )
+
+    @cached_property
+    def _reached(self) -> tuple[TracedFunction, tuple[str, ...]]:
+        return limits_reached(self._structure, self._limits)
+
+    def causes(self, states: FloatArray, commanded: FloatArray) -> list[str]:
+        """The limits that commanded controls exceed, such as "largest joint1_motor".
+
+        Args:
+            states: States, shape (k, n).
+            commanded: Commanded controls, shape (k, p), of which some exceed a limit.
+        """
+        function, names = self._reached
+        parameters = self.dae.parameter_values
+        over = [function(x, u, parameters)[0] for x, u in zip(states, commanded, strict=True)]
+        is_over = np.max(over, axis=0, initial=-np.inf) > 0.0
+        return [name for name, yes in zip(names, is_over, strict=True) if yes]
 
     def _values(self, context: Context) -> tuple[FloatArray, ...]:
         state, control = self._state.Eval(context), self._commanded.Eval(context)

@@ -274,6 +274,23 @@ def test_friction_makes_no_limit_exceeded(friction):
     assert np.mean(reached > 0.99) > 0.9
 
 
+def test_with_damping_the_time_of_the_motion_is_not_that_of_the_reference():
+    """The path alone determines the motion: a reference 20 times as slow has the same."""
+    wall = PointOnSurface(
+        "tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall", viscous_friction=150.0
+    )
+    model = RobotModel.from_multibody(
+        parse("two_link_arm"), [wall], [PointCoordinates("tool", "z")], [1.2, -1.6]
+    )
+    timing, found = PathTiming(find_structure(model.dae), two_link_limits()), []
+    for slower in (1.0, 20.0):
+        references = SinusoidReference(0.3, 0.3, 1.5 / slower), ConstantReference(20.0)
+        ends = {"begin": -0.9 * slower, "end": 0.9 * slower}
+        found.append(timing.profile(references, **ends, points=300).duration)
+    assert found[0] > 1.1 * two_link_profile(two_link_limits(), end=0.9, begin=-0.9).duration
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
 def test_what_has_no_profile_is_refused_in_a_sentence():
     springs = RobotModel.from_multibody(
         parse("two_link_arm"),

@@ -158,6 +158,33 @@ def test_the_pieces_of_a_plate_have_its_clearance(hole):
     assert outside > 200
 
 
+@pytest.mark.parametrize("hole", [None, Hole(0.005, (0.01, 0.004), chamfer=0.001)], ids=str)
+def test_the_face_of_a_plate_is_where_it_has_no_clearance(hole):
+    """In the plane of the face the body is below the feet that are on the inner side of all edges.
+
+    Beyond an edge the least distance is that of the clearance, to first order at a rim.
+    """
+    plate = Plate((0, 0, 0), (-1, 0, 0.3), (0.03, 0.02), thickness=0.02, hole=hole)
+    offset, random = ca.SX.sym("offset", 3), np.random.default_rng(2)
+    outputs = {"clearance": plate.clearance(offset), "edges": plate.edges(offset)}
+    function = TracedFunction("plate", {"offset": offset}, outputs)
+    places, on = random.uniform([-0.04, -0.03], [0.04, 0.03], (400, 2)), 0
+    for place in places @ np.vstack(tangents(plate.normal)):
+        clearance, edges = function(place)
+        is_on = bool((edges > 0.0).all())
+        on += is_on
+        # The length of a vector is 1e-12 m at least.
+        assert bool(clearance[0] < 2e-12) is is_on
+        if not is_on and (edges < 0.0).sum() == 1 and np.argmin(edges) < 4:
+            assert clearance[0] == pytest.approx(-edges.min(), abs=1e-12)
+    assert 100 < on < 300
+
+
+def test_surfaces_that_do_not_end_have_no_edges():
+    for name, surface in SURFACES.items():
+        assert bool(surface.edges(ca.SX.sym("p", 3)).numel()) is surface.ends is (name == "plate")
+
+
 def test_a_hole_that_does_not_fit_its_plate_is_refused():
     for hole in (Hole(0.02), Hole(0.005, (0.016, 0.0)), Hole(0.005, chamfer=0.03)):
         with pytest.raises(ModelError, match="does not fit a plate with the half_widths"):

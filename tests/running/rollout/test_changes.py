@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from falling import ball, box, planar_box, rocking_block, standing_on_right
+from falling import ball, box, mass_point, planar_box, rocking_block, standing_on_right
 from painleve import rod, sliding
 from polishing import CLIMB, push, run_on, started, task_loop
 from pydrake.systems.analysis import SimulatorConfig
@@ -16,9 +16,11 @@ from drake_dae import (
     Approach,
     Dwell,
     GuardedMove,
+    Hole,
     Move,
     PhaseGuard,
     Plane,
+    Plate,
     PointOnSurface,
     Press,
     Release,
@@ -241,6 +243,7 @@ def test_a_task_that_has_begun_does_not_begin_again():
     assert "a task begins when its run does" in str(found.failure)
 
 
+TABLE = Plate((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.2), hole=Hole(0.005, chamfer=0.001))
 FALLING = {
     "a ball that bounces": (lambda: ball(0.6), [0.5, -1.0], 1.5),
     "a box that lands on two feet": (
@@ -249,6 +252,16 @@ FALLING = {
         0.7,
     ),
     "a block that rocks": (rocking_block, standing_on_right(0.2), 3.0),
+    "a box that slides over an edge": (
+        lambda: box({"left": 0.3, "right": 0.3}, driven=False, floor=TABLE),
+        [0.0, 0.55, 0.0, 0.4, 0.0, 0.0],
+        0.6,
+    ),
+    "a point that bounces over a hole and an edge": (
+        lambda: mass_point({"floor": TABLE}, 0.7),
+        [-0.28, 0.004, 0.02, 0.5, 0.0, 0.0],
+        1.3,
+    ),
 }
 
 

@@ -1,5 +1,6 @@
 """What `new` finds out of files that say too little, or too much."""
 
+import os
 import subprocess
 import sys
 import sysconfig
@@ -56,6 +57,20 @@ def test_a_planar_arm_runs_with_the_far_end_of_its_last_link(tmp_path):
     loop, _, record = run_scenario(load_scenario(tmp_path / "task.yaml", ["duration=0.3"]))
     off = np.abs(record["tracking_error"] - loop.predicted_error(record)).max()
     assert off < 1e-8  # The accuracy of the integrator.
+
+
+@pytest.mark.slow
+def test_its_text_may_be_saved_anywhere_unless_a_folder_is_named(tmp_path, monkeypatch):
+    """In a folder below the working directory, too, where a relative name would be another file."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(arm(2))
+    Path("below").mkdir()
+    for folder, saved in ((None, "below/task.yaml"), ("", "task.yaml"), (tmp_path, "named.yaml")):
+        _, text = new_scenario("arm.urdf", folder=folder)
+        assert ("file: arm.urdf" in text) == (folder is not None)
+        Path(saved).write_text(text)
+        file = load_scenario(saved).robot.file
+        assert os.path.realpath(file) == os.path.realpath("arm.urdf")
 
 
 def test_an_end_that_has_a_frame_keeps_it(tmp_path):

@@ -20,6 +20,7 @@ from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.efforts import read_efforts
 from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
@@ -329,6 +330,20 @@ def test_meaningless_effort_limits_are_ignored(effort, tmp_path):
     file = tmp_path / "robot.urdf"
     file.write_text(robot("one", joint("j", "a", "b", "0 0 1")).replace("87.0", effort))
     assert read_efforts({"": file}) == {}
+
+
+def test_effort_limits_of_a_file_with_a_prefix_that_it_does_not_declare(tmp_path):
+    """Drake reads such files, with the acceleration limit, where XML has none of these names."""
+    file = tmp_path / "robot.urdf"
+    text = robot("one", link("a", 1.0), link("b", 1.0), joint("j", "a", "b", "0 0 1"))
+    file.write_text(text.replace("<limit", '<limit drake:acceleration="7"'))
+    chosen = Robot(file=str(file), actuators="all")
+    plant, efforts = read_robot(chosen)
+    change_robot(chosen, plant, efforts)
+    assert efforts == {("", "j"): 87.0}
+    plant.Finalize()
+    assert plant.GetAccelerationUpperLimits()[-1] == 7.0
+    assert plant.GetEffortUpperLimits().tolist() == [87.0]
 
 
 FRICTION = """

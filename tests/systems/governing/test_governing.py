@@ -1,8 +1,11 @@
 """Motions that are slowed, and controls that are limited, while they run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from arms import arm, consistent_states, error_controlled, fixed_step, law
+from arms import arm, consistent_states, error_controlled, fixed_step, law, numbers
+from scipy.optimize import linprog
 
 from drake_dae import (
     ConstantReference,
@@ -180,6 +183,53 @@ def test_limits_hold_in_the_stated_order(name):
         np.testing.assert_allclose(departure, missed, atol=1e-9 * np.abs(missed).max())
         assert is_limited
     assert held > 3
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_speeds_and_accelerations_hold_where_drives_and_forces_allow_it(name):
+    """By MultibodyPlant, and by a linear program that tells whether any control is allowed."""
+    found, random = arm(name), np.random.default_rng(2)
+    plant, dae = found.plant, found.model.dae
+    speeds = [signal.name for signal in found.model.links.velocity_signals]
+    limits = replace(
+        robot_motion_limits(found.model, forces={"wall.force": (5.0, 60.0)}),
+        states=dict.fromkeys(speeds, (-1.0, 1.0)),
+        rates=dict.fromkeys(speeds, (-6.0, 6.0)),
+    )
+    function = feasible_control(found.structure, limits)
+    most = np.array([limits.controls[signal.name][1] for signal in dae.control_signals])
+    driven, held, given_way = np.eye(most.size), 0, 0
+    for state in consistent_states(name, 30):
+        half = state.size // 2
+        speed = 0.99 * state[half:] / np.abs(state[half:]).max()
+        there = numbers(name, state[:half], speed)
+        jacobian = there.constraint_jacobian
+        # M v' = u + J^T f - bias,   J v' + J' v = 0.
+        matrix = np.block([[there.mass, -jacobian.T], [jacobian, np.zeros((1, 1))]])
+        right = np.concatenate([-there.bias, -there.constraint_acceleration])
+        free = np.linalg.solve(matrix, right)
+        by = np.linalg.solve(matrix, np.vstack([driven, np.zeros((1, most.size))]))
+        # v' <= 100 (V - v), at most 100 1/s times the room.
+        high = np.append(np.minimum(6.0, 100.0 * (1.0 - speed)), 60.0)
+        low = np.append(np.maximum(-6.0, 100.0 * (-1.0 - speed)), 5.0)
+        rows, room = np.vstack([by, -by]), np.concatenate([high - free, free - low])
+        bounds = list(zip(-most, most, strict=True))
+        can = linprog(np.zeros(most.size), rows, room, bounds=bounds).status == 0
+        force = [rows[half], rows[-1]], [room[half], room[-1]]
+        can_press = linprog(np.zeros(most.size), *force, bounds=bounds).status == 0
+        wanted = random.uniform(-1.0, 1.0, most.size) * most
+        control, *_ = function(np.concatenate([state[:half], speed]), wanted, dae.parameter_values)
+        assert np.all(np.abs(control) <= most)
+        over = rows @ control - room
+        if can:
+            held += 1
+            # They give way by 1e-6 times their multipliers, relative to what full torque makes.
+            assert over.max() <= 2e-3 * 6.0
+        elif can_press:
+            given_way += 1
+            assert max(over[half], over[-1]) <= 2e-2
+    assert held > 3
+    assert plant.num_velocities() == half
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import re
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 
 def blank(match: re.Match[str]) -> str:
@@ -15,8 +16,19 @@ def without_comments(text: str) -> str:
 
 
 def parsed(text: str | bytes) -> ElementTree.Element:
-    """The root of an XML text; an empty element if it is malformed, which Drake reports."""
+    """The root of an XML text; an empty element if it is malformed, which Drake reports.
+
+    Like Drake it takes prefixes that are not declared, such as `drake:`, as parts of names.
+    """
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError:
+        pass
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(text, True)
+        return builder.close()
+    except (expat.ExpatError, AssertionError):  # An assertion of what has no element.
         return ElementTree.Element("malformed")

@@ -15,6 +15,7 @@ from drake_dae.errors import ModelError, PainleveError, SimulationError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.unilateral.edges import Edges
 from drake_dae.systems.plants.unilateral.frictional import FrictionalContact
 from drake_dae.systems.plants.unilateral.impacts import TouchRows, is_p_matrix
 
@@ -95,6 +96,7 @@ class UnilateralContacts:
         along: The rows of the sliding velocities of each contact in `all_rates`.
         bilateral: The rows of all other constraints.
         normals: The normal row of each contact.
+        edges: The edges of their surfaces.
         gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
             derivatives from exogenous signals.
@@ -167,6 +169,7 @@ class UnilateralContacts:
         self.gaps = dae.trace(
             "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         )
+        self.edges = Edges(model, [parts[name][0] for name in self.names])
         self.off = dae.trace("latches", {"value": dae.k}) if latches else None
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)

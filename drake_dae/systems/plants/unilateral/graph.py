@@ -35,10 +35,12 @@ class ContactGraph:
     Attributes:
         name: The plant.
         contacts: The names of the contacts.
+        ending: Those with a surface that ends.
     """
 
     name: str
     contacts: tuple[str, ...]
+    ending: tuple[str, ...] = ()
 
     @property
     def modes(self) -> tuple[tuple[str, ...], ...]:
@@ -57,9 +59,12 @@ class ContactGraph:
                 if name in mode:
                     remaining = tuple(other for other in mode if other != name)
                     yield Transition(mode, remaining, name, f"lambda({name}) falls to 0", "")
+                    if name in self.ending:
+                        yield Transition(mode, remaining, name, f"{name} leaves its face", "")
                     continue
                 joined = tuple(other for other in self.contacts if other in mode or other == name)
                 falls = f"phi({name}) falls to 0"
+                falls += " on its face" if name in self.ending else ""
                 rate = f"phi'({name})"
                 yield Transition(mode, mode, name, falls, f"{rate} := -e {rate}")
                 settles = f"{falls} and bouncing would end within the settling time"

@@ -7,6 +7,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
 from drake_dae.systems.plants.contact_events import ContactEvent
+from drake_dae.systems.plants.unilateral.edges import until_passed
 
 MARGIN = 1e-13
 """The rate of an opening contact above minus this, in m/s, is round-off."""
@@ -20,6 +21,7 @@ class RunLog:
         events: The events of contacts.
         time: The start time of the current step, in s.
         gaps, rates: The gaps and rates of all contacts then, in m and m/s; empty before a run.
+        edges, edge_rates: The distances from edges and their rates then; see `Edges`.
         before: Time and state before the last reset.
         held: Whether the step began in the previous mode, with positive forces of all its contacts.
         pulled: The indices of contacts with negative force since then, after a jump of the control.
@@ -30,6 +32,8 @@ class RunLog:
     time: float = np.nan
     gaps: FloatArray = field(default_factory=lambda: np.zeros(0))
     rates: FloatArray = field(default_factory=lambda: np.zeros(0))
+    edges: FloatArray = field(default_factory=lambda: np.zeros(0))
+    edge_rates: FloatArray = field(default_factory=lambda: np.zeros(0))
     before: tuple[float, bytes] = (np.nan, b"")
     held: bool = False
     pulled: set[int] = field(default_factory=set)
@@ -53,7 +57,30 @@ def clearance(log: RunLog, time: float, gaps: FloatArray, rates: FloatArray) -> 
         return clearances
     pierced = gaps < np.minimum(log.gaps, 0.0) - TOUCHING
     clearances[pierced] = gaps[pierced]
-    before, after = (np.where(np.abs(each) < MARGIN, 0.0, each) for each in (log.rates, rates))
-    dips = lowest(time - log.time, log.gaps, before, gaps, after)
+    dips = lowest(time - log.time, log.gaps, moving(log.rates), gaps, moving(rates))
     clearances[dips < -TOUCHING] = dips[dips < -TOUCHING]
     return clearances
+
+
+def moving(rates: FloatArray) -> FloatArray:
+    """Rates in m/s, those of round-off size as zero."""
+    return np.where(np.abs(rates) < MARGIN, 0.0, rates)
+
+
+def edges_passed(
+    log: RunLog, time: float, on: FloatArray, edges: FloatArray, rates: FloatArray
+) -> FloatArray:
+    """The distances to edges, or their least values within the step where these are negative.
+
+    Args:
+        log: The log at the start of the step.
+        time: The time, in s.
+        on: As of `Feet`.
+        edges, rates: The distances from edges and their rates at the time, in m and m/s.
+    """
+    until, speeds = until_passed(on, edges, rates)
+    if not log.edges.size:
+        return until
+    first, first_speeds = until_passed(on, log.edges, log.edge_rates)
+    dips = lowest(time - log.time, first, moving(first_speeds), until, moving(speeds))
+    return np.where(dips < -TOUCHING, dips, until)

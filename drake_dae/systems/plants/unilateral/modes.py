@@ -11,6 +11,7 @@ from drake_dae.dae.structure.constrained import ConstraintStructure, find_constr
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
+from drake_dae.systems.plants.unilateral.edges import Feet
 from drake_dae.systems.plants.unilateral.impacts import rows_of
 from drake_dae.trace.functions import TracedFunction
 
@@ -154,6 +155,16 @@ def closed_of(values: FloatArray) -> Closed:
     return tuple(value > 0.5 for value in values.tolist())
 
 
-def numbers_of(closed: Closed) -> FloatArray:
-    """The numbers of a mode, shape (k,): 1 where closed, 0 where open."""
-    return np.array(closed, dtype=float)
+def numbers_of(closed: Closed, feet: Feet) -> FloatArray:
+    """The discrete state of a mode: for each contact 1 closed, 0 open, -1 open beside its face.
+
+    After these it has `Feet.on`.
+    """
+    numbers = np.array(closed, dtype=float)
+    numbers[np.flatnonzero(feet.beside)] = -1.0
+    return np.concatenate([numbers, feet.on])
+
+
+def feet_of(values: FloatArray, count: int) -> Feet:
+    """The feet of a discrete state with that number of contacts and latches."""
+    return Feet(tuple(value < -0.5 for value in values[:count].tolist()), values[count:].copy())

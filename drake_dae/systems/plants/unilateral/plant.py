@@ -20,14 +20,13 @@ from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, ones
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
-from drake_dae.systems.plants.unilateral.log import RunLog, clearance
-from drake_dae.systems.plants.unilateral.modes import Closed, closed_of, numbers_of
+from drake_dae.systems.plants.unilateral.log import RunLog, clearance, edges_passed
+from drake_dae.systems.plants.unilateral.modes import closed_of, numbers_of
 from drake_dae.systems.plants.unilateral.ports import ModalPorts
 from drake_dae.systems.plants.unilateral.resets import Resets
 from drake_dae.systems.plants.unilateral.traced import TracedContacts
@@ -46,6 +45,8 @@ class UnilateralRobotPlant(ModalPorts):
       do not. Friction also acts in impacts.
     - It opens when lambda falls through zero, or when a jump of the control makes it negative. A
       force that is zero except for round-off, as under a law that leaves none, keeps it closed.
+    - On a surface that ends, as a `Plate`, it opens where the foot of its point leaves the face,
+      and closes on the face alone; see `Edges`.
     - With dependent contacts, such as four feet of a table, as few as possible carry the force, and
       the others touch without force. If friction leaves no motion or two, the run ends with a
       PainleveError.
@@ -130,6 +131,7 @@ class UnilateralRobotPlant(ModalPorts):
         self._latch_sets = [
             tuple(name in closed for name in self.latches) for closed in latch_sets
         ] or list(product((False, True), repeat=len(self.latches)))
+        self._edges = self._contacts.edges
         self._resets = Resets(self._contacts, self.modes, settling, captured)
         self._log_index = self.DeclareCacheEntry(
             "events",
@@ -143,14 +145,18 @@ class UnilateralRobotPlant(ModalPorts):
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
+        guards = [
+            *(("gap, force or command", self._guard, i) for i in range(len(self.contacts))),
+            *(("edge", self._edge_guard, i) for i in self._edges.places),
+        ]
         self._witnesses = [
             self.MakeWitnessFunction(
-                f"{name}: gap, force or command",
+                f"{self.contacts[place]}: {text}",
                 WitnessFunctionDirection.kPositiveThenNonPositive,
-                weakly(self._guard, i),
+                weakly(guard, place),
                 UnrestrictedUpdateEvent(weakly(self._at_guard)),
             )
-            for i, name in enumerate(self.contacts)
+            for text, guard, place in guards
         ]
 
     def events(self, context: Context) -> tuple[ContactEvent, ...]:
@@ -161,7 +167,8 @@ class UnilateralRobotPlant(ModalPorts):
     @property
     def graph(self) -> ContactGraph:
         """Modes, guards and resets: print it, or draw its `graphviz()`."""
-        return ContactGraph(self.dae.name, self._contacts.names)
+        names = self._contacts.names
+        return ContactGraph(self.dae.name, names, tuple(names[i] for i in self._edges.places))
 
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
@@ -174,7 +181,7 @@ class UnilateralRobotPlant(ModalPorts):
     def _guard(self, place: int, context: Context) -> float:
         """Positive while a contact keeps its mode: Drake locates the zero."""
         margin, log = float(self._margins(context)[place]), self._log(context)
-        closed = context.get_discrete_state_vector().value()[place] > 0.5
+        closed = self._numbers(context)[place] > 0.5
         is_latch = place >= len(self._contacts.names)
         if not (closed or is_latch) or context.get_time() != log.time:
             return -1.0 if place in log.pulled else margin
@@ -186,28 +193,37 @@ class UnilateralRobotPlant(ModalPorts):
             log.pulled.add(place)
         return margin if margin > 0.0 else 1.0
 
-    def _margins(self, context: Context) -> FloatArray:
-        """For each contact its `grip` if closed; otherwise positive until it penetrates.
+    def _edge_guard(self, place: int, context: Context) -> float:
+        """Positive until the foot of a contact passes an edge."""
+        return float(self._margins(context)[len(self.contacts) + self._edges.places.index(place)])
 
-        For each latch positive while it is as it is commanded.
+    def _margins(self, context: Context) -> FloatArray:
+        """For each contact its `grip` if closed; otherwise positive until it penetrates its face.
+
+        For each latch positive while it is as it is commanded; then those of edges, see `Edges`.
         """
         margins: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
         return margins
 
     def _calc_margins(self, context: Context, value: AbstractValue) -> None:
-        mode = context.get_discrete_state_vector().value() > 0.5
-        closed, latched = np.split(mode, [len(self._contacts.names)])
-        margins = np.zeros(closed.size)
-        if not closed.all():
+        closed, latched = np.split(self._numbers(context) > 0.5, [len(self._contacts.names)])
+        margins, further = np.zeros(closed.size), np.zeros(0)
+        if not closed.all() or self._edges:
+            log, time = self._log(context), context.get_time()
             state = context.get_continuous_state_vector().value()
             gaps, rates = self._checked(self._contacts.gaps, context, state)
-            log = self._log(context)
-            margins[:] = clearance(log, context.get_time(), gaps, rates)
+            margins = clearance(log, time, gaps, rates)
+            if self._edges:
+                feet = self._feet(context)
+                margins[np.flatnonzero(feet.beside)] = 1.0
+                away, speeds = self._checked(self._edges.function, context, state)
+                until = edges_passed(log, time, feet.on, away, speeds)
+                further = self._edges.margins(feet, until, gaps)
         if closed.any():
             grip = self._evaluate(self._mode(context).grip, context)
             margins[closed] = grip[self._contacts.normals][closed]
         as_commanded = latched == np.array(self._commanded(context), dtype=bool)
-        value.set_value(np.concatenate([margins, np.where(as_commanded, 1.0, -1.0)]))
+        value.set_value(np.concatenate([margins, np.where(as_commanded, 1.0, -1.0), further]))
 
     def _at_guard(
         self, context: Context, event: UnrestrictedUpdateEvent, state: State
@@ -231,11 +247,11 @@ class UnilateralRobotPlant(ModalPorts):
         if np.isnan(self._control(context)).any():
             # Values held between samples change with this event, at the start of the first step.
             log.waits = True
-            closed = self._resets.resting(x, values, self._commanded(context))
-            state.get_mutable_discrete_state().set_value(numbers_of(closed))
+            closed, feet = self._resets.resting(x, values, self._commanded(context))
+            state.get_mutable_discrete_state().set_value(numbers_of(closed, feet))
             self._begin_step(context, x, values)
             return EventStatus.Succeeded()
-        status = self._reset(context, state)
+        status = self._reset(context, state, starts=True)
         # A closed contact at the start is not an event.
         log.events = [
             event
@@ -257,14 +273,8 @@ class UnilateralRobotPlant(ModalPorts):
                 f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
                 residual,
             )
-        gaps = self._contacts.gaps.evaluate(state, values)[0].copy()
-        deepest = int(np.argmin(gaps)) if gaps.size else 0
-        if gaps.size and gaps[deepest] < -TOUCHING:
-            raise InconsistentStateError(
-                f"{self.dae.name}: the start state is {-gaps[deepest]:.3g} m inside the surface of "
-                f"'{self.contacts[deepest]}'; start outside",
-                gaps,
-            )
+        gaps = self._contacts.gaps.evaluate(state, values)[0]
+        self._edges.check_outside(state, values, gaps)
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         log = self._log(context)
@@ -286,15 +296,18 @@ class UnilateralRobotPlant(ModalPorts):
         """Stores the start of a step."""
         log = self._log(context)
         log.gaps, log.rates = (v.copy() for v in self._contacts.gaps.evaluate(state, values))
+        log.edges, log.edge_rates = self._edges.distances(state, values)
 
-    def _reset(self, context: Context, state: State) -> EventStatus:
-        closed: Closed = closed_of(context.get_discrete_state_vector().value())
+    def _reset(self, context: Context, state: State, starts: bool = False) -> EventStatus:
+        closed = closed_of(self._numbers(context))
+        beside = None if starts else self._feet(context).beside
         time, x, values = context.get_time(), self.state(context), self._values(context)
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
             e = context.get_numeric_parameter(1).value()
             latched = self._commanded(context)
-            after = self._resets(time, x, closed, self._control(context), values, e, latched)
+            control = self._control(context)
+            after = self._resets(time, x, closed, control, values, e, latched, beside)
         except InconsistentStateError as error:
             raise off_manifold(time, x, error) from error
         log, before = self._log(context), (time, x.tobytes())
@@ -302,7 +315,7 @@ class UnilateralRobotPlant(ModalPorts):
             log.before = before
             log.events += after.events
         state.get_mutable_continuous_state().SetFromVector(after.state)
-        state.get_mutable_discrete_state().set_value(numbers_of(after.closed))
+        state.get_mutable_discrete_state().set_value(numbers_of(after.closed, after.feet))
         self._begin_step(context, after.state, values)
         return EventStatus.Succeeded()
 

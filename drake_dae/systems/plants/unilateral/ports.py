@@ -21,7 +21,8 @@ from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, coefficient
-from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of
+from drake_dae.systems.plants.unilateral.edges import Feet
+from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of, feet_of
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -66,7 +67,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         opened = self.modes((False,) * count, dae.nominal_state)
         start = opened.structure.manifold.project(dae.nominal_state)
         self.DeclareContinuousState(BasicVector(start))
-        self.DeclareDiscreteState(count)
+        self.DeclareDiscreteState(count + bound.edges.size)
         self._is_controlled = dae.num_controls > 0
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
         self._latch_port = None
@@ -152,7 +153,7 @@ class ModalPorts(ParameterizedSystem, Plant):
             ModelError: The shape is wrong.
         """
         super().set_state(context, state)
-        context.SetDiscreteState(np.zeros(len(self.contacts)))
+        context.SetDiscreteState(np.zeros(len(self.contacts) + self._contacts.edges.size))
 
     def gaps(self, context: Context) -> FloatArray:
         """phi of each contact, m, shape (k,)."""
@@ -181,7 +182,7 @@ class ModalPorts(ParameterizedSystem, Plant):
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""
         self.check_context(context)
-        shut = closed_of(context.get_discrete_state_vector().value())
+        shut = closed_of(self._numbers(context))
         return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
@@ -222,7 +223,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         mode = self._by_numbers.get(numbers.tobytes())
         if mode is None:
             state = context.get_continuous_state_vector().value()
-            mode = self.modes(closed_of(numbers), state)
+            mode = self.modes(closed_of(self._numbers(context)), state)
             self._by_numbers[numbers.tobytes()] = mode
         self._now = mode
         return mode
@@ -261,11 +262,20 @@ class ModalPorts(ParameterizedSystem, Plant):
         names = [self.contacts[i] for i in places]
         return contacts.painleve_error(error.time, error.state, names, outcome)
 
+    def _numbers(self, context: Context) -> FloatArray:
+        """The numbers of contacts and latches: 1 closed, 0 open, -1 beside a face; (k + l,)."""
+        numbers: FloatArray = context.get_discrete_state_vector().value()
+        return numbers[: len(self.contacts)]
+
+    def _feet(self, context: Context) -> Feet:
+        return feet_of(context.get_discrete_state_vector().value(), len(self.contacts))
+
     def _state(self, context: Context) -> FloatArray:
         return context.get_continuous_state_vector().value()
 
     def _mode_numbers(self, context: Context) -> FloatArray:
-        return context.get_discrete_state_vector().value()
+        # Beside a face a contact is open.
+        return np.maximum(self._numbers(context), 0.0)
 
     def _mode_force(self, context: Context) -> FloatArray:
         return self._evaluate(self._mode(context).force, context)

@@ -12,6 +12,7 @@ from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.contacts import ConstraintTerms, UnilateralContacts
+from drake_dae.systems.plants.unilateral.edges import Beside, Feet
 from drake_dae.systems.plants.unilateral.frictional import impact
 from drake_dae.systems.plants.unilateral.impacts import (
     MOST,
@@ -37,18 +38,21 @@ class ResetResult:
     Attributes:
         state: x, shape (n,).
         closed: The mode.
+        feet: The contacts that are beside their faces, and so open; see `Edges`.
         events: The events.
     """
 
     state: FloatArray
     closed: Closed
+    feet: Feet
     events: tuple[ContactEvent, ...]
 
 
 class Resets:
     """Impacts, and the choice of the mode.
 
-    Touching contacts are those that are closed or whose gap is zero. While one of them approaches,
+    Touching contacts are those that are closed or whose gap is zero, and that are not beside their
+    faces. While one of them approaches,
     there is an impact by Newton's law with each contact's coefficient of restitution e,
 
         c+ = c- + A Lambda,    0 <= Lambda_i,    0 <= c+_i + e_i c-_i,    Lambda_i (...) = 0,
@@ -98,12 +102,14 @@ class Resets:
         parameters: FloatArray,
         restitution: FloatArray,
         latched: Closed = (),
+        beside: Beside | None = None,
     ) -> ResetResult:
         """The reset at a time from a state, in a mode, with the e of each contact.
 
         Args:
             time, state, closed, control, parameters, restitution: As above.
             latched: The latches that are commanded to be closed, one flag for each.
+            beside: The contacts that were beside their faces; None at the start of a run.
 
         Raises:
             SimulationError: No set of contacts fits, impacts do not end, or a latch is too far from
@@ -121,7 +127,10 @@ class Resets:
         for _ in range(REPEATED):
             terms = contacts.terms(x, control, parameters)
             gaps, rates = (value.copy() for value in contacts.gaps.evaluate(x, parameters))
-            touching = [i for i in range(count) if closed[i] or gaps[i] <= TOUCHING]
+            feet = contacts.edges.feet(x, parameters, gaps, beside)
+            touching = [
+                i for i in range(count) if not feet.beside[i] and (closed[i] or gaps[i] <= TOUCHING)
+            ]
             if len(touching) > MOST:
                 names = ", ".join(contacts.names[i] for i in touching)
                 raise SimulationError(
@@ -162,21 +171,30 @@ class Resets:
         closed = (*(i in pushing for i in range(count)), *latched)
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
-        return ResetResult(x, closed, tuple(self._completed(events, closed)))
+        return ResetResult(x, closed, feet, tuple(self._completed(events, closed)))
 
-    def resting(self, state: FloatArray, parameters: FloatArray, latched: Closed) -> Closed:
-        """The contacts that touch at rest, as many as can be closed together, and the latches."""
+    def resting(
+        self, state: FloatArray, parameters: FloatArray, latched: Closed
+    ) -> tuple[Closed, Feet]:
+        """The contacts that touch at rest, as many as can be closed together, and the latches.
+
+        Returns:
+            The mode, and the places of the feet.
+        """
         contacts = self._contacts
         control = np.zeros(contacts.dae.num_controls)
         matrix = contacts.terms(state, control, parameters).impulse_matrix
         gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
         bilateral = contacts.bilateral_in((*(False for _ in contacts.names), *latched))
         closed: list[int] = []
-        for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
+        feet = contacts.edges.feet(state, parameters, gaps)
+        is_beside = np.array(feet.beside, dtype=bool)
+        touching = (gaps <= TOUCHING) & (np.abs(rates) <= SLOW) & ~is_beside
+        for i in np.flatnonzero(touching).tolist():
             trial = [contacts.touches[j] for j in (*closed, i)]
             if rows_of(matrix, bilateral, trial) is not None:
                 closed.append(i)
-        return (*(i in closed for i in range(len(contacts.touches))), *latched)
+        return (*(i in closed for i in range(len(contacts.touches))), *latched), feet
 
     def _impact(
         self,

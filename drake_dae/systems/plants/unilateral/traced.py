@@ -58,7 +58,9 @@ class TracedContacts:
             raise not_traced(f"a plant with {len(every)} modes of its contacts, more than {MOST},")
         dae = self._dae = contacts.dae
         self._contacts, self._modes, self._residual = contacts, modes, residual
-        self._state, self._held = ca.SX.sym("state", dae.num_states), ca.SX.sym("mode", count)
+        self._state = ca.SX.sym("state", dae.num_states)
+        self._held = ca.SX.sym("mode", count + contacts.edges.size)
+        self._numbers, self._on = ca.vertsplit(self._held, [0, count, self._held.numel()])
         self._control = ca.SX.sym("control", dae.num_controls)
         size = dae.parameter_symbol.numel()
         # The coefficients of restitution come last; no motion depends on them.
@@ -143,10 +145,12 @@ class TracedContacts:
         computations.append(Computation(pushed, ("acting_force",), ("constraint_force",)))
         x, mode, inputs = self._state, self._held, (self._state, self._parameters)
         same = ca.Function(
-            "shown", [x, mode], [x, mode, *(x[part] for part in ports.parts.values())]
+            "shown",
+            [x, mode],
+            [x, ca.fmax(self._numbers, 0), *(x[part] for part in ports.parts.values())],
         )
         computations.append(Computation(same, (STATE, HELD), ("state", "mode", *ports.parts)))
-        holds = {row: mode[i] for i, own in enumerate(contacts.rows()) for row in own}
+        holds = {row: ca.fmax(mode[i], 0) for i, own in enumerate(contacts.rows()) for row in own}
         rows = [
             ca.repmat(ca.SX(holds.get(row, 1)), size, 1) for row, size in enumerate(contacts.sizes)
         ]
@@ -167,13 +171,15 @@ class TracedContacts:
         return tuple(computations)
 
     def guard(self) -> Computation:
-        """The margins of the plant: forces or clearances of contacts, and commands of latches."""
+        """The margins of the plant: of contacts and their edges, and commands of latches."""
         grip, contacts = ca.SX.sym("grip", self._dae.num_constraints), self._contacts
         gaps, rates = contacts.gaps.function.call([self._state, self._parameters])[:2]
         clear = ca.if_else(gaps < -TOUCHING, gaps, ca.fmax(gaps, rates + MARGIN))
         is_closed, latched = ca.vertsplit(
-            self._held > 0.5, [0, len(contacts.names), self._held.numel()]
+            self._numbers > 0.5, [0, len(contacts.names), self._numbers.numel()]
         )
+        beside = self._numbers[: len(contacts.names)] < -0.5
+        clear = ca.if_else(beside, 1, clear)
         margins = ca.if_else(is_closed, grip[contacts.normals], clear)
         inputs, sources = (
             [self._state, self._held, grip, self._all],
@@ -183,9 +189,15 @@ class TracedContacts:
             latch = ca.SX.sym("latch", len(contacts.latches))
             inputs, sources = [*inputs, latch], [*sources, "latch"]
             margins = ca.vertcat(margins, ca.if_else((latch > 0.5) == latched, 1, -1))
+        away, speeds = contacts.edges.function.function.call([self._state, self._parameters])[:2]
+        is_on = self._on > 0.5
+        until = ca.if_else(is_on, away, TOUCHING - away)
+        margins = ca.vertcat(margins, contacts.edges.traced_margins(beside, self._on, until, gaps))
         # The gap of a closed contact does not fall, and that of one that has just opened neither.
-        is_still = ca.logic_or(is_closed, ca.fabs(rates) < MARGIN)
-        values = [ca.densify(value) for value in (margins, gaps, ca.if_else(is_still, 0, rates))]
+        is_still = ca.vertcat(ca.logic_or(is_closed, beside), ca.SX.zeros(until.numel()))
+        rates = ca.vertcat(rates, ca.if_else(is_on, speeds, -speeds))
+        falls = ca.if_else(ca.logic_or(is_still, ca.fabs(rates) < MARGIN), 0, rates)
+        values = [ca.densify(value) for value in (margins, ca.vertcat(gaps, until), falls)]
         function = ca.Function("guard", inputs, values)
         return Computation(function, tuple(sources), (MARGINS, GAPS, RATES))
 
@@ -200,13 +212,16 @@ class TracedContacts:
 
         steps = self._chosen(values, [ca.SX.nan(self._dae.num_states, 1)])
         newton = ca.Function("newton", [self._state, start, self._all, self._held], steps)
-        return Projection(
-            newton, self._dae.scale, partial(_project, self._modes, len(self._contacts.names))
-        )
+        return Projection(newton, self._dae.scale, partial(_project, self._modes, self._contacts))
 
 
 def _project(
-    modes: Modes, contacts: int, state: FloatArray, parameters: FloatArray, held: FloatArray
+    modes: Modes,
+    contacts: UnilateralContacts,
+    state: FloatArray,
+    parameters: FloatArray,
+    held: FloatArray,
 ) -> FloatArray:
-    of_system = parameters[: parameters.size - contacts]
-    return modes(closed_of(held), state).structure.manifold.project(state, of_system)
+    of_system = parameters[: parameters.size - len(contacts.names)]
+    closed = closed_of(held[: len(contacts.every)])
+    return modes(closed, state).structure.manifold.project(state, of_system)

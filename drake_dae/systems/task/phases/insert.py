@@ -47,7 +47,7 @@ class Insert(Phase):
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     begins_in_contact, ends_in_contact = False, False
-    feels_ends = True
+    enters_holes = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -90,7 +90,7 @@ class Phase(ABC):
        the largest force, distance and rate of its directions.
     7. With `finds_line` the paths of its contact points are straight, and `followed_lines` fits a
        line to them.
-    8. With `feels_ends` it waits for an edge or a hole of a surface that ends.
+    8. With `enters_holes` the tool is in a hole at its end, and touches the sides of it.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -123,7 +123,7 @@ class Phase(ABC):
     for_contact: ClassVar[bool] = True
     for_latch: ClassVar[bool] = False
     finds_line: ClassVar[bool] = False
-    feels_ends: ClassVar[bool] = False
+    enters_holes: ClassVar[bool] = False
     # Not fields here: only phases that wait, or hold a contact, have them as fields.
     within = inf
     if_late = if_lost = _NOTHING

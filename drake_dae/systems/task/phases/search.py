@@ -65,7 +65,7 @@ class Search(Phase):
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     begins_in_contact, ends_in_contact, holds_contact = True, False, True
-    is_relative, ends_by_loss, feels_ends = True, True, True
+    is_relative, ends_by_loss = True, True
 
     def __post_init__(self) -> None:
         super().__post_init__()
