@@ -8,7 +8,16 @@ from pydrake.math import RollPitchYaw
 from runs import scenario
 from scipy.optimize import brentq
 
-from drake_dae import Plate, build_scenario, followed_lines, load_scenario, rollout, start_values
+from drake_dae import (
+    Plate,
+    build_scenario,
+    followed_lines,
+    grid_variations,
+    load_scenario,
+    rollout,
+    start_values,
+    sweep,
+)
 
 # 20 mm before the wall, at rest.
 WALL = """
@@ -67,6 +76,27 @@ def test_a_point_follows_a_wall_that_is_tilted(tmp_path):
     moved = np.diff(record["controlled_output"][rows, 0])
     assert_allclose(moved, 0.1, atol=1e-3)  # It begins before the press has settled.
     assert "is the line through [1.2" in str(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_rolled", [True, pytest.param(False, marks=pytest.mark.thorough)])
+def test_a_sweep_follows_each_length_as_a_run_does(is_rolled, tmp_path):
+    """In the lanes of one rollout, and by Drake; to what its steps at changes of phase leave."""
+    (tmp_path / "wall.yaml").write_text(WALL)
+    lengths = {"task.phases.2.length": [0.05, 0.02]}
+    chosen = load_scenario(tmp_path / "wall.yaml", ["duration=1.8"])
+    file = tmp_path / "runs.jsonl"
+    study = sweep(chosen, grid_variations(lengths), file, workers=1, rollout=is_rolled)
+    assert study.table()["outcome"] == ["finished", "finished"]
+    settings = ["duration=1.8", "task.phases.2.length=0.02"]
+    (line,), record, changes = lines_of(load_scenario(tmp_path / "wall.yaml", settings))
+    assert line.largest < 1e-8
+    assert "after a length of 0.02 m" in [change.reason for change in changes]
+    errors = record["tracking_error"][:, 0]
+    for name, wanted in (("largest", np.abs(errors).max()), ("final", errors[-1])):
+        found = study.values(f"{name} error of tool.z [m]")
+        assert_allclose(found[1], wanted, rtol=0.0, atol=1e-9)
+    assert found[0] != found[1]
 
 
 @pytest.mark.slow

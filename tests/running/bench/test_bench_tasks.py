@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from browser import in_page, needs_chromium, opened, with_script
+from numpy.testing import assert_allclose
 from runs import scenario
 from test_live import serving
 from test_page import needs_zig
@@ -114,6 +115,39 @@ def test_buttons_end_phases_and_lose_the_contact(is_live, guarded, tmp_path):
     assert found["given"] == 0
     # The wall comes back at 5 cm/s.
     assert found["wall"] == [pytest.approx(1.358, abs=2e-3), pytest.approx(0.01, abs=1e-6)]
+
+
+FOLLOWS = """
+  const found = [];
+  for (let turn = 0; turn < 3; turn++) {
+    await run(1);
+    found.push([now().time, now().phase, ...now().error]);
+  }
+  return found;
+"""
+
+
+@needs_chromium
+@needs_zig
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_page_follows_an_edge_as_a_rollout_does(tmp_path):
+    """On springs, since Drake's own contact is not exported; with the steps of the page."""
+    chosen = scenario("edge_follow", "plant=!CompliantContact {radius: 0.001, friction: 0.2}")
+    built = build_commanded(chosen)
+    (file,) = write_page(built.loop, built.context, tmp_path / "page.html", chosen.integrator)
+    found = in_page(file.read_text(), FOLLOWS, file)
+    run = HandRun(built.loop, built.context, chosen.integrator)
+    names, reached = [phase.name for phase in chosen.task.make().phases], []
+    for time, phase, *errors in found:
+        while run.record().time[-1] < time - 1e-9:
+            run.advance()
+        reached.append(phase)
+        assert phase == names[placed(run)]
+        # A page shows the outputs that the phase controls; the others follow them.
+        wanted = run.record()["tracking_error"][-1, : len(errors)]
+        assert_allclose(errors, wanted, rtol=0.0, atol=1e-9)
+    assert reached[-1] == "Follow"
 
 
 def test_links_are_pushed_in_compliant_contact():
