@@ -62,10 +62,14 @@ def test_pegs_that_are_too_thick_are_counted_as_not_inserted(example, capsys):
     assert "--pegs is their number, 1 or more, got 0" in capsys.readouterr().err
 
 
+IDEAL = "plant=!IdealConstraints {}"
+
+
+@pytest.mark.parametrize("settings", [[], pytest.param([IDEAL], marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
-def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
+def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, settings, example):
     """Beyond the edge by the path in `patience`, 0.05 s at 30 mm/s, and less than 1.5 mm more."""
-    _, found, changes = rolled(example, f"edge_search-{arm}")
+    _, found, changes = rolled(example, f"edge_search-{arm}", *settings)
     assert found.failure is None
     assert changes[-1].phase == "done"
     record, edges = found.record, {0: 0.454 + 0.05, 1: -0.004 + 0.04}
