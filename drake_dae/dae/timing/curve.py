@@ -126,7 +126,7 @@ class Curve:
         shares = np.array([0.0 if is_pause else length**0.5 for *_, length, is_pause in ranges])
         counts = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 20)
         self.pieces = tuple(
-            self._pause(first, last) if is_pause else self._piece(first, last, int(number))
+            self._pause(first, last, count) if is_pause else self._piece(first, last, int(number))
             for (first, last, _, is_pause), number in zip(ranges, counts, strict=True)
         )
 
@@ -190,8 +190,8 @@ class Curve:
             turn = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
         return turn if speed(turn) < 1e3 * self._rest else None
 
-    def _pause(self, first: float, last: float) -> Piece:
-        times = np.linspace(first, last, 21)
+    def _pause(self, first: float, last: float, count: int) -> Piece:
+        times = np.linspace(first, last, count + 1)  # Forces go on, as straight lines between.
         values, none = self.at(times), np.zeros((times.size, self.moving.size))
         return Piece(times, np.zeros(times.size), values, none, none, np.zeros(times.size))
 

@@ -20,7 +20,7 @@ from drake_dae.dae.timing.coarser import coarser
 from drake_dae.dae.timing.curve import Curve, Piece
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.timing.reachable import FastestMotion, LinearLimits, fastest_motion
-from drake_dae.dae.timing.rows import LimitRow, LimitRows, rows_along
+from drake_dae.dae.timing.rows import LimitRow, LimitRows, checked_pause, rows_along
 from drake_dae.dae.timing.smoothing import smoothed
 from drake_dae.dae.timing.time_table import at_rest_outside, stacked, time_table
 from drake_dae.dae.timing.tool_limits import tool_limits
@@ -182,6 +182,7 @@ class PathTiming:
         parts, causes = list[ProfilePiece](), tuple[LimitRow, ...]()
         for piece in _without_last_pause(curve.pieces, along.layout):
             if piece.is_pause:
+                guess = checked_pause(along, piece, guess, numbers)
                 parts.append(_pause(piece))
                 continue
             tools = tool_limits(references, piece, along.layout)

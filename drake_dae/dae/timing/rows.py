@@ -201,6 +201,23 @@ def rows_along(
     )
 
 
+def checked_pause(
+    along: AlongCurve, piece: Piece, guess: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """Checks the limits in a pause, where forces go on, and returns the state at its end.
+
+    Arguments are as for `rows_along`.
+
+    Raises:
+        ReferenceSignalError: The pause is not within the limits.
+    """
+    at_rest, _ = along.states_at_rest(piece, guess, parameters)
+    zero = np.zeros(piece.times.size)
+    rows = along.reference(piece, zero, zero)
+    _check_rest(along, piece, at_rest, along.values(at_rest, rows, parameters))
+    return np.asarray(at_rest[-1])
+
+
 def _check_friction(rows: LimitRows, above: FloatArray, below: FloatArray) -> None:
     """Checks that friction in slow motion is within the limits.
 

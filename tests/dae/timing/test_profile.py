@@ -224,6 +224,26 @@ def test_pauses_last_as_in_the_reference_and_the_last_one_is_left_out():
     assert move.piece.times[-1] == pytest.approx(0.7 + line.travel.duration, abs=1e-2)
 
 
+def test_a_force_in_a_pause_is_within_its_limits_and_that_of_the_reference():
+    line = LineReference(0.3, 0.5, PathLimits(10.0, 100.0), start_time=2.0)
+    wave = SinusoidReference(20.0, 5.0, 3.0)
+    timing = PathTiming(
+        arm("two_link").structure, two_link_limits(forces={"wall.force": (14.0, None)})
+    )
+    profile = timing.profile((line, wave), 5.0, points=200)
+    # While nothing moves time passes as in the reference.
+    times = np.linspace(0.0, 1.9, 500)
+    rows = TimeOptimalReference(profile).pieces((2, 0)).at_all(times)
+    # 5e-4 of the largest force.
+    np.testing.assert_allclose(rows[:, 3], 20.0 + 5.0 * np.sin(3.0 * times), atol=1.3e-2)
+    above = PathTiming(
+        arm("two_link").structure, two_link_limits(forces={"wall.force": (16.0, None)})
+    )
+    # In the pause: 3 t = 3 pi / 2.
+    with pytest.raises(ReferenceSignalError, match=r"t = 1\.57 s .* wall\.force is 15 N, and"):
+        above.profile((line, wave), 5.0, points=200)
+
+
 def test_a_path_with_limits_of_its_own_keeps_them_and_has_no_other_end():
     limits = PathLimits(0.25, 1.0, 3.0)
     line = LineReference(0.3, 0.5, limits, order=4)
