@@ -1,4 +1,4 @@
-"""The tasks of `examples/arms` on a UR5, a Panda and two UR5s, by rollouts."""
+"""The tasks of `examples/arms` on a UR5, a Panda and pairs of them, by rollouts."""
 
 import numpy as np
 import pytest
@@ -132,30 +132,43 @@ def test_each_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(
     assert np.sqrt(np.mean(force**2)) < 0.05
 
 
+@pytest.mark.parametrize("settings", [(), ("plant=!IdealConstraints {}",)], ids=["drake", "ideal"])
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
-def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, example):
-    """The center of pressure is 6 mm off the middle: within 0.5 mm of its path, 0.3 at its end."""
-    _, found, changes = rolled(example, f"flat_press-{arm}")
+def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, settings, example):
+    """The center of pressure is 6 mm off the middle: within 0.5 mm of its path, 0.3 at its end.
+
+    While the face slides to and fro it is up to 5 mm off, where 15 mm are the edge.
+    """
+    _, found, changes = rolled(example, f"flat_press-{arm}", *settings)
     assert found.failure is None
     assert changes[-1].phase == "done"
     record = found.record
     names = [signal.name for signal in record.signals["tracking_error"].signals]
-    moves = changes[4].time + 1.5, changes[5].time
-    rows = (record.time > moves[0]) & (record.time < moves[1])
     force, *moments = (names.index(f"face.{name}") for name in ("force", "mx", "my"))
-    errors = record["tracking_error"][rows]
-    assert np.abs(errors[:, force]).max() < 0.05
+    errors = record["tracking_error"]
     off = np.linalg.norm(errors[:, moments], axis=1) / 30.0
-    assert off.max() < 5e-4
-    assert off[-1] < 3e-4
+
+    def during(begin, end):
+        return (record.time > begin) & (record.time < end)
+
+    rows = during(changes[4].time + 1.5, changes[5].time)
+    assert np.abs(errors[rows, force]).max() < 0.05
+    assert off[rows].max() < 5e-4
+    assert off[rows][-1] < 3e-4
+    assert changes[5].phase == "Move 3"
+    slides = during(changes[5].time, changes[6].time)
+    forces = record["constraint_force"][slides]
+    assert 1e-4 < off[slides].max() < 5e-3
+    assert (1.0 - 3.0 * forces.min(1) / forces.sum(1)).max() < 0.6
 
 
-def test_a_box_of_4_kg_goes_from_one_ur5_to_the_other(example):
+@pytest.mark.parametrize(("pair", "mass"), [("two_ur5", 4.0), ("two_panda", 2.0)])
+def test_a_box_goes_from_one_arm_of_a_pair_to_the_other(pair, mass, example):
     """Then the right hand carries it alone, and the left one is 10 cm away."""
-    loop, found, changes = rolled(example, "hand_over-two_ur5")
+    loop, found, changes = rolled(example, f"hand_over-{pair}")
     assert found.failure is None
     assert [c.phase for c in changes] == ["bring", "grasp", "squeeze", "pass", "retreat", "done"]
     record, names = found.record, [s.name for s in loop.plant.dae.force_signals]
     forces = dict(zip(names, record["constraint_force"][-1], strict=True))
-    assert_allclose(forces["right.fz"], -4.0 * 9.81, rtol=1e-6)
+    assert_allclose(forces["right.fz"], -mass * 9.81, rtol=1e-6)
     assert_allclose([forces[f"left.{name}"] for name in ("fx", "fy", "fz")], 0.0, atol=1e-9)

@@ -2,7 +2,18 @@
 
 import pytest
 
-from drake_dae import Dwell, GuardedMove, Insert, Move, Press, Release, Search, Wait, load_scenario
+from drake_dae import (
+    Dwell,
+    Follow,
+    GuardedMove,
+    Insert,
+    Move,
+    Press,
+    Release,
+    Search,
+    Wait,
+    load_scenario,
+)
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
@@ -37,19 +48,26 @@ PHASES = {
     Dwell: "!Dwell {{duration: 1.5, {ends}}}",
     Wait: "!Wait {{for_signal: ready, within: 2, {ends}}}",
     Press: "!Press {{force: 12, over: 1.5, {ends}}}",
+    Follow: "!Follow {{along: tool.z, length: 0.04, speed: 0.03, {ends}}}",
 }
 AWAY = "[{frame: tool, force: [-50, 0, 0], start_time: 2.0, end_time: 2.15}]"
+ALONG = "[{frame: tool, force: [0, 0, 150], start_time: 2.0, end_time: 2.4}]"
+JUMP = "!PointToPoint {{start: [10], end: [-30], start_time: 0.2, end_time: 0.21}}"
+MOVE = "!Move {{references: {{tool.z: 0.4, wall.force: 10}}, duration: 1.5, {ends}}}"
+BACK = "!Move {{references: {{tool.z: 0.3, wall.force: -30}}, over: 0.01, duration: 1.5, {ends}}}"
+# Half of the length of the wall, pushes, and phases: as above, or led to the loss by themselves.
 CAUSES = {
-    "a push": (0.2, AWAY, None),
+    "a push": (0.2, AWAY, PHASES),
+    "a push over the edge": (0.02, ALONG, PHASES),
     "a wall that ends": (
         0.02,
         "[]",
-        "!Move {{references: {{tool.z: 0.4, wall.force: 10}}, duration: 1.5, {ends}}}",
+        {Move: MOVE, Follow: PHASES[Follow].replace("0.04", "0.1")},
     ),
     "a reference that jumps": (
         0.2,
         "[]",
-        "!Move {{references: {{tool.z: 0.3, wall.force: -30}}, over: 0.01, duration: 1.5, {ends}}}",
+        {Move: BACK, Press: f"!Press {{{{force: {JUMP}, over: 0.5, {{ends}}}}}}"},
     ),
 }
 ENDINGS = ("stop", "hold", "approach", "fail", "away")
@@ -57,9 +75,9 @@ ENDINGS = ("stop", "hold", "approach", "fail", "away")
 
 def ended(path, cause, phase, reaction):
     """The phase changes of a task whose contact is lost, and the error of its run."""
-    half, pushes, own = CAUSES[cause]
+    half, pushes, phases = CAUSES[cause]
     ends = f"if_lost: {reaction}, on_failure: {reaction}"
-    text = (own or PHASES[phase]).format(ends=ends)
+    text = phases[phase].format(ends=ends)
     signals = "{ready: 0}" if "ready" in text else "{}"
     filled = TEXT.format(half=half, pushes=pushes, phase=text, ends=ends, signals=signals)
     path.write_text(filled.replace("- !Retreat {", "- !Retreat {name: away, retries: 1, "))
@@ -71,12 +89,14 @@ def ended(path, cause, phase, reaction):
 
 CASES = [
     ("a push", Press, "fail"),
-    *((cause, Move, "stop") for cause in CAUSES if cause != "a push"),
+    ("a push over the edge", Wait, "hold"),
+    ("a wall that ends", Follow, "away"),
+    ("a reference that jumps", Move, "stop"),
 ]
 MORE = [
     (cause, phase, reaction)
-    for cause in CAUSES
-    for phase in (PHASES if cause == "a push" else (Move,))
+    for cause, (*_, phases) in CAUSES.items()
+    for phase in phases
     for reaction in ENDINGS
     if (cause, phase, reaction) not in CASES
 ]
@@ -88,7 +108,9 @@ MORE = [
     [*CASES, *(pytest.param(*case, marks=pytest.mark.thorough) for case in MORE)],
 )
 def test_a_lost_contact_ends_as_it_was_chosen(cause, phase, reaction, tmp_path):
-    """By a push of 50 N, an edge of the part, and a force that is wanted away from the wall."""
+    """By a push away, or along the wall over its edge; an edge on the way; a force that is wanted
+    away from the wall.
+    """
     changes, failure = ended(tmp_path / "task.yaml", cause, phase, reaction)
     words = {"stop": "held", "hold": "held", "approach": "Approach", "away": "away"}
     if reaction == "fail":
