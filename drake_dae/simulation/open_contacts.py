@@ -5,6 +5,9 @@ import numpy as np
 from drake_dae.simulation.records.events import impacts
 from drake_dae.simulation.records.record import Record
 
+_BELOW = 1e-6
+"""Below minus this gap, in m, an open contact is beside its face."""
+
 
 def contact_notes(record: Record) -> list[tuple[str, str]]:
     """The impacts and open times of contacts as (label, text); empty if no contact can open."""
@@ -33,13 +36,12 @@ def contact_notes(record: Record) -> list[tuple[str, str]]:
             notes.append((name, "always closed"))
             continue
         first = record.time[int(np.argmax(is_open)) - 1]
-        notes.append(
-            (
-                name,
-                f"open for {taken[is_open].sum():.4g} s, first from {first:.4g} s on, up to "
-                f"{np.max(away):.3g} {signal.unit} away",
-            )
-        )
+        text = f"open for {taken[is_open].sum():.4g} s, first from {first:.4g} s on"
+        if (most := np.max(away)) > 0.0:
+            text += f", up to {most:.3g} {signal.unit} away"
+        if (least := np.min(away)) < -_BELOW:
+            text += f", beside its face up to {-least:.3g} {signal.unit} below it"
+        notes.append((name, text))
     return notes
 
 

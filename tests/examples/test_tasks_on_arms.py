@@ -62,10 +62,14 @@ def test_pegs_that_are_too_thick_are_counted_as_not_inserted(example, capsys):
     assert "--pegs is their number, 1 or more, got 0" in capsys.readouterr().err
 
 
+IDEAL = "plant=!IdealConstraints {}"
+
+
+@pytest.mark.parametrize("settings", [[], pytest.param([IDEAL], marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
-def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, example):
+def test_each_arm_finds_two_edges_of_a_plate_that_is_4_mm_off(arm, settings, example):
     """Beyond the edge by the path in `patience`, 0.05 s at 30 mm/s, and less than 1.5 mm more."""
-    _, found, changes = rolled(example, f"edge_search-{arm}")
+    _, found, changes = rolled(example, f"edge_search-{arm}", *settings)
     assert found.failure is None
     assert changes[-1].phase == "done"
     record, edges = found.record, {0: 0.454 + 0.05, 1: -0.004 + 0.04}
@@ -90,11 +94,25 @@ def test_each_arm_finds_the_line_of_an_edge_that_is_6_mm_off(arm, example):
     assert np.linalg.norm(np.cross(line.direction, edge)) < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("plant", "most"),
+    [
+        (["plant=!CompliantContact {friction: 0.3, radius: 0.01}"], 1e-4),
+        (["plant=!IdealConstraints {}", "plant_parameters.part.friction=0.3"], 2e-5),
+    ],
+    ids=["springs", "ideal"],
+)
 @pytest.mark.parametrize("arm", ["ur5", "panda"])
-def test_each_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(arm, example):
-    """On springs, since a rollout has no hydroelastic contact; within 0.1 mm under the tool."""
-    ball = "plant=!CompliantContact {friction: 0.3, radius: 0.01}"
-    loop, found, changes = rolled(example, f"polish_unknown_part-{arm}", ball)
+def test_each_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(
+    arm, plant, most, example
+):
+    """On springs, since a rollout has no hydroelastic contact, and in ideal contact.
+
+    Within 0.1 mm under the tool at each time, and 0.1 mm rms along the whole way: 0.06 mm with the
+    Panda, whose tool is 4 degrees beside the normal in its nominal posture, so that a ball of 10 mm
+    is 0.03 mm off the surface. A rigid point has no such ball: twice the 0.01 mm of the Panda.
+    """
+    loop, found, changes = rolled(example, f"polish_unknown_part-{arm}", *plant)
     assert found.failure is None
     assert changes[-1].phase == "done"
     record, times = found.record, {change.phase: change.time for change in changes}
@@ -106,6 +124,8 @@ def test_each_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(arm, 
     errors = [found_off(chosen, loop, record, np.array([row]), row)[0] for row in rows]
     assert np.abs(found_off(chosen, loop, record, rows, 0)).max() > 5e-3
     assert np.abs(errors).max() < 1e-4
+    way = [found_off(chosen, loop, record, rows, row) for row in rows]
+    assert np.sqrt(np.mean(np.square(way))) < most
     names = [signal.name for signal in record.signals["tracking_error"].signals]
     late = record.time[polish] > times["polish"] + 1.0  # After the transition.
     force = record["tracking_error"][polish][late, names.index("part.force")]

@@ -291,6 +291,12 @@ def test_a_contact_that_is_open_before_the_run_begins_is_reported_by_its_first_s
         ("contacts", "no impacts"),
         ("wall", "open for 0.4 s, first from 0 s on, up to 0.2 m away"),
     ]
+    beside = record(
+        mode=([[1.0], [0.0], [0.0]], [("wall.mode", "")]),
+        gap=([[0.0], [-0.1], [-0.2]], [("wall.gap", "m")]),
+    )
+    words = "first from 0 s on, beside its face up to 0.2 m below it"
+    assert words in contact_notes(beside)[1][1]
     closed = record(
         mode=([[0.0], [1.0], [1.0]], [("wall.mode", "")]),
         gap=([[0.0], [0.0], [0.0]], [("wall.gap", "m")]),

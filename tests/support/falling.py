@@ -47,7 +47,7 @@ def ball(restitution, mass=1.0):
     return UnilateralRobotPlant(ball_model(mass), {"floor": restitution})
 
 
-def mass_point(plates, restitution=0.0, rpy=None):
+def mass_point(plates, restitution=0.0, rpy=None, exogenous=()):
     """A mass point of 2 kg in space over plates, each of which it touches from the face alone."""
     q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
     links = LinkExpressions(
@@ -59,7 +59,7 @@ def mass_point(plates, restitution=0.0, rpy=None):
         actuation_matrix=np.zeros((3, 0)),
     )
     faces = [PointOnSurface("point", plate, name=name, rpy=rpy) for name, plate in plates.items()]
-    model = RobotModel(links, faces, [], forces=[])
+    model = RobotModel(links, faces, [], forces=[], exogenous=exogenous)
     return UnilateralRobotPlant(model, dict.fromkeys(plates, restitution))
 
 

@@ -39,14 +39,17 @@ class IdentifiedTerms:
     Attributes:
         parameters: The parameters, in the order of theta.
         slopes: (x, u, v, parameters) -> the derivatives with respect to theta of p, of its rate
-            without inputs, and of the part from the inputs, shape (k, c) each; and the distances
-            phi that depend on theta, shape (j,), with their derivatives, shape (j, c).
+            without inputs, and of the part from the inputs, shape (k, c) each; the distances phi
+            that depend on theta, shape (j,), with their derivatives, shape (j, c), and with their
+            second derivatives, one below the other, shape (j c, c).
         pressed: The constraint input of each of these distances.
+        places: The indices in theta of what these distances depend on, as the place of a surface.
     """
 
     parameters: tuple[Parameter, ...]
     slopes: TracedFunction
     pressed: tuple[int, ...]
+    places: tuple[int, ...]
 
     @classmethod
     def of(
@@ -76,10 +79,13 @@ class IdentifiedTerms:
             )
         gaps = system.k[list(pressed), :]
         outputs = {name: ca.jacobian(value, theta) for name, value in momentum.items()}
-        outputs |= {"gaps": gaps, "gap slopes": ca.jacobian(gaps, theta)}
+        bends = [ca.hessian(gap, theta)[0] for gap in ca.vertsplit(gaps)] if pressed else []
+        bend = ca.vertcat(ca.SX(0, theta.numel()), *bends)
+        outputs |= {"gaps": gaps, "gap slopes": ca.jacobian(gaps, theta), "gap bends": bend}
         dense = {name: ca.densify(value) for name, value in outputs.items()}
         slopes = system.trace("slopes of parameters", dense, inputs, often=False)
-        return cls(parameters, slopes, pressed)
+        places = tuple(i for i in range(theta.numel()) if ca.depends_on(gaps, theta[i]))
+        return cls(parameters, slopes, pressed, places)
 
     @property
     def signals(self) -> tuple[Signal, ...]:

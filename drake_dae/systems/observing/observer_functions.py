@@ -258,7 +258,6 @@ class ObserverFunctions(Observed):
         inertia = ca.diag(ca.substitute(mass, self._system.parameter_symbol, parameters))
         sliding = ca.mtimes(contact.friction, ca.diag(contact.slides))
         is_closed = forces >= self._observing.least_force
-        momentum, drift, inputs, gaps, gap_slopes = slopes[:5]
-        return Sampled(
-            momentum, drift, inputs, sliding, gaps, gap_slopes, forces, is_closed, inertia, hold
-        )
+        momentum, drift, inputs, gaps, gap_slopes, gap_bends = slopes[:6]
+        known = momentum, drift, inputs, sliding, gaps, gap_slopes, gap_bends
+        return Sampled(*known, forces, is_closed, inertia, hold)

@@ -123,7 +123,10 @@ def observed_arm():
 
 
 def test_slopes_are_those_of_momentum_and_distance():
-    """Central differences of steps of 1e-5, whose error is about 1e-9 of values of up to 10."""
+    """Central differences of steps of 1e-5, whose error is about 1e-9 of values of up to 10.
+
+    The second derivatives of the distance are differences of its first ones.
+    """
     system, observation, names = observed_arm()
     random = np.random.default_rng(1)
     x = system.nominal_state + 0.3 * random.standard_normal(system.num_states)
@@ -135,17 +138,21 @@ def test_slopes_are_those_of_momentum_and_distance():
     assert sorted(found) == sorted(names)
     places = [i for name in found for i in np.arange(values.size)[system.parameter_slice(name)]]
     k = ca.Function("k", [system.state, system.parameter_symbol], [system.k])
+    bends = np.reshape(slopes[5], (len(places), len(places)), order="F")
+    assert np.abs(bends).max() > 0.1
     for column, place in enumerate(places):
-        ends = []
+        ends, gap_slopes = [], []
         for step in (1e-5, -1e-5):
             shifted = values.copy()
             shifted[place] += step
             momentum = observation.momentum(x, u, v, shifted)[:3]
             ends.append([*momentum, k(ca.DM(x), ca.DM(shifted)).full().ravel()])
+            gap_slopes.append(observation.identified.slopes(x, u, v, shifted)[4].copy())
         parts = [slopes[0], slopes[1], slopes[2], slopes[4]]
         for slope, high, low in zip(parts, *ends, strict=True):
             derived = np.reshape(slope, (len(high), -1), order="F")[:, column]
             assert_allclose(derived, (high - low) / 2e-5, atol=1e-7)
+        assert_allclose(bends[:, column], np.ravel(gap_slopes[0] - gap_slopes[1]) / 2e-5, atol=1e-7)
 
 
 def test_the_place_of_a_payload_is_that_of_a_body_in_a_multibody_plant():
