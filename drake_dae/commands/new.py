@@ -14,7 +14,6 @@ from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.new.new_scenario import new_scenario
-from drake_dae.scenario.feasibility.noise import noise_outlook
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.summary import WIDTH
 
@@ -26,6 +25,9 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _analyze(options: argparse.Namespace) -> int:
     """Prints the report on the scenario that the options name."""
+    # Rollouts load SciPy's integrators, which `new` does not need.
+    from drake_dae.studies.bounding.noise import noise_outlook
+
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     report = find_feasibility(scenario)

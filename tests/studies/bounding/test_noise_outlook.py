@@ -7,8 +7,8 @@ import pytest
 
 from drake_dae import load_scenario
 from drake_dae.cli import main
-from drake_dae.scenario.feasibility.noise import noise_outlook
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.studies.bounding.noise import noise_outlook
 
 ON_CONTACT = (
     "plant=!CompliantContact {stiffness: 1.0e5, radius: 1.0e-5}",
