@@ -297,7 +297,7 @@ def _path(
     if kind == "line":
         text = f"!Line {{start: {point()}, end: {point()}, {limits}}}"
     elif kind == "move":
-        times = f"start_time: {start}, end_time: {until}, order: 2"
+        times = f"start_time: {start}, end_time: {until}, order: 4"
         text = f"!PointToPoint {{start: {point()}, end: {point()}, {times}}}"
     elif kind == "polyline":
         points = [point() for _ in range(draw.randrange(2, 5))]
