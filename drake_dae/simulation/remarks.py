@@ -22,6 +22,9 @@ _AT_ONCE, _AWAY = 0.1, 1e-3
 """A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
 none: a tool does not come that far."""
 
+EXCEEDED = 1e-3
+"""An excess over the limit of an acceleration that is told, as a share of it."""
+
 
 def surface_remarks(model: RobotModel, record: Record) -> list[str]:
     """Remarks on approximations of surfaces, and on leaving their defined range.
@@ -127,11 +130,34 @@ def departure_remarks(record: Record, feasible: FeasibleControl | None) -> list[
         if size > 0.0
     )
     states, commanded = record["state"][is_off], record["control"] + record["excess"]
-    causes = ", ".join(feasible.causes(states, commanded[is_off]))
+    beyond = feasible.beyond(states, commanded[is_off])
+    causes = ", ".join(name for name, over in beyond.items() if over.max() > 0.0)
     return [
         f"Between {times[0]:.4g} and {times[-1]:.4g} s, for {share:.2g} s in all, no motion along "
         f"the path was within the limits{f' ({causes})' if causes else ''}: the highest "
         f"derivatives of the errors left their prediction, of {amounts}."
+    ]
+
+
+def rate_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
+    """A remark on accelerations beyond their limits, which no motion along the path avoids.
+
+    Args:
+        record: A record with state and control.
+        feasible: The block that keeps other limits; None where there is none.
+    """
+    if feasible is None:
+        return []
+    beyond = feasible.beyond(record["state"], record["control"])
+    over = {name: share for name, share in beyond.items() if name.endswith("'")}
+    over = {name: share for name, share in over.items() if share.max(initial=0.0) > EXCEEDED}
+    if not over:
+        return []
+    times = record.time[np.max([*over.values()], axis=0) > EXCEEDED]
+    texts = ", ".join(f"{name} by {share.max():.2g} of it" for name, share in over.items())
+    return [
+        f"Between {times[0]:.4g} and {times[-1]:.4g} s no motion along the path was within the "
+        f"limits of accelerations, and these were exceeded: {texts}."
     ]
 
 

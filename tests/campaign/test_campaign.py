@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from campaign import bad_files, bad_inputs, drops, random_robots, random_tasks
+from campaign import bad_files, bad_inputs, drops, random_limits, random_robots, random_tasks
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
 
@@ -63,6 +63,17 @@ def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path:
 def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: int, tmp_path: Path):
     found = random_tasks.outcome(*random_tasks.random_task(random.Random(seed)), tmp_path)
     assert not found.startswith(random_tasks.BAD), found
+
+
+# 0 and 3 keep their limits, 2 is refused, and in 4 the plant is heavier than the law's model.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seed", [0, 2, 3, 4, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))]
+)
+def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int, tmp_path: Path):
+    run = random_limits.random_run(random.Random(seed), tmp_path, random_limits.CHEAP)
+    found = random_limits.outcome(run)
+    assert not found.startswith(random_limits.BAD), found
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """What a run says of what is approximate in it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arms import arm, consistent_states, numbers
@@ -8,7 +10,7 @@ from drake_dae import Record, robot_motion_limits
 from drake_dae.cli import main
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.simulation.remarks import departure_remarks, limit_remarks
+from drake_dae.simulation.remarks import departure_remarks, limit_remarks, rate_remarks
 from drake_dae.simulation.summary import Limits
 from drake_dae.systems.governing.feasible_control import FeasibleControl
 
@@ -59,6 +61,21 @@ def test_a_run_says_when_limits_made_errors_leave_their_prediction():
     assert "largest joint2_motor" not in text
     size = np.abs(columns[2][:, 0]).max()
     assert f"left their prediction, of tool.z by up to {size:.2g} m/s^2" in text
+    # The other torques accelerate it.
+    assert rate_remarks(Record(times, recorded), feasible) == []
+    rates = dict.fromkeys(("joint1_w", "joint2_w"), (-5.0, 5.0))
+    agile = FeasibleControl(found.structure, replace(robot_motion_limits(found.model), rates=rates))
+    (text,) = rate_remarks(Record(times, recorded), agile)
+    assert text.startswith(
+        "Between 1 and 3 s no motion along the path was within the limits of acc"
+    )
+    # M v' = u + J^T f - bias,   J v' = 0.
+    matrix = np.block(
+        [[there.mass, -there.constraint_jacobian.T], [there.constraint_jacobian, np.zeros((1, 1))]]
+    )
+    right = np.append(columns[0][3] - there.bias, 0.0)
+    share = np.abs(np.linalg.solve(matrix, right)[:2]).max() / 5.0 - 1.0
+    assert f" by {share:.2g} of it" in text
     recorded["departure"] = Recorded(0.0 * columns[2], feasible.departure_signals)
     assert departure_remarks(Record(times, recorded), feasible) == []
     assert departure_remarks(Record(times, {}), None) == []

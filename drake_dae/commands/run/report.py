@@ -19,6 +19,7 @@ from drake_dae.simulation.remarks import (
     ball_remarks,
     departure_remarks,
     limit_remarks,
+    rate_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -102,6 +103,7 @@ def report_run(
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
     lines += departure_remarks(record, loop.feasible)
+    lines += rate_remarks(record, loop.feasible)
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
     lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]

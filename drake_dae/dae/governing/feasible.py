@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.governing.quadratic import nearest_within
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.timing.limited_signals import LimitedSignals
+from drake_dae.dae.timing.limited_signals import APPROACH, LimitedSignals
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -17,7 +17,7 @@ SOFTNESS = 1e-8
 """How far forces give way where drives cannot hold them, for a multiplier of one."""
 
 SOFTER = 1e-6
-"""The same for speeds and accelerations of joints, which give way before forces."""
+"""The same for speeds of joints, which give way before forces."""
 
 WITHIN = 1e-9
 """An excess over a limit, as a share of it, that is round-off."""
@@ -31,16 +31,16 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
         min |W (ubar - ubar_d)|^2 = |W B (u - u_d)|^2   with   |u_j| <= U_j,
         least <= v = alpha + beta u <= largest,
 
-    and with the limits of states x and their rates x', where W divides each output by the length of
-    its row of B diag(U). Limits of u hold always; those of v and of cones as far as they allow it;
-    those of states and rates, the speeds and accelerations of joints, as far as these allow it. A
-    speed stays within its limits by v' <= APPROACH (V - v). u is u_d where that is within all
-    limits.
+    and with the limits of states, the speeds of joints, where W divides each output by the length
+    of its row of B diag(U). Limits of u hold always; those of v and of cones as far as they allow
+    it; those of speeds as far as these allow it, by w' <= APPROACH (W - w). Limits of rates, the
+    accelerations of joints, are not kept: a robot that may not brake leaves its path, and with
+    an error of its model it does not return. u is u_d where that is within all limits.
     ubar - ubar_d is by how much the derivative e^(mu) of the error leaves (30).
 
     Args:
         structure: The structure of the system, with as many controls as outputs.
-        limits: Symmetric limits of all controls, and others.
+        limits: Symmetric limits of all controls, and others; those of rates are not used.
 
     Returns:
         (state, control, parameters) -> control, excess, departure, is_limited: excess is u_d - u,
@@ -95,27 +95,15 @@ def _soft(
 ) -> tuple[ca.SX, ca.DM, ca.SX, FloatArray]:
     """Returns A, S, b and the softness of S A x <= b for u = U x, with rows of A of length one.
 
-    Of the limits of a rate and those by which its state stays within its own, see
-    `LimitedSignals.approach`, the nearer one counts. b is cut off where no x is near it.
+    States stay within their limits with the rates of `LimitedSignals.approach`. b is cut off where
+    no x is near it.
     """
-    limited = LimitedSignals(structure, replace(limits, controls={}))
-    free, by = (ca.vertsplit(part) for part in limited.by_control())
-    low, high = ca.vertsplit(ca.SX(limited.low)), ca.vertsplit(ca.SX(limited.high))
-    place = {signal.name: i for i, signal in enumerate(limited.signals)}
-    of_rates, by_rates = (ca.vertsplit(part) for part in limited.rates_of_states())
-    slowest, fastest = (ca.vertsplit(part) for part in limited.approach())
-    rates = {signal.derivative(1).name for signal in structure.system.state_signals}
-    softness = [SOFTER if signal.name in rates else SOFTNESS for signal in limited.signals]
-    for i, signal in enumerate(limited.state_signals):
-        row = place.get(signal.derivative(1).name)
-        if row is not None:
-            low[row], high[row] = ca.fmax(low[row], slowest[i]), ca.fmin(high[row], fastest[i])
-            continue
-        free.append(of_rates[i])
-        by.append(by_rates[i])
-        low.append(slowest[i])
-        high.append(fastest[i])
-        softness.append(SOFTER)
+    limited = LimitedSignals(structure, replace(limits, controls={}, rates={}))
+    parts = zip(limited.by_control(), limited.rates_of_states(), strict=True)
+    free, by = (ca.vertsplit(ca.vertcat(*part)) for part in parts)
+    pairs = zip((limited.low, limited.high), limited.approach(), strict=True)
+    low, high = (ca.vertsplit(ca.vertcat(ca.SX(bound), rate)) for bound, rate in pairs)
+    softness = [SOFTNESS] * len(limited.signals) + [SOFTER] * len(limited.states)
     columns = structure.system.num_controls
     rows, bounds, soft, sides = [], [], [], []
     nearest = -(columns**0.5) - 1.0
@@ -151,8 +139,8 @@ def limits_reached(
         limits: The limits.
 
     Returns:
-        (state, control, parameters) -> excess over each limit, positive beyond it, shape (k,); and
-        the name of each, such as "largest joint1_motor".
+        (state, control, parameters) -> excess over each limit as a share of it, positive beyond it,
+        shape (k,); and the name of each, such as "largest joint1_motor". A limit of 0 counts as 1.
     """
     system, limited = structure.system, LimitedSignals(structure, limits)
     control = ca.SX.sym("control", system.num_controls)
@@ -161,11 +149,15 @@ def limits_reached(
     values = ca.vertcat(free + ca.mtimes(by, control), of_states + ca.mtimes(by_states, control))
     slowest, fastest = limited.approach()
     low, high = ca.vertcat(ca.SX(limited.low), slowest), ca.vertcat(ca.SX(limited.high), fastest)
+    sizes = [
+        *np.minimum(np.abs(limited.low), np.abs(limited.high)),
+        *(APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))),
+    ]
     over, names = [], list[str]()
     for i, signal in enumerate([*limited.signals, *limited.state_signals]):
         for bound, sign, side in ((high[i], 1.0, "largest"), (low[i], -1.0, "least")):
             if _is_finite(bound):
-                over.append(sign * (values[i] - bound))
+                over.append(sign * (values[i] - bound) / (sizes[i] or 1.0))
                 names.append(f"{side} {signal.name}")
     inputs = {"state": system.state, "control": control, "parameters": system.parameter_symbol}
     outputs = {"over": ca.vertcat(ca.SX(0, 1), *over)}

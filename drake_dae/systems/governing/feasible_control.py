@@ -81,18 +81,20 @@ class FeasibleControl(LeafSystem):
     def _reached(self) -> tuple[TracedFunction, tuple[str, ...]]:
         return limits_reached(self._structure, self._limits)
 
-    def causes(self, states: FloatArray, commanded: FloatArray) -> list[str]:
-        """The limits that commanded controls exceed, such as "largest joint1_motor".
+    def beyond(self, states: FloatArray, controls: FloatArray) -> dict[str, FloatArray]:
+        """Name of a limit, such as "largest joint1_motor" -> by what share of it it is exceeded.
 
         Args:
             states: States, shape (k, n).
-            commanded: Commanded controls, shape (k, p), of which some exceed a limit.
+            controls: Controls, shape (k, p).
+
+        Returns:
+            For each limit an array of shape (k,), negative within the limit.
         """
         function, names = self._reached
         parameters = self.dae.parameter_values
-        over = [function(x, u, parameters)[0] for x, u in zip(states, commanded, strict=True)]
-        is_over = np.max(over, axis=0, initial=-np.inf) > 0.0
-        return [name for name, yes in zip(names, is_over, strict=True) if yes]
+        over = [function(x, u, parameters)[0] for x, u in zip(states, controls, strict=True)]
+        return dict(zip(names, np.reshape(over, (-1, len(names))).T, strict=True))
 
     def _values(self, context: Context) -> tuple[FloatArray, ...]:
         state, control = self._state.Eval(context), self._commanded.Eval(context)

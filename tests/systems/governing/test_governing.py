@@ -186,7 +186,7 @@ def test_limits_hold_in_the_stated_order(name):
 
 
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
-def test_speeds_and_accelerations_hold_where_drives_and_forces_allow_it(name):
+def test_speeds_hold_where_drives_and_forces_allow_it(name):
     """By MultibodyPlant, and by a linear program that tells whether any control is allowed."""
     found, random = arm(name), np.random.default_rng(2)
     plant, dae = found.plant, found.model.dae
@@ -210,8 +210,8 @@ def test_speeds_and_accelerations_hold_where_drives_and_forces_allow_it(name):
         free = np.linalg.solve(matrix, right)
         by = np.linalg.solve(matrix, np.vstack([driven, np.zeros((1, most.size))]))
         # v' <= 100 (V - v), at most 100 1/s times the room.
-        high = np.append(np.minimum(6.0, 100.0 * (1.0 - speed)), 60.0)
-        low = np.append(np.maximum(-6.0, 100.0 * (-1.0 - speed)), 5.0)
+        high = np.append(100.0 * (1.0 - speed), 60.0)
+        low = np.append(100.0 * (-1.0 - speed), 5.0)
         rows, room = np.vstack([by, -by]), np.concatenate([high - free, free - low])
         bounds = list(zip(-most, most, strict=True))
         can = linprog(np.zeros(most.size), rows, room, bounds=bounds).status == 0

@@ -1,0 +1,236 @@
+"""How far the noise of sensors spreads the signals of a sampled loop, to first order."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Diagram
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.running.rollout.asked import RolloutRequest
+from drake_dae.running.rollout.problems import problems_of
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
+from drake_dae.running.rollout.stepping.interpreted import run
+
+_CHANGE, _LEAST = 1e-6, 1e-2
+"""The change of a value for a difference, relative to its size, of which the least is 0.01."""
+
+_OF_NOISE = 1e-3
+"""The change of a random number for a difference; its deviation is 1."""
+
+
+MOST = 100
+"""The largest number of updates after which samples repeat."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpread:
+    """The standard deviations of the signals of a loop by noise.
+
+    Attributes:
+        times: The times of the samples in s, shape (k,).
+        deviations: Name of a signal -> the deviations of its entries, shape (k, entries).
+        changes: The same of their changes from one sample to the next.
+    """
+
+    times: FloatArray
+    deviations: Mapping[str, FloatArray]
+    changes: Mapping[str, FloatArray]
+
+    def rms(self, name: str) -> FloatArray:
+        """The root mean square of the deviations of a signal over the times, shape (entries,)."""
+        rms: FloatArray = np.sqrt(np.mean(np.square(self.deviations[name]), axis=0))
+        return rms
+
+    def roughness(self, name: str) -> float:
+        """The root mean square length of the change of a signal from one sample to the next."""
+        return float(np.sqrt(np.mean(np.sum(np.square(self.changes[name]), axis=1))))
+
+
+@checked(ModelError)
+def noise_spread(
+    loop: ClosedLoop | Diagram,
+    start: ArrayLike,
+    parameters: ArrayLike | None,
+    times: ArrayLike,
+    *,
+    config: SimulatorConfig | None = None,
+) -> NoiseSpread:
+    """Predicts how far random numbers of deviation 1 spread the signals of a sampled loop.
+
+    The samples of all blocks repeat after a period T, in which random numbers n_k are drawn. From
+    one period to the next all states z of the diagram become F(t_k, z_k, n_k), and its signals are
+    G(t_k, z_k, n_k). About the run without noise a deviation moves, to first order, as
+
+        dz_(k+1) = A dz_k + B n_k,    dy_k = C dz_k + D n_k,
+
+    so that its covariance after k samples and that of the signals are
+
+        P = sum_(i < k) A^i B B^T (A^i)^T,    C P C^T + D D^T,
+
+    and that of the change of the signals to the next period is that of (C A - C) dz_k + (C B - D)
+    n_k + D n_(k+1). A, B, C and D are differences of the step at the time of interest, which the
+    motion may change only slowly. What rounds has no slope: of the resolution of encoders nothing
+    is counted, nor of lost packets.
+
+    Args:
+        loop: The closed loop, or a diagram of blocks that can be traced, as for `rollout`.
+        start, parameters: As for `rollout`, of one run.
+        times: The times of interest in s, shape (k,), increasing, the first after the start.
+        config: As for `rollout`.
+
+    Returns:
+        The deviations at the periods next to these times.
+
+    Raises:
+        ModelError: Arguments have wrong shapes; samples do not repeat within `MOST` of them; blocks
+            change at times that a run locates; Drake steps a block; or the run without noise ends
+            early.
+        InconsistentStateError: The start is not on N*.
+    """
+    begun = 0.0 if config is None else config.start_time
+    request = RolloutRequest.of(loop, np.append(begun, np.ravel(times)), config, None, None)
+    program, compiled = request.program, request.program.compiled
+    if compiled.changes or compiled.has_stepped:
+        raise ModelError(
+            f"{program.name} has no spread by noise: a block changes at times that a run locates, "
+            "as at impacts and openings, or Drake steps it"
+        )
+    problems = problems_of(program, start, parameters, request.times, None)
+    if len(problems) != 1:
+        raise ModelError(f"the spread by noise is that of one run, got {len(problems)} starts")
+    samples = _Samples(functions_of(program), request.settings, problems[0])
+    found = [samples.at(time) for time in request.times[1:].tolist()]
+    whole, changes = (np.array(part) for part in zip(*((d, c) for _, d, c in found), strict=True))
+    stops = np.cumsum([0, *map(len, program.signals.values())])[:-1]
+
+    def signals(values: FloatArray) -> Mapping[str, FloatArray]:
+        return dict(zip(program.signals, np.split(values, stops[1:], axis=1), strict=True))
+
+    return NoiseSpread(np.array([time for time, _, _ in found]), signals(whole), signals(changes))
+
+
+class _Samples:
+    """The periods of the samples in a run without noise, one after the other."""
+
+    def __init__(
+        self, functions: DiagramFunctions, settings: Settings, problem: RunProblem
+    ) -> None:
+        repeats = (count for count in range(1, MOST) if _repeats(problem, count))
+        if (count := next(repeats, None)) is None:
+            raise ModelError(
+                f"{functions.program.name} has no spread by noise: that needs samples that repeat "
+                f"after at most {MOST} of them"
+            )
+        self._count = count
+        self._period = float(problem.events[count] - problem.events[0])
+        self._functions, self._settings, self._problem = functions, settings, problem
+        self._state, self._held, self._index = problem.state, problem.held, 0
+        self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
+
+    def at(self, time: float) -> tuple[float, FloatArray, FloatArray]:
+        """The time of a period, and the deviations of all signals and of their changes there."""
+        # The signals are those at the end of the period that begins here.
+        index = max(round((time - self._begun) / self._period), 1) - 1
+        if index > self._index:
+            reached = self._run(index - self._index)
+            self._state, self._held, self._index = reached.state, reached.held, index
+        of_state, of_noise = self._slopes()
+        size = self._state.size + self._held.size
+        (a, c), (b, d) = np.split(of_state, [size]), np.split(of_noise, [size])
+        # Without these, differences of counters would count, which no noise reaches.
+        reached_by_noise = _reached(a, b)
+        a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
+        a[~reached_by_noise] = 0.0
+        spread = _summed(a, b @ b.T, index)
+        changed, drawn = c @ a - c, c @ b - d
+        whole, change = (
+            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", row, spread, row) + rest, 0.0))
+            for row, rest in (
+                (c, np.sum(d**2, axis=1)),
+                (changed, np.sum(drawn**2, axis=1) + np.sum(d**2, axis=1)),
+            )
+        )
+        return self._begun + (index + 1) * self._period, whole, change
+
+    def _run(
+        self, count: int, change: FloatArray | None = None, noise: FloatArray | None = None
+    ) -> Run:
+        """Runs some periods from here, with a change of state and held values, and with noise."""
+        state, held, last = self._state, self._held, self._index + count
+        part = slice(self._count * self._index, self._count * last)
+        if change is not None:
+            state, held = state + change[: state.size], held + change[state.size :]
+        problem = replace(
+            self._problem,
+            times=self._begun + self._period * np.array([self._index, last]),
+            state=state,
+            held=held,
+            events=self._problem.events[part],
+            due=self._problem.due[part],
+            noise=self._quiet[part] if noise is None else noise.reshape(self._count, -1),
+        )
+        done = run(self._functions, self._settings, problem)
+        if done.ending != RunEnding.DONE:
+            raise ModelError(
+                f"{self._functions.program.name} has no spread by noise: its run without noise "
+                f"ends at {done.time:.6g} s"
+            )
+        return done
+
+    def _slopes(self) -> tuple[FloatArray, FloatArray]:
+        """The slopes of states, held values and signals after a period, by both and by noise."""
+        values = np.concatenate([self._state, self._held])
+        sizes = _CHANGE * np.maximum(np.abs(values), _LEAST)
+
+        def column(change: FloatArray | None, noise: FloatArray | None) -> FloatArray:
+            after = self._run(1, change, noise)
+            return np.concatenate([after.state, after.held, after.rows[-1]])
+
+        count = self._count * self._quiet.shape[1]
+        by_values = [
+            (column(change, None) - column(-change, None)) / (2.0 * size)
+            for change, size in zip(np.diag(sizes), sizes, strict=True)
+        ]
+        by_noise = [
+            (column(None, noise) - column(None, -noise)) / (2.0 * _OF_NOISE)
+            for noise in _OF_NOISE * np.eye(count)
+        ]
+        rows = values.size + self._functions.program.width
+        return np.array(by_values).T, np.array(by_noise).T.reshape(rows, count)
+
+
+def _repeats(problem: RunProblem, count: int) -> bool:
+    """Whether a number of updates later the same are due, always after the same time."""
+    if count >= problem.events.size:
+        return False
+    gaps = problem.events[count:] - problem.events[:-count]
+    same = problem.due[count:] == problem.due[:-count]
+    return bool(np.ptp(gaps) <= 1e-6 * gaps[0] and same.all())
+
+
+def _reached(a: FloatArray, b: FloatArray) -> Booleans:
+    """The states that noise reaches by z+ = A z + B n."""
+    found: Booleans = np.any(b != 0.0, axis=1)
+    while True:
+        more = found | np.any(a[:, found] != 0.0, axis=1)
+        if (more == found).all():
+            return found
+        found = more
+
+
+def _summed(a: FloatArray, noise: FloatArray, count: int) -> FloatArray:
+    """The sum of A^i Q (A^i)^T for i < count, by doubling."""
+    total, power = np.zeros_like(noise), np.eye(len(a))
+    part, step = noise, a  # The sum of 2^j terms, and A^(2^j).
+    while count:
+        if count & 1:
+            total, power = total + power @ part @ power.T, power @ step
+        part, step, count = part + step @ part @ step.T, step @ step, count >> 1
+    return total

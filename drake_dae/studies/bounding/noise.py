@@ -1,0 +1,102 @@
+"""What the noise of its sensors does to a scenario's outputs, predicted without a run."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.running.rollout.noise import noise_spread
+from drake_dae.running.rollout.problems import start_values
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.rolled import for_rollout
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_scenario
+
+_LOOKED, _LONGEST = 5, 4.0
+"""At how many times of a motion the spread is computed, in the second half of at most 4 s."""
+
+_UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseOutlook:
+    """The predicted standard deviations of a scenario's outputs by the noise of its sensors.
+
+    Attributes:
+        outputs: Name of an output -> unit and deviation.
+        roughness: The rms change of the controls from one sample to the next, over all drives, in
+            their unit.
+        unit: That unit; empty if drives have several.
+        reason: Why there is no prediction; empty if there is one.
+    """
+
+    outputs: dict[str, tuple[str, float]]
+    roughness: float = 0.0
+    unit: str = ""
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if self.reason:
+            return f"no prediction of what noise does: {self.reason}"
+        parts = []
+        for name, (unit, deviation) in self.outputs.items():
+            shown, factor = _UNITS.get(unit, (unit, 1.0))
+            parts.append(f"{name} {factor * deviation:.2g} {shown}".rstrip())
+        rough = f"{self.roughness:.2g} {self.unit}".rstrip()
+        return (
+            "noise of the sensors spreads the outputs, as standard deviations to first order: "
+            f"{', '.join(parts)}; the controls change by {rough} from sample to sample"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The outlook as plain data, in SI units."""
+        if self.reason:
+            return {"reason": self.reason}
+        deviations = {name: deviation for name, (_, deviation) in self.outputs.items()}
+        return {"deviations": deviations, "roughness": self.roughness}
+
+
+def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
+    """Predicts the deviations of outputs and controls by the noise of encoders and force sensor.
+
+    It is `noise_spread` of the scenario's loop, on the plant that rollouts have, from its start.
+    The resolution h of encoders counts as noise of h / sqrt(12) at each sample, which it is where a
+    joint passes several steps in the time in which the loop settles. Where joints rest, it is
+    a constant error of up to h / 2, of which this prediction knows nothing.
+
+    Args:
+        scenario: The scenario, as `load_scenario` returns it.
+
+    Returns:
+        The outlook; None for a scenario without noise, and for a task.
+
+    Raises:
+        ScenarioError: The scenario is not valid; the message names the key.
+    """
+    encoders = scenario.encoders
+    if encoders is not None:
+        # What rounds has no slope.
+        noise = encoders.position_deviation
+        encoders = replace(encoders, resolution=0.0, position_noise=noise)
+    deviations = [
+        *([] if encoders is None else [encoders.position_noise, encoders.velocity_noise]),
+        getattr(scenario.force_feedback, "noise_deviation", 0.0),
+    ]
+    if scenario.task is not None or not any(np.any(np.asarray(each)) for each in deviations):
+        return None
+    completed, loop = build_completed(replace(for_rollout(scenario)[0], encoders=encoders))
+    scenario = completed.scenario
+    start, parameters = start_values(loop, start_scenario(scenario, loop))
+    until = min(scenario.duration, _LONGEST)
+    times = scenario.integrator.start_time + np.linspace(until / 2.0, until, _LOOKED)
+    try:
+        spread = noise_spread(loop, start, parameters, times, config=scenario.integrator)
+    except (InconsistentStateError, ModelError) as error:
+        return NoiseOutlook({}, reason=str(error))
+    signals = loop.signals["controlled_output"]
+    rms = spread.rms("controlled_output").tolist()
+    outputs = {s.name: (s.unit, each) for s, each in zip(signals, rms, strict=True)}
+    units = {signal.unit for signal in loop.signals["control"]}
+    unit = units.pop() if len(units) == 1 else ""
+    return NoiseOutlook(outputs, spread.roughness("control"), unit)

@@ -1,0 +1,97 @@
+"""The predicted spread by noise, beside Lyapunov's equation and the spread of many runs."""
+
+import numpy as np
+import pytest
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LinearSystem, RandomSource, ZeroOrderHold
+from scipy.linalg import solve_discrete_lyapunov
+
+from drake_dae import load_scenario, noise_spread, rollout, start_values
+from drake_dae.errors import ModelError
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.start import start_scenario
+
+PERIOD = 0.01
+
+
+def filtered(hold):
+    """Noise, held for a time, through z+ = A z + B n, y = C z + D n: a diagram and its matrices."""
+    A = np.array([[0.9, 0.2], [-0.1, 0.8]])
+    B, C, D = np.array([[0.5], [1.0]]), np.array([[1.0, -0.5]]), np.array([[0.3]])
+    builder = DiagramBuilder()
+    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, PERIOD))
+    held = builder.AddSystem(ZeroOrderHold(hold, 1))
+    system = builder.AddSystem(LinearSystem(A, B, C, D, PERIOD))
+    builder.Connect(noise.get_output_port(), held.get_input_port())
+    builder.Connect(noise.get_output_port(), system.get_input_port())
+    builder.ExportOutput(held.get_output_port(), "held")
+    builder.ExportOutput(system.get_output_port(), "y")
+    return builder.Build(), (A, B, C, D)
+
+
+def test_a_linear_filter_has_the_spread_of_lyapunovs_equation():
+    """Drake draws a number before the filter reads it: y_k = C A z + (C B + D) n, z of before."""
+    diagram, (A, B, C, D) = filtered(PERIOD)
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    found = noise_spread(diagram, start, parameters, [3 * PERIOD, 10.0])
+    direct, change = C @ B + D, C @ (A - np.eye(2))
+    # Two numbers came before the third, and then more than count.
+    spreads = (B @ B.T + A @ B @ B.T @ A.T, solve_discrete_lyapunov(A, B @ B.T))
+    for row, spread in enumerate(spreads):
+        wanted = np.sqrt(C @ A @ spread @ A.T @ C.T + direct**2)
+        assert found.deviations["y"][row, 0] == pytest.approx(wanted[0, 0], rel=1e-8)
+        moved = change @ A @ spread @ A.T @ change.T
+        wanted = np.sqrt(moved + (change @ B - D) ** 2 + direct**2)
+        assert found.changes["y"][row, 0] == pytest.approx(wanted[0, 0], rel=1e-8)
+    np.testing.assert_allclose(found.times, [3 * PERIOD, 10.0])
+
+
+def test_samples_of_several_rates_repeat_after_the_longest():
+    """What is held for half a period is the last number: its deviation is that of the noise."""
+    diagram, _ = filtered(PERIOD / 2.0)
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    found = noise_spread(diagram, start, parameters, [1.0])
+    assert found.deviations["held"][0, 0] == pytest.approx(1.0, rel=1e-8)
+    assert found.rms("held").shape == (1,)
+
+
+def test_what_has_no_spread_is_refused_in_a_sentence():
+    diagram, _ = filtered(PERIOD * 1.0101)
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    with pytest.raises(ModelError, match="samples that repeat after at most 100"):
+        noise_spread(diagram, start, parameters, [5.0])
+    loop = build_completed(load_scenario(find_scenario("wall_bounce")))[1]
+    with pytest.raises(ModelError, match="changes at times that a run locates"):
+        noise_spread(loop, *start_values(loop, loop.diagram.CreateDefaultContext()), [1.0])
+
+
+@pytest.mark.slow
+def test_a_robot_in_contact_has_the_spread_of_its_runs():
+    """Beside 24 runs of 2 s.
+
+    The slowest part of the errors has a time constant of 0.1 s, so that these are some 200
+    independent values of each, whose deviation is known to 5 per cent: 20 per cent is four times as
+    much.
+    """
+    settings = [
+        "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}",
+        "sampling={period: 0.001, delay: 0.001}",
+        "gains=",
+        "encoders={position_noise: 5.0e-5, velocity_noise: 0.01}",
+        "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}",
+    ]
+    completed, loop = build_completed(load_scenario(find_scenario("wall_point_contact"), settings))
+    scenario = completed.scenario
+    start, parameters = start_values(loop, start_scenario(scenario, loop))
+    config = scenario.integrator
+    found = noise_spread(loop, start, parameters, [1.0, 1.5, 2.0], config=config)
+    times = np.arange(0.0, 2.0005, 0.001)
+    runs = rollout(loop, start, parameters, times, config=config, seeds=list(range(24)))
+    late = [run.record["controlled_output"][1000:] for run in runs]
+    measured = np.sqrt(np.mean(np.var(late, axis=0, ddof=1), axis=0))
+    np.testing.assert_allclose(found.rms("controlled_output"), measured, rtol=0.2)
+    steps = [np.diff(run.record["control"][1000:], axis=0) for run in runs]
+    rough = np.sqrt(np.mean(np.sum(np.var(steps, axis=0, ddof=1), axis=1)))
+    assert found.roughness("control") == pytest.approx(rough, rel=0.05)
