@@ -1,11 +1,12 @@
 """Checks of a robot for Drake's own contact, and changed parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import Box, HalfSpace, Sphere
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.multibody.tree import BodyIndex, RigidBody, SpatialInertia, UnitInertia
+from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, numbers, show, unknown_name
 from drake_dae.errors import ModelError
@@ -165,3 +166,40 @@ def point_mass(mass: float, center: FloatArray) -> SpatialInertia:
     squares = center @ center - center**2
     unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
     return SpatialInertia(mass, center, unit)
+
+
+OtherMass = tuple[RigidBody, float, FloatArray | None]
+"""A body, its mass in kg, and its place in m if it is a point mass."""
+
+
+def other_masses(
+    model: RobotModel, plant: MultibodyPlant, values: FloatArray
+) -> tuple[OtherMass, ...]:
+    """The bodies of a plant whose mass or place is not that of the robot's file.
+
+    Args:
+        model: The robot, made from a MultibodyPlant.
+        plant: Another plant of the same robot.
+        values: The values of all parameters of the model.
+    """
+    drawn = model.links.plant
+    assert drawn is not None  # check_same.
+    bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
+    with_mass = (body for body in bodies if body.default_mass() > 0.0)
+    known = {p.name: values[model.dae.parameter_slice(p.name)] for p in model.links.parameters}
+    masses = [name for name in known if name.endswith(".mass")]
+    changed = list[OtherMass]()
+    for body, name in zip(with_mass, masses, strict=True):
+        mass, center = known[name].item(), known.get(f"{name.removesuffix('mass')}center")
+        if mass != body.default_mass() or (center is not None and center.any()):
+            changed.append((plant.get_body(body.index()), mass, center))
+    return tuple(changed)
+
+
+def set_masses(context: Context, masses: Sequence[OtherMass]) -> None:
+    """Sets the masses of `other_masses` in a context of their plant."""
+    for body, mass, center in masses:
+        if center is None:
+            body.SetMass(context, mass)
+        else:
+            body.SetSpatialInertiaInBodyFrame(context, point_mass(mass, center))

@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
@@ -36,7 +36,8 @@ from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
     check_same,
-    point_mass,
+    other_masses,
+    set_masses,
     solids_of,
 )
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
@@ -152,7 +153,7 @@ class ContactPlant(Diagram, Plant):
         pairs = self._add_contacts(plant, scene_graph, material)
         plant.Finalize()
         check_same(plant, model)
-        self._masses = self._other_masses()
+        self._masses = other_masses(model, plant, self._values)
         port = plant.get_applied_spatial_force_input_port()
         if pushed:
             bodies = (plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies()))
@@ -270,22 +271,6 @@ class ContactPlant(Diagram, Plant):
             balls.append((GetScopedFrameByName(plant, name), centers, point))
         return balls
 
-    def _other_masses(self) -> list[tuple[RigidBody, float, FloatArray | None]]:
-        """The bodies with another mass or place than in the model, with their own."""
-        drawn = self.model.links.plant
-        assert drawn is not None  # check_model.
-        bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
-        changed = []
-        with_mass = (body for body in bodies if body.default_mass() > 0.0)
-        names = [parameter.name for parameter in self.model.links.parameters]
-        values = {name: self._values[self.dae.parameter_slice(name)] for name in names}
-        masses = [name for name in values if name.endswith(".mass")]
-        for body, name in zip(with_mass, masses, strict=True):
-            mass, center = values[name].item(), values.get(f"{name.removesuffix('mass')}center")
-            if mass != body.default_mass() or (center is not None and center.any()):
-                changed.append((self.multibody.get_body(body.index()), mass, center))
-        return changed
-
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
         return self._values.copy()
@@ -332,11 +317,7 @@ class ContactPlant(Diagram, Plant):
         links = values[: self.multibody.num_multibody_states()]
         multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(multibody_context, links)
-        for body, mass, center in self._masses:
-            if center is None:
-                body.SetMass(multibody_context, mass)
-            else:
-                body.SetSpatialInertiaInBodyFrame(multibody_context, point_mass(mass, center))
+        set_masses(multibody_context, self._masses)
 
     def traced(self) -> Block:
         parts = self._scene, self._forces, self._stages

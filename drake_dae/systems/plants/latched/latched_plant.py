@@ -27,7 +27,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.plants.contact.contact_checks import check_same
+from drake_dae.systems.plants.contact.contact_checks import check_same, other_masses, set_masses
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
 
@@ -121,6 +121,9 @@ class LatchedPlant(LeafSystem, Plant):
         self._scene = builder.Build()
         # Scratch memory: all of it is set before each step.
         self._scratch = self._scene.CreateDefaultContext()
+        masses = other_masses(model, self.multibody, model.dae.parameter_values)
+        scratch = self._scene.GetMutableSubsystemContext(self.multibody, self._scratch)
+        set_masses(scratch, masses)
         dae, force = model.dae, ca.SX.sym("force", model.dae.num_constraints)
         self._size = dae.num_states + dae.num_constraints
         held = self.DeclareDiscreteState(self._size + len(latches))

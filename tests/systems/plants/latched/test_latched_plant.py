@@ -1,5 +1,7 @@
 """Latches of Drake's discrete plant: momentum, forces, refusals."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 from latches import latched_crane
@@ -103,6 +105,20 @@ def test_the_force_is_that_which_moves_the_load(model):
     np.testing.assert_allclose(rates(plant, context), 0.4, rtol=1e-6)
     residual = plant.GetOutputPort("constraint_residual").Eval(context)
     assert 0.0 < np.max(np.abs(residual)) < 1e-5  # m; Drake's latch gives way a little.
+
+
+def test_a_mass_of_the_model_is_that_of_drakes_plant(model):
+    """A load of 3 kg in place of 1.5: 10 N on 5 kg in all are 2 m/s^2, and 6 N on the load."""
+    heavy = copy(model)
+    heavy.dae = model.dae.with_values({"load.mass": 3.0})
+    plant = latched(heavy)
+    pull = np.array([0.0, 0.0, 10.0])[[["x", "z", "y"].index(axis) for axis in _AXES]]
+    simulator = started(plant, pull, 1.0, 0.0)
+    simulator.AdvanceTo(0.2)
+    context = simulator.get_context()
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    np.testing.assert_allclose(force, [0.0, 6.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(rates(plant, context), 0.4, rtol=1e-6)
 
 
 def test_an_open_latch_exerts_no_force(model):
