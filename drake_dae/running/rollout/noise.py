@@ -9,7 +9,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.arrays import Booleans, FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
@@ -44,13 +44,28 @@ class NoiseSpread:
     changes: Mapping[str, FloatArray]
 
     def rms(self, name: str) -> FloatArray:
-        """The root mean square of the deviations of a signal over the times, shape (entries,)."""
-        rms: FloatArray = np.sqrt(np.mean(np.square(self.deviations[name]), axis=0))
+        """The root mean square of the deviations of a signal over the times, shape (entries,).
+
+        Raises:
+            ModelError: There is no such signal.
+        """
+        rms: FloatArray = np.sqrt(np.mean(np.square(_of(self.deviations, name)), axis=0))
         return rms
 
     def roughness(self, name: str) -> float:
-        """The root mean square length of the change of a signal from one sample to the next."""
-        return float(np.sqrt(np.mean(np.sum(np.square(self.changes[name]), axis=1))))
+        """The root mean square length of the change of a signal from one sample to the next.
+
+        Raises:
+            ModelError: There is no such signal.
+        """
+        return float(np.sqrt(np.mean(np.sum(np.square(_of(self.changes, name)), axis=1))))
+
+
+def _of(signals: Mapping[str, FloatArray], name: str) -> FloatArray:
+    """The values of a signal."""
+    if not isinstance(name, str) or name not in signals:
+        raise ModelError(unknown_name("signal", name, list(signals)))
+    return signals[name]
 
 
 @checked(ModelError)

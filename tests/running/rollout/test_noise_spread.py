@@ -55,6 +55,8 @@ def test_samples_of_several_rates_repeat_after_the_longest():
     found = noise_spread(diagram, start, parameters, [1.0])
     assert found.deviations["held"][0, 0] == pytest.approx(1.0, rel=1e-8)
     assert found.rms("held").shape == (1,)
+    with pytest.raises(ModelError, match="no signal 'hold'; did you mean 'held'"):
+        found.rms("hold")
 
 
 def test_what_has_no_spread_is_refused_in_a_sentence():
