@@ -25,8 +25,8 @@ _OF_NOISE = 1e-3
 """The change of a random number for a difference; its deviation is 1."""
 
 
-MOST = 100
-"""The largest number of updates after which samples repeat."""
+SAME = 1e-6
+"""Times that differ by less than this fraction of a period are the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,10 @@ def noise_spread(
 ) -> NoiseSpread:
     """Predicts how far random numbers of deviation 1 spread the signals of a sampled loop.
 
-    The samples of all blocks repeat after a period T, in which random numbers n_k are drawn. From
-    one period to the next all states z of the diagram become F(t_k, z_k, n_k), and its signals are
-    G(t_k, z_k, n_k). About the run without noise a deviation moves, to first order, as
+    The samples of all blocks repeat after T, the longest of their periods, in which random numbers
+    n_k are drawn. From one period to the next all states z of the diagram become F(t_k, z_k, n_k),
+    and its signals are G(t_k, z_k, n_k). About the run without noise a deviation moves, to first
+    order, as
 
         dz_(k+1) = A dz_k + B n_k,    dy_k = C dz_k + D n_k,
 
@@ -104,9 +105,9 @@ def noise_spread(
         The deviations at the periods next to these times.
 
     Raises:
-        ModelError: Arguments have wrong shapes; samples do not repeat within `MOST` of them; blocks
-            change at times that a run locates; Drake steps a block; or the run without noise ends
-            early.
+        ModelError: Arguments have wrong shapes; samples do not repeat with the longest of their
+            periods; blocks change at times that a run locates; Drake steps a block; or the run
+            without noise ends early.
         InconsistentStateError: The start is not on N*.
     """
     begun = 0.0 if config is None else config.start_time
@@ -137,14 +138,13 @@ class _Samples:
     def __init__(
         self, functions: DiagramFunctions, settings: Settings, problem: RunProblem
     ) -> None:
-        repeats = (count for count in range(1, MOST) if _repeats(problem, count))
-        if (count := next(repeats, None)) is None:
+        periods = [rate.period for rate in functions.program.compiled.rates]
+        self._period = max(periods, default=0.0)
+        if not periods or any(not _divides(each, self._period) for each in periods):
             raise ModelError(
                 f"{functions.program.name} has no spread by noise: that needs samples that repeat "
-                f"after at most {MOST} of them"
+                "with the longest of their periods"
             )
-        self._count = count
-        self._period = float(problem.events[count] - problem.events[0])
         self._functions, self._settings, self._problem = functions, settings, problem
         self._state, self._held, self._index = problem.state, problem.held, 0
         self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
@@ -179,7 +179,7 @@ class _Samples:
     ) -> Run:
         """Runs some periods from here, with a change of state and held values, and with noise."""
         state, held, last = self._state, self._held, self._index + count
-        part = slice(self._count * self._index, self._count * last)
+        part = self._updates(last)
         if change is not None:
             state, held = state + change[: state.size], held + change[state.size :]
         problem = replace(
@@ -189,7 +189,7 @@ class _Samples:
             held=held,
             events=self._problem.events[part],
             due=self._problem.due[part],
-            noise=self._quiet[part] if noise is None else noise.reshape(self._count, -1),
+            noise=self._quiet[part] if noise is None else noise.reshape(part.stop - part.start, -1),
         )
         done = run(self._functions, self._settings, problem)
         if done.ending != RunEnding.DONE:
@@ -198,6 +198,11 @@ class _Samples:
                 f"ends at {done.time:.6g} s"
             )
         return done
+
+    def _updates(self, last: int) -> slice:
+        """The updates from here to a period, which may be at times that differ by round-off."""
+        ends = self._begun + self._period * (np.array([self._index, last]) - SAME)
+        return slice(*np.searchsorted(self._problem.events, ends).tolist())
 
     def _slopes(self) -> tuple[FloatArray, FloatArray]:
         """The slopes of states, held values and signals after a period, by both and by noise."""
@@ -208,7 +213,7 @@ class _Samples:
             after = self._run(1, change, noise)
             return np.concatenate([after.state, after.held, after.rows[-1]])
 
-        count = self._count * self._quiet.shape[1]
+        count = self._quiet[self._updates(self._index + 1)].size
         by_values = [
             (column(change, None) - column(-change, None)) / (2.0 * size)
             for change, size in zip(np.diag(sizes), sizes, strict=True)
@@ -221,13 +226,8 @@ class _Samples:
         return np.array(by_values).T, np.array(by_noise).T.reshape(rows, count)
 
 
-def _repeats(problem: RunProblem, count: int) -> bool:
-    """Whether a number of updates later the same are due, always after the same time."""
-    if count >= problem.events.size:
-        return False
-    gaps = problem.events[count:] - problem.events[:-count]
-    same = problem.due[count:] == problem.due[:-count]
-    return bool(np.ptp(gaps) <= 1e-6 * gaps[0] and same.all())
+def _divides(part: float, period: float) -> bool:
+    return abs(period / part - round(period / part)) < SAME
 
 
 def _reached(a: FloatArray, b: FloatArray) -> Booleans:

@@ -62,7 +62,7 @@ def test_samples_of_several_rates_repeat_after_the_longest():
 def test_what_has_no_spread_is_refused_in_a_sentence():
     diagram, _ = filtered(PERIOD * 1.0101)
     start, parameters = start_values(diagram, diagram.CreateDefaultContext())
-    with pytest.raises(ModelError, match="samples that repeat after at most 100"):
+    with pytest.raises(ModelError, match="samples that repeat with the longest"):
         noise_spread(diagram, start, parameters, [5.0])
     loop = build_completed(load_scenario(find_scenario("wall_bounce")))[1]
     with pytest.raises(ModelError, match="changes at times that a run locates"):
