@@ -86,14 +86,14 @@ def noise_spread(
 
         dz_(k+1) = A dz_k + B n_k,    dy_k = C dz_k + D n_k,
 
-    so that its covariance after k samples and that of the signals are
+    so that its covariance, zero at the start, and that of the signals are
 
-        P = sum_(i < k) A^i B B^T (A^i)^T,    C P C^T + D D^T,
+        P_(k+1) = A P_k A^T + B B^T,    C P C^T + D D^T,
 
     and that of the change of the signals to the next period is that of (C A - C) dz_k + (C B - D)
-    n_k + D n_(k+1). A, B, C and D are differences of the step at the time of interest, which the
-    motion may change only slowly. What rounds has no slope: of the resolution of encoders nothing
-    is counted, nor of lost packets.
+    n_k + D n_(k+1). A, B, C and D are differences of the step at each time of interest, and until
+    then the same since the time before: so there should be several during a motion. What rounds
+    has no slope: of the resolution of encoders nothing is counted, nor of lost packets.
 
     Args:
         loop: The closed loop, or a diagram of blocks that can be traced, as for `rollout`.
@@ -148,13 +148,16 @@ class _Samples:
         self._functions, self._settings, self._problem = functions, settings, problem
         self._state, self._held, self._index = problem.state, problem.held, 0
         self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
+        size = problem.state.size + problem.held.size
+        self._spread = np.zeros((size, size))
 
     def at(self, time: float) -> tuple[float, FloatArray, FloatArray]:
         """The time of a period, and the deviations of all signals and of their changes there."""
         # The signals are those at the end of the period that begins here.
         index = max(round((time - self._begun) / self._period), 1) - 1
-        if index > self._index:
-            reached = self._run(index - self._index)
+        since = index - self._index
+        if since:
+            reached = self._run(since)
             self._state, self._held, self._index = reached.state, reached.held, index
         of_state, of_noise = self._slopes()
         size = self._state.size + self._held.size
@@ -163,7 +166,7 @@ class _Samples:
         reached_by_noise = _reached(a, b)
         a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
         a[~reached_by_noise] = 0.0
-        spread = _summed(a, b @ b.T, index)
+        self._spread = spread = _after(a, b @ b.T, since, self._spread)
         changed, drawn = c @ a - c, c @ b - d
         whole, change = (
             np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", row, spread, row) + rest, 0.0))
@@ -240,12 +243,11 @@ def _reached(a: FloatArray, b: FloatArray) -> Booleans:
         found = more
 
 
-def _summed(a: FloatArray, noise: FloatArray, count: int) -> FloatArray:
-    """The sum of A^i Q (A^i)^T for i < count, by doubling."""
-    total, power = np.zeros_like(noise), np.eye(len(a))
-    part, step = noise, a  # The sum of 2^j terms, and A^(2^j).
+def _after(a: FloatArray, noise: FloatArray, count: int, spread: FloatArray) -> FloatArray:
+    """P after a number of times P = A P A^T + Q, by doubling."""
+    part, step = noise, a  # Q and A of 2^j times.
     while count:
         if count & 1:
-            total, power = total + power @ part @ power.T, power @ step
+            spread = step @ spread @ step.T + part
         part, step, count = part + step @ part @ step.T, step @ step, count >> 1
-    return total
+    return spread

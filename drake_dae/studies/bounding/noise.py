@@ -6,15 +6,16 @@ from typing import Any
 import numpy as np
 
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.running.rollout.noise import noise_spread
+from drake_dae.running.rollout.noise import NoiseSpread, noise_spread
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 
-_LOOKED, _LONGEST = 5, 4.0
-"""At how many times of a motion the spread is computed, in the second half of at most 4 s."""
+_LOOKED, _LONGEST = 12, 4.0
+"""At how many times of a motion slopes are computed; the spread is told of the second half, which
+ends after at most 4 s."""
 
 _UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 
@@ -89,11 +90,17 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     scenario = completed.scenario
     start, parameters = start_values(loop, start_scenario(scenario, loop))
     until = min(scenario.duration, _LONGEST)
-    times = scenario.integrator.start_time + np.linspace(until / 2.0, until, _LOOKED)
+    times = scenario.integrator.start_time + until * np.arange(1, _LOOKED + 1) / _LOOKED
     try:
-        spread = noise_spread(loop, start, parameters, times, config=scenario.integrator)
+        whole = noise_spread(loop, start, parameters, times, config=scenario.integrator)
     except (InconsistentStateError, ModelError) as error:
         return NoiseOutlook({}, reason=str(error))
+    late = slice(_LOOKED // 2, None)
+    parts = (
+        {name: values[late] for name, values in each.items()}
+        for each in (whole.deviations, whole.changes)
+    )
+    spread = NoiseSpread(whole.times[late], *parts)
     signals = loop.signals["controlled_output"]
     rms = spread.rms("controlled_output").tolist()
     outputs = {s.name: (s.unit, each) for s, each in zip(signals, rms, strict=True)}
