@@ -128,10 +128,13 @@ class Governing:
         """
         structure = self.law.structure
         limited = LimitedSignals(structure, self.limits)
-        control, _ = structure.control_for(commanded)
-        slope_now, slope = (
-            structure.control_for(commanded + effect)[0] - control for effect in (now, ahead)
+        # By a symbol: to solve with what is looked up in a table, as a long path, crashes CasADi.
+        desired = ca.SX.sym("commanded", commanded.numel())
+        solved, _ = structure.control_for(desired)
+        control, *others = (
+            ca.substitute(solved, desired, commanded + effect) for effect in (0.0, now, ahead)
         )
+        slope_now, slope = (other - control for other in others)
         free, by = limited.by_control()
         values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope)
         sizes = np.minimum(np.abs(limited.low), np.abs(limited.high))

@@ -94,7 +94,11 @@ class FeasibleControl(LeafSystem):
         function, names = self._reached
         parameters = self.dae.parameter_values
         over = [function(x, u, parameters)[0] for x, u in zip(states, controls, strict=True)]
-        return dict(zip(names, np.reshape(over, (-1, len(names))).T, strict=True))
+        found: dict[str, FloatArray] = {}
+        # A friction cone has several rows of one name.
+        for name, share in zip(names, np.reshape(over, (-1, len(names))).T, strict=True):
+            found[name] = np.maximum(share, found.get(name, share))
+        return found
 
     def _values(self, context: Context) -> tuple[FloatArray, ...]:
         state, control = self._state.Eval(context), self._commanded.Eval(context)
