@@ -350,7 +350,7 @@ def outcome(run: Run) -> str:
         found = rolled(run.base.rows)
         if not run.is_model:
             return judged_beside(run, completed, loop, found, free)
-        return judged(run, completed, loop, found, lambda: rolled(15 * run.base.rows).record)
+        return judged(run, completed, loop, found, lambda: rolled(150 * run.base.rows).record)
     except Exception as error:
         return f"RAW: {error!r}"
 
