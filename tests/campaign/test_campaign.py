@@ -1,6 +1,7 @@
 """A small part of the campaign: a mistake ends as a message, a robot as numbers that are right."""
 
 import random
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 from campaign import bad_files, bad_inputs, drops, random_limits, random_robots, random_tasks
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
+
+from drake_dae.dae.timing.profile import EXCESS
 
 FEW, MANY = range(40), range(40, 110)
 FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 48)
@@ -84,6 +87,15 @@ def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
     found = random_limits.outcome(run)
     assert found.startswith("left: "), found
     assert "largest friction cone of grip.fz" in found
+
+
+@pytest.mark.slow
+def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path):
+    """Within the accepted excess; with points spread by length alone it was up to 1.98 of a cone."""
+    run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
+    share = re.search(r": cone (\S+) of its limit", random_limits.outcome(run))
+    assert share is not None
+    assert float(share[1]) < 1.0 + EXCESS
 
 
 @pytest.mark.slow

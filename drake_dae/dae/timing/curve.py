@@ -196,10 +196,19 @@ class Curve:
         return Piece(times, np.zeros(times.size), values, none, none, np.zeros(times.size))
 
     def _piece(self, first: float, last: float, count: int) -> Piece:
-        """Points close together at both rests, where the speed changes fast with the distance."""
+        """Points close together at both rests, where the speed changes fast with the distance.
+
+        In between they are spread by the length, of which a whole turn counts as much as all.
+        """
         fine = np.linspace(first, last, max(1001, 2 * count + 1))
-        middle = self._speed(self.at((fine[1:] + fine[:-1]) / 2.0))
-        far = np.concatenate([[0.0], np.cumsum(middle * np.diff(fine))])
+        rates = self._weights * self.at((fine[1:] + fine[:-1]) / 2.0)[:, self._first]
+        middle = np.linalg.norm(rates, axis=1)
+        units = rates / np.maximum(middle, self._rest)[:, None]
+        turned = np.linalg.norm(np.diff(units, axis=0, prepend=units[:1]), axis=1) / (2.0 * np.pi)
+        moves = middle > self._rest
+        turned[~(moves & np.append(moves[0], moves[:-1]))] = 0.0
+        lengths = middle * np.diff(fine)
+        far = np.concatenate([[0.0], np.cumsum(lengths / lengths.sum() + turned)])
         close = far[-1] * (1.0 - np.cos(np.pi * np.arange(count + 1) / count)) / 2.0
         times = np.interp(close, far, fine)
         times[0], times[-1] = first, last
