@@ -91,7 +91,7 @@ def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
 
 @pytest.mark.slow
 def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path):
-    """Within the accepted excess; with points spread by length alone it was up to 1.98 of a cone."""
+    """Within the accepted excess; with points spread by length alone a cone was exceeded twice."""
     run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
     share = re.search(r": cone (\S+) of its limit", random_limits.outcome(run))
     assert share is not None
