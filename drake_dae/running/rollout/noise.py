@@ -24,7 +24,6 @@ _CHANGE, _LEAST = 1e-6, 1e-2
 _OF_NOISE = 1e-3
 """The change of a random number for a difference; its deviation is 1."""
 
-
 SAME = 1e-6
 """Times that differ by less than this fraction of a period are the same."""
 
