@@ -86,6 +86,15 @@ def noise_of(
     return noise
 
 
+def distribution_of(source: System) -> RandomDistribution:
+    """Returns the distribution of a RandomSource, which Drake does not tell, by its numbers."""
+    context, seed = source.CreateDefaultContext(), 0
+    source.SetRandomContext(context, RandomGenerator(seed))
+    value = source.get_output_port().Eval(context)
+    every = RandomDistribution.__members__.values()
+    return next(each for each in every if (_first(each, value.size, seed) == value).all())
+
+
 def _drawn(
     source: System, start: float, times: FloatArray, period: float, seed: int | None
 ) -> FloatArray:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 
@@ -13,6 +14,7 @@ from drake_dae.arrays import Booleans, FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
+from drake_dae.running.rollout.events import distribution_of
 from drake_dae.running.rollout.problems import problems_of
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
@@ -22,7 +24,14 @@ _CHANGE, _LEAST = 1e-6, 1e-2
 """The change of a value for a difference, relative to its size, of which the least is 0.01."""
 
 _OF_NOISE = 1e-3
-"""The change of a random number for a difference; its deviation is 1."""
+"""The change of a random number for a difference, relative to its deviation."""
+
+_MOMENTS = {
+    RandomDistribution.kUniform: (0.5, 12.0**-0.5),
+    RandomDistribution.kGaussian: (0.0, 1.0),
+    RandomDistribution.kExponential: (1.0, 1.0),
+}
+"""Mean and deviation of the numbers of a RandomSource."""
 
 SAME = 1e-6
 """Times that differ by less than this fraction of a period are the same."""
@@ -76,12 +85,12 @@ def noise_spread(
     *,
     config: SimulatorConfig | None = None,
 ) -> NoiseSpread:
-    """Predicts how far random numbers of deviation 1 spread the signals of a sampled loop.
+    """Predicts how far random numbers spread the signals of a sampled loop.
 
     The samples of all blocks repeat after T, the longest of their periods, in which random numbers
-    n_k are drawn. From one period to the next all states z of the diagram become F(t_k, z_k, n_k),
-    and its signals are G(t_k, z_k, n_k). About the run without noise a deviation moves, to first
-    order, as
+    are drawn: n_k as multiples of their deviations, from their means. From one period to the next
+    all states z of the diagram become F(t_k, z_k, n_k), and its signals are G(t_k, z_k, n_k). About
+    the run without noise, with all numbers at their means, a deviation moves, to first order, as
 
         dz_(k+1) = A dz_k + B n_k,    dy_k = C dz_k + D n_k,
 
@@ -92,7 +101,7 @@ def noise_spread(
     and that of the change of the signals to the next period is that of (C A - C) dz_k + (C B - D)
     n_k + D n_(k+1). A, B, C and D are differences of the step at each time of interest, and until
     then the same since the time before: so there should be several during a motion. What rounds
-    has no slope: of the resolution of encoders nothing is counted, nor of lost packets.
+    has no slope: of the resolution of encoders nothing is counted.
 
     Args:
         loop: The closed loop, or a diagram of blocks that can be traced, as for `rollout`.
@@ -105,10 +114,15 @@ def noise_spread(
 
     Raises:
         ModelError: Arguments have wrong shapes; samples do not repeat with the longest of their
-            periods; blocks change at times that a run locates; Drake steps a block; or the run
-            without noise ends early.
+            periods; signals are late or lost at random; blocks change at times that a run locates;
+            Drake steps a block; or the run without noise ends early.
         InconsistentStateError: The start is not on N*.
     """
+    if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
+        raise ModelError(
+            f"{loop.plant.get_name()} has no spread by noise: controls or measurements come late "
+            "or are lost at random, which has no slope; run it with several seeds instead"
+        )
     begun = 0.0 if config is None else config.start_time
     request = RolloutRequest.of(loop, np.append(begun, np.ravel(times)), config, None, None)
     program, compiled = request.program, request.program.compiled
@@ -147,6 +161,10 @@ class _Samples:
         self._functions, self._settings, self._problem = functions, settings, problem
         self._state, self._held, self._index = problem.state, problem.held, 0
         self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
+        self._deviations = np.zeros(problem.noise.shape[1])
+        for source, part in functions.program.compiled.noise:
+            mean, deviation = _MOMENTS[distribution_of(source)]
+            self._quiet[:, part], self._deviations[part] = mean, deviation
         size = problem.state.size + problem.held.size
         self._spread = np.zeros((size, size))
 
@@ -191,7 +209,7 @@ class _Samples:
             held=held,
             events=self._problem.events[part],
             due=self._problem.due[part],
-            noise=self._quiet[part] if noise is None else noise.reshape(part.stop - part.start, -1),
+            noise=self._quiet[part] if noise is None else self._quiet[part] + noise,
         )
         done = run(self._functions, self._settings, problem)
         if done.ending != RunEnding.DONE:
@@ -215,14 +233,16 @@ class _Samples:
             after = self._run(1, change, noise)
             return np.concatenate([after.state, after.held, after.rows[-1]])
 
-        count = self._quiet[self._updates(self._index + 1)].size
+        drawn = self._quiet[self._updates(self._index + 1)].shape
+        count = int(np.prod(drawn))
         by_values = [
             (column(change, None) - column(-change, None)) / (2.0 * size)
             for change, size in zip(np.diag(sizes), sizes, strict=True)
         ]
         by_noise = [
             (column(None, noise) - column(None, -noise)) / (2.0 * _OF_NOISE)
-            for noise in _OF_NOISE * np.eye(count)
+            for one in np.eye(count)
+            for noise in [_OF_NOISE * self._deviations * one.reshape(drawn)]
         ]
         rows = values.size + self._functions.program.width
         return np.array(by_values).T, np.array(by_noise).T.reshape(rows, count)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import DrakeDaeError
 from drake_dae.running.rollout.noise import NoiseSpread, noise_spread
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.scenario.build import build_completed
@@ -70,10 +70,7 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
         scenario: The scenario, as `load_scenario` returns it.
 
     Returns:
-        The outlook; None for a scenario without noise, and for a task.
-
-    Raises:
-        ScenarioError: The scenario is not valid; the message names the key.
+        The outlook, or why there is none; None for a scenario without noise, and for a task.
     """
     encoders = scenario.encoders
     if encoders is not None:
@@ -86,14 +83,13 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     ]
     if scenario.task is not None or not any(np.any(np.asarray(each)) for each in deviations):
         return None
-    completed, loop = build_completed(replace(for_rollout(scenario)[0], encoders=encoders))
-    scenario = completed.scenario
-    start, parameters = start_values(loop, start_scenario(scenario, loop))
     until = min(scenario.duration, _LONGEST)
     times = scenario.integrator.start_time + until * np.arange(1, _LOOKED + 1) / _LOOKED
     try:
+        completed, loop = build_completed(replace(for_rollout(scenario)[0], encoders=encoders))
+        start, parameters = start_values(loop, start_scenario(completed.scenario, loop))
         whole = noise_spread(loop, start, parameters, times, config=scenario.integrator)
-    except (InconsistentStateError, ModelError) as error:
+    except DrakeDaeError as error:
         return NoiseOutlook({}, reason=str(error))
     late = slice(_LOOKED // 2, None)
     parts = (

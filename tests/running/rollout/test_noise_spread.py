@@ -16,12 +16,12 @@ from drake_dae.scenario.start import start_scenario
 PERIOD = 0.01
 
 
-def filtered(hold):
+def filtered(hold, distribution=RandomDistribution.kGaussian):
     """Noise, held for a time, through z+ = A z + B n, y = C z + D n: a diagram and its matrices."""
     A = np.array([[0.9, 0.2], [-0.1, 0.8]])
     B, C, D = np.array([[0.5], [1.0]]), np.array([[1.0, -0.5]]), np.array([[0.3]])
     builder = DiagramBuilder()
-    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, PERIOD))
+    noise = builder.AddSystem(RandomSource(distribution, 1, PERIOD))
     held = builder.AddSystem(ZeroOrderHold(hold, 1))
     system = builder.AddSystem(LinearSystem(A, B, C, D, PERIOD))
     builder.Connect(noise.get_output_port(), held.get_input_port())
@@ -59,6 +59,17 @@ def test_samples_of_several_rates_repeat_after_the_longest():
         found.rms("hold")
 
 
+def test_other_random_numbers_have_their_own_deviation():
+    """Numbers between 0 and 1 have the variance 1 / 12, and those of e^-n the variance 1."""
+    gaussian, uniform, exponential = (
+        noise_spread(diagram, *start_values(diagram, diagram.CreateDefaultContext()), [1.0])
+        for kind in ("kGaussian", "kUniform", "kExponential")
+        for diagram in [filtered(PERIOD, getattr(RandomDistribution, kind))[0]]
+    )
+    assert uniform.rms("y") == pytest.approx(gaussian.rms("y") / 12.0**0.5, rel=1e-8)
+    assert exponential.rms("y") == pytest.approx(gaussian.rms("y"), rel=1e-8)
+
+
 def test_what_has_no_spread_is_refused_in_a_sentence():
     diagram, _ = filtered(PERIOD * 1.0101)
     start, parameters = start_values(diagram, diagram.CreateDefaultContext())
@@ -66,6 +77,10 @@ def test_what_has_no_spread_is_refused_in_a_sentence():
         noise_spread(diagram, start, parameters, [5.0])
     loop = build_completed(load_scenario(find_scenario("wall_bounce")))[1]
     with pytest.raises(ModelError, match="changes at times that a run locates"):
+        noise_spread(loop, *start_values(loop, loop.diagram.CreateDefaultContext()), [1.0])
+    late = ["sampling={period: 0.001, delay: 0.001, jitter: 0.0002}"]
+    loop = build_completed(load_scenario(find_scenario("two_link_wall"), late))[1]
+    with pytest.raises(ModelError, match="late or are lost at random"):
         noise_spread(loop, *start_values(loop, loop.diagram.CreateDefaultContext()), [1.0])
 
 
