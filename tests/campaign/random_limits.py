@@ -9,19 +9,13 @@ if one ends otherwise. With `--out` each outcome is a line of that file when it 
 runs in the file are not run again.
 """
 
-import argparse
-import json
 import logging
 import random
 import re
 import sys
 import sysconfig
-import tempfile
-import time
 import warnings
-from collections import Counter
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -32,6 +26,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from campaign.judged_limits import BAD, confirmed, judged, judged_beside
+from campaign.seeds import run_seeds
 
 from drake_dae import load_scenario
 from drake_dae.dae.references import ConstantReference
@@ -356,34 +351,15 @@ def outcome(run: Run) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
     warnings.simplefilter("ignore")
     logging.getLogger("drake").setLevel(logging.ERROR)
-    seeds = range(options.seed, options.seed + options.count)
-    lines = options.out.read_text().splitlines() if options.out and options.out.exists() else []
-    ended = {seed: found for seed, found in map(json.loads, lines) if seed in seeds}
     among = robots()
-    with tempfile.TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
-        for seed in (seed for seed in seeds if seed not in ended):
-            began = time.perf_counter()
-            run = random_run(random.Random(seed), Path(folder), among)
-            found = outcome(run)
-            ended[seed] = found = f"{found} [{run.what}]"
-            if options.out:
-                with options.out.open("a") as file:
-                    print(json.dumps([seed, found]), file=file)
-            if found.startswith(BAD) or time.perf_counter() - began > 60.0:
-                print(f"{seed}: {found[:400]}, {time.perf_counter() - began:.0f} s", flush=True)
-    kinds = Counter(re.split(r"[:,]", found)[0] for found in ended.values())
-    for kind, count in kinds.most_common():
-        print(f"{count:6} {kind}")
-    bad = [seed for seed, found in sorted(ended.items()) if found.startswith(BAD)]
-    print(f"{len(ended):6} runs, {len(bad)} of them ended as none may: {bad}")
-    return int(bool(bad))
+
+    def ended(seed: int, folder: Path) -> str:
+        run = random_run(random.Random(seed), folder, among)
+        return f"{outcome(run)} [{run.what}]"
+
+    return run_seeds(__doc__, ended, BAD, lambda found: re.split(r"[:,]", found)[0])
 
 
 if __name__ == "__main__":

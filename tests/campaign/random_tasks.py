@@ -9,20 +9,18 @@ at the tool. Returns 1 if one does not. With `--out` each outcome is a line of t
 known, and the tasks in the file are not run again.
 """
 
-import argparse
-import json
 import random
 import re
 import sys
-import tempfile
-import time
 import warnings
-from collections import Counter
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from campaign.seeds import run_seeds
 
 from drake_dae import load_scenario
 from drake_dae.errors import DrakeDaeError
@@ -37,6 +35,7 @@ ABOVE = 1.1
 """The largest impulse beside the expected one: the distance is controlled, to a few percent."""
 DURATIONS = (6.0, 60.0)
 """In s; a task that has not ended in the first time is run for the second."""
+_NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 TEXT = """
 robot: {{file: package://drake_dae_models/two_link_arm.urdf}}
 constraints:
@@ -201,30 +200,12 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
     warnings.simplefilter("ignore")
-    seeds = range(options.seed, options.seed + options.count)
-    lines = options.out.read_text().splitlines() if options.out and options.out.exists() else []
-    ended = {seed: found for seed, found in map(json.loads, lines) if seed in seeds}
-    with tempfile.TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
-        for seed in (seed for seed in seeds if seed not in ended):
-            began = time.perf_counter()
-            ended[seed] = found = outcome(*random_task(random.Random(seed)), Path(folder))
-            if options.out:
-                with options.out.open("a") as file:
-                    print(json.dumps([seed, found]), file=file)
-            if found.startswith(BAD) or time.perf_counter() - began > 60.0:
-                print(f"{seed}: {found[:300]}, {time.perf_counter() - began:.0f} s", flush=True)
-    kinds = Counter(re.sub(r"[-+]?\d[\d.e+-]*", "#", found)[:100] for found in ended.values())
-    for kind, count in kinds.most_common():
-        print(f"{count:6} {kind}")
-    bad = [seed for seed, found in sorted(ended.items()) if found.startswith(BAD)]
-    print(f"{len(ended):6} tasks, {len(bad)} of them ended as none may: {bad}")
-    return int(bool(bad))
+
+    def ended(seed: int, folder: Path) -> str:
+        return outcome(*random_task(random.Random(seed)), folder)
+
+    return run_seeds(__doc__, ended, BAD, lambda found: _NUMBER.sub("#", found)[:100])
 
 
 if __name__ == "__main__":
