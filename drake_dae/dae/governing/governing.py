@@ -44,7 +44,8 @@ class Governing:
 
     where s' = 1 is the reference's own rate, which is not exceeded. A limit is met AHEAD of time: a
     change of s' by AHEAD s'' counts with its effect on r_ss s'^2, as far as the limits hold now.
-    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. Where
+    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. The
+    accelerations are those of the model: a robot whose v' is d more exceeds V by d / APPROACH. Where
     low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
     exceeded.
 

@@ -105,5 +105,10 @@ def timed(
             f"{', '.join(free)} has no effort limit: where no motion along the path is within the "
             "limits, the error stays as predicted and they are exceeded"
         )
-    governed = robot_motion_limits(model, **contacts) if is_governed else None
-    return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)
+    # Half of what the profile leaves of the speeds is for errors of the model: a joint whose
+    # acceleration is da more than the model's exceeds its limit by da / APPROACH.
+    speeds = (1.0 + settings.joint_speeds) / 2.0
+    governed = robot_motion_limits(model, joint_speeds=speeds, **contacts)
+    return Completed(scenario, tuple(notes)), TimedScenario(
+        reference, governed if is_governed else None
+    )

@@ -23,7 +23,9 @@ class TimeOptimal:
     Attributes:
         efforts: The fraction of the drives' effort limits that the motion may use; the rest is left
             for feedback.
-        joint_speeds: The fraction of the joints' velocity limits that the motion may use.
+        joint_speeds: The fraction of the joints' velocity limits that the motion may use. Half of
+            the rest is left for feedback; with the other half a governor keeps the limits where the
+            model's accelerations are not exact.
         joint_accelerations: The fraction of the joints' acceleration limits that the motion may
             use, if the robot's file has such limits.
         forces: Constraint force -> its least and its largest value in N or N m; null
