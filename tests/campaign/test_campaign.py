@@ -70,7 +70,8 @@ def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: in
 # path of 602 is looked up in a table.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed", [0, 2, 3, 4, 602, 674, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))]
+    "seed",
+    [0, 2, 3, 4, 602, 674, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))],
 )
 def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int, tmp_path: Path):
     run = random_limits.random_run(random.Random(seed), tmp_path, random_limits.CHEAP)
@@ -89,7 +90,7 @@ def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
 
 @pytest.mark.slow
 def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path):
-    """With points spread by length alone a cone was exceeded twice, with an excess of 2 % by 0.5 %."""
+    """With points spread by length alone a cone was exceeded twice."""
     run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
     found = random_limits.outcome(run)
     assert found.startswith("kept: cone"), found

@@ -156,6 +156,11 @@ class TrackingLaw:
         )
 
     @property
+    def damped_structure(self) -> Structure:
+        """The structure of the law's model with its `constraint_damping`; see `damped`."""
+        return self._model
+
+    @property
     def inputs(self) -> dict[str, ca.SX]:
         """Name -> symbol of each input of `function`."""
         return dict(self._inputs)
