@@ -184,12 +184,9 @@ class TrackingLaw:
         Returns:
             A function of what `function` takes; None where there is none.
         """
-        motion = (
-            self.structure.motion_for(self._ubar)
-            if self.damped_structure is self.structure
-            else None
-        )
-        if motion is None:
+        if self.damped_structure is not self.structure:
+            return None
+        if (motion := self.structure.motion_for(self._ubar)) is None:
             return None
         rate, force, pivot = motion
         outputs = {"rate": rate, "force": force}
