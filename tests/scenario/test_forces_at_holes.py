@@ -92,5 +92,5 @@ def test_the_forces_of_the_shipped_peg():
         insert.standing.aside, 1.05e-3 + comes_to_rest + tilted * phase.depth, rtol=1e-3
     )
     push = insert.mass * (64.0 * phase.lag + 16.0 * phase.speed)
-    assert push < insert.standing.force < 1.3 * push
+    assert push < insert.standing.force < 1.5 * push
     assert f"presses with {insert.standing.force:.3g} N at most" in "\n".join(needs.lines)

@@ -271,7 +271,7 @@ def _tool(
         names = [signal.name for signal in law.system.output_signals]
         distance = names.index(contact.residual_signals[0].name)
         stiff, damped = law.gains.matrix[:, 0::2], law.gains.matrix[:, 2 * distance + 1]
-    moved: FloatArray = np.linalg.solve(mass, jacobian.T)
+    moved = np.linalg.solve(mass, jacobian.T).astype(np.float64)
     return ToolAtHole(
         jacobian,
         moved,
