@@ -16,17 +16,11 @@ from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
 from drake_dae.running.rollout.events import distribution_of
 from drake_dae.running.rollout.problems import problems_of
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.run import Run, RunProblem, Settings
 from drake_dae.running.rollout.spread.recursion import after, of_signals, reached
+from drake_dae.running.rollout.spread.slopes import PeriodSlopes, undisturbed
 from drake_dae.running.rollout.spread.waves import RoundedPositions, Rounding
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
-from drake_dae.running.rollout.stepping.interpreted import run
-
-_CHANGE, _LEAST = 1e-6, 1e-2
-"""The change of a value for a difference, relative to its size, of which the least is 0.01."""
-
-_OF_NOISE = 1e-3
-"""The change of a random number for a difference, relative to its deviation."""
 
 _MOMENTS = {
     RandomDistribution.kUniform: (0.5, 12.0**-0.5),
@@ -204,14 +198,15 @@ class _Samples:
         index = max(round((time - self._begun) / self._period), 1) - 1
         since = index - self._index
         middles = self._index + 0.5 + np.arange(since + 1)
+        if self._rounded is None:
+            middles = middles[-1:]
         passed = []
         if since:
             done = self._run(np.array([self._index, *middles[:-1], index]))
             passed.append(done.rows[1:-1])
             self._state, self._held, self._index = done.state, done.held, index
-        of_state, of_noise = self._slopes()
-        size = self._state.size + self._held.size
-        (a, c), (b, d) = np.split(of_state, [size]), np.split(of_noise, [size])
+        period = self._problem_of(np.array([index, index + 1.0]))
+        a, b, c, d = PeriodSlopes(self._functions, self._settings, period, self._deviations).step()
         # Without these, differences of counters would count, which no noise reaches.
         reached_by_noise = reached(a, b)
         a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
@@ -227,64 +222,26 @@ class _Samples:
             np.sqrt(np.maximum(change, 0.0)),
         )
 
-    def _run(
-        self, times: FloatArray, change: FloatArray | None = None, noise: FloatArray | None = None
-    ) -> Run:
-        """Runs from here, with a change of state and held values, and with noise.
-
-        Args:
-            times: The times of its rows in periods, from this one to another.
-            change, noise: The changes; None for none.
-        """
-        state, held = self._state, self._held
+    def _problem_of(self, times: FloatArray) -> RunProblem:
+        """The run from here without noise, with rows at these times in periods."""
         part = self._updates(times[-1])
-        if change is not None:
-            state, held = state + change[: state.size], held + change[state.size :]
-        problem = replace(
+        return replace(
             self._problem,
             times=self._begun + self._period * times,
-            state=state,
-            held=held,
+            state=self._state,
+            held=self._held,
             events=self._problem.events[part],
             due=self._problem.due[part],
-            noise=self._quiet[part] if noise is None else self._quiet[part] + noise,
+            noise=self._quiet[part],
         )
-        done = run(self._functions, self._settings, problem)
-        if done.ending != RunEnding.DONE:
-            raise ModelError(
-                f"{self._functions.program.name} has no spread by noise: its run without noise "
-                f"ends at {done.time:.6g} s"
-            )
-        return done
+
+    def _run(self, times: FloatArray) -> Run:
+        return undisturbed(self._functions, self._settings, self._problem_of(times))
 
     def _updates(self, last: float) -> slice:
         """The updates from here to a period, which may be at times that differ by round-off."""
         ends = self._begun + self._period * (np.array([self._index, last]) - SAME)
         return slice(*np.searchsorted(self._problem.events, ends).tolist())
-
-    def _slopes(self) -> tuple[FloatArray, FloatArray]:
-        """The slopes of states, held values and signals after a period, by both and by noise."""
-        values = np.concatenate([self._state, self._held])
-        sizes = _CHANGE * np.maximum(np.abs(values), _LEAST)
-        period = np.array([self._index, self._index + 1.0])
-
-        def column(change: FloatArray | None, noise: FloatArray | None) -> FloatArray:
-            done = self._run(period, change, noise)
-            return np.concatenate([done.state, done.held, done.rows[-1]])
-
-        drawn = self._quiet[self._updates(self._index + 1)].shape
-        count = int(np.prod(drawn))
-        by_values = [
-            (column(change, None) - column(-change, None)) / (2.0 * size)
-            for change, size in zip(np.diag(sizes), sizes, strict=True)
-        ]
-        by_noise = [
-            (column(None, noise) - column(None, -noise)) / (2.0 * _OF_NOISE)
-            for one in np.eye(count)
-            for noise in [_OF_NOISE * self._deviations * one.reshape(drawn)]
-        ]
-        rows = values.size + self._functions.program.width
-        return np.array(by_values).T, np.array(by_noise).T.reshape(rows, count)
 
 
 def _divides(part: float, period: float) -> bool:
