@@ -119,10 +119,10 @@ class TaskNeeds:
             room = f"{needs.room:.3g} left" if isfinite(needs.room) else ""
             numbers = [digits(number) for number in (needs.begin, needs.end, needs.force)]
             texts = [f"{needs.margin:.2g}", drive, needs.drive, room, needs.joint]
-            if faces and (face := needs.face) is None:
+            if needs.face is not None:
+                texts += [f"{needs.face.eccentricity:.2f}", f"{needs.face.tips:.2g}"]
+            elif faces:
                 texts += ["", ""]
-            elif face is not None:
-                texts += [f"{face.eccentricity:.2f}", f"{face.tips:.2g}"]
             rows.append([needs.name, *numbers, *texts])
         head += ["eccentricity", "tips at [N]"] if faces else []
         return Table(head, rows)
