@@ -71,12 +71,14 @@ def sensed_contact(
 
 
 def predicted(best: AdvisedGains) -> str:
-    """The predicted errors of gains, as a sentence."""
+    """The errors from which gains were chosen, as sentences."""
     by_noise = f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N"
     return (
-        f"Predicted rms errors: {1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N "
-        f"if an unknown force of {MODEL_ERROR:g} N appears every {EVERY:g} s; {by_noise} of it by "
-        f"noise. The controls change by {best.roughness:.2g} N m from sample to sample"
+        "These gains are the best for one direction alone: "
+        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms "
+        f"if an unknown force of {MODEL_ERROR:g} N appears every {EVERY:g} s, {by_noise} of it by "
+        f"noise, and a change of the controls of {best.roughness:.2g} N m from sample to sample. "
+        "What noise does in the whole loop is predicted by `drake-dae analyze`"
     )
 
 

@@ -25,9 +25,12 @@ def outlook(*settings, name="two_link_wall"):
     return noise_outlook(load_scenario(find_scenario(name), settings))
 
 
-def test_without_noise_and_for_tasks_nothing_is_predicted():
+def test_without_noise_nothing_is_predicted_and_for_tasks_it_says_why():
     assert outlook() is None
-    assert outlook("encoders={position_noise: 1.0e-5}", name="wall_polish") is None
+    assert outlook(name="wall_polish") is None
+    told = outlook("encoders={position_noise: 1.0e-5}", name="wall_polish")
+    assert "a task changes its law" in str(told)
+    assert "several seeds" in told.to_dict()["reason"]
 
 
 @pytest.mark.slow
