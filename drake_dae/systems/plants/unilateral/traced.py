@@ -64,7 +64,7 @@ class TracedContacts:
         self._control = ca.SX.sym("control", dae.num_controls)
         size = dae.parameter_symbol.numel()
         # The coefficients of restitution come last; no motion depends on them.
-        self._all = ca.SX.sym("parameters", size + len(contacts.names))
+        self._all = ca.SX.sym("parameters", size + len(contacts.shown))
         self._parameters = self._all[:size]
         self._all_modes = [(closed, self._mode(closed)) for closed in every]
 
@@ -222,6 +222,6 @@ def _project(
     parameters: FloatArray,
     held: FloatArray,
 ) -> FloatArray:
-    of_system = parameters[: parameters.size - len(contacts.names)]
+    of_system = parameters[: parameters.size - len(contacts.shown)]
     closed = closed_of(held[: len(contacts.every)])
     return modes(closed, state).structure.manifold.project(state, of_system)
