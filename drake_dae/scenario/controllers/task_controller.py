@@ -37,7 +37,8 @@ def check_task(scenario: Scenario) -> None:
         if ending and entering and not scenario.plant.has_sides:
             text = (
                 f"{entering[0]} enters a hole, and the ideal contact of '{ending[0]}' has a face "
-                "that ends, and no sides; take !MultibodyPlant or !CompliantContact"
+                "that ends, and no sides without a peg; give it, as pegs: [{constraint: "
+                f"{ending[0]}, radius: 0.00495, length: 0.02}}], or take !MultibodyPlant"
             )
             problems.append(("plant", text))
     if scenario.start.errors:

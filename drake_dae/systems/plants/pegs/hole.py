@@ -152,6 +152,7 @@ def peg_in_hole(contact: Constraint, peg: Peg, model: RobotModel) -> PegInHole:
         "side": inside,
         "rim": inside,
     }
+    on_tip = {contact.name, f"{contact.name}.chamfer", f"{contact.name}.side"}
     openings = [
         _opening(
             f"{contact.name}.{name}",
@@ -168,7 +169,13 @@ def peg_in_hole(contact: Constraint, peg: Peg, model: RobotModel) -> PegInHole:
         for name, gap, direction, point, arm in touches
         if w or name != "chamfer"
     ]
-    return PegInHole(face, tuple(openings))
+    # The tip touches one of three faces, and the rim is touched while it is below the rim.
+    outside = on_tip - {f"{contact.name}.side"}
+    made = [
+        replace(each, excludes=outside if each.name not in on_tip else on_tip - {each.name})
+        for each in openings
+    ]
+    return PegInHole(replace(face, excludes=on_tip - {contact.name}), tuple(made))
 
 
 def _radial(u: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -29,6 +29,7 @@ class Opening:
         gap: phi in m, of a contact that only the plant has.
         push: The generalized force of a unit normal force with its friction, shape (nv, 1),
             likewise.
+        excludes: The names of the contacts that cannot be closed together with it.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Opening:
     friction: str | None
     gap: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     push: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    excludes: frozenset[str] = frozenset()
 
 
 def opening_of(constraint: Constraint, model: RobotModel) -> Opening:

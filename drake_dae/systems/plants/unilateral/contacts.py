@@ -151,6 +151,7 @@ class UnilateralContacts:
             raise ModelError(f"{model.name}: a robot with latches has no pegs in ideal contact")
         openings, self.restitution_of = openings_of(model, self.shown, pegs)
         self.names = tuple(openings)
+        self._excludes = [opening.excludes for opening in openings.values()]
         self.of_model = model.dae
         self.dae = dae = with_openings(model, list(openings.values())[len(self.shown) :])
         self.touches = [_touch_rows(*parts[name]) for name in self.shown]
@@ -223,6 +224,12 @@ class UnilateralContacts:
         return FrictionalContact(
             touch.normal, self.along[place], float(parameters[mu]), restitution
         )
+
+    def may_close(self, closed: Sequence[bool]) -> bool:
+        """Whether contacts can be closed together, one flag for each, by the shapes of bodies."""
+        shut = {name for name, flag in zip(self.names, closed, strict=False) if flag}
+        pairs = zip(self.names, self._excludes, strict=True)
+        return not any(name in shut and shut & others for name, others in pairs)
 
     def rows(self) -> list[Indices]:
         """The rows of each contact and latch."""

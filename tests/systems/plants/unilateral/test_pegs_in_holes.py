@@ -163,11 +163,11 @@ def test_around_the_side_of_its_hole_a_peg_needs_the_centripetal_force():
 
 
 def test_a_hole_that_moves_holds_its_peg_back():
-    """The plate is at A sin(w t); the peg begins with its speed, and presses with M A w^2 sin."""
+    """The plate is at A sin(w t + 1/2); the peg begins with its speed, and needs M A w^2 sin."""
     plant = plant_of(upright_peg(exogenous=["wall.position"]))
     builder = DiagramBuilder()
     builder.AddSystem(plant)
-    moved = [SinusoidReference(0.0, 0.01, 5.0), ConstantReference([0.0, 0.0])]
+    moved = [SinusoidReference(0.0, 0.01, 5.0, 0.5), ConstantReference([0.0, 0.0])]
     table = builder.AddSystem(ReferenceGenerator(moved, plant.exogenous_layout.degrees))
     builder.Connect(table.get_output_port(), plant.GetInputPort("exogenous"))
     simulator = Simulator(builder.Build())
@@ -175,10 +175,11 @@ def test_a_hole_that_moves_holds_its_peg_back():
     simulator.get_mutable_integrator().set_fixed_step_mode(True)
     root = simulator.get_mutable_context()
     context = plant.GetMyMutableContextFromRoot(root)
-    plant.set_state(context, [CLEARANCE, 0.0, -5e-3, 0.05, 0.0, 0.0])
+    at, speed = 0.01 * np.sin(0.5), 0.05 * np.cos(0.5)
+    plant.set_state(context, [CLEARANCE + at, 0.0, -5e-3, speed, 0.0, 0.0])
     root.SetAccuracy(1e-9)
     simulator.AdvanceTo(0.2)
-    moved = 0.01 * np.sin(5.0 * 0.2)
+    moved = 0.01 * np.sin(5.0 * 0.2 + 0.5)
     # The steps of 0.01 s are off by (w h)^6 = 2e-8 of the motion, and it is projected.
     assert_allclose(plant.state(context)[0], CLEARANCE + moved, atol=1e-11)
     assert_allclose(value(plant, context, "hole_force").sum(), MASS * 25.0 * moved, rtol=1e-9)
