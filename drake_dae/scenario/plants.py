@@ -70,11 +70,12 @@ class ScenarioPlant(ABC):
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
     6. With `has_sides` its contacts include the sides of a body that ends, as those of a hole in a
-       `Plate`, and not only its face.
+       `Plate`, and not only its face. `pegs` are the pegs that enter them.
     """
 
     carries: ClassVar[bool] = False
     adjusts: ClassVar[bool] = True
+    pegs: Sequence[Peg] = ()
     in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
