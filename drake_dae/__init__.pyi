@@ -128,10 +128,10 @@ from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.gradient.gradient import RolloutGradient as RolloutGradient
 from .running.rollout.gradient.gradient import rollout_gradient as rollout_gradient
 from .running.rollout.gradient.gradient import rollout_tangent as rollout_tangent
-from .running.rollout.noise import NoiseSpread as NoiseSpread
-from .running.rollout.noise import noise_spread as noise_spread
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
+from .running.rollout.spread.noise import NoiseSpread as NoiseSpread
+from .running.rollout.spread.noise import noise_spread as noise_spread
 from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario

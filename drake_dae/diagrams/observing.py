@@ -7,6 +7,7 @@ from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.observing.observer import DisturbanceObserver
 from drake_dae.systems.observing.observer_rates import Observing
@@ -25,7 +26,7 @@ def add_observer(
     sampling: Sampling | None,
     control: OutputPort,
     reference: OutputPort,
-    limits: ControlLimits | None,
+    limits: ControlLimits | FeasibleControl | None,
     encoders: Encoders | None,
 ) -> Observer:
     """Adds the observer and connects it to the controller's exogenous port.
@@ -43,7 +44,7 @@ def add_observer(
         control: The control at the plant. If the controller has `observed` ports, they replace
             state and control.
         reference: R(t).
-        limits: The limits of the drives.
+        limits: What keeps the limits of the drives; None if nothing does.
         encoders: What measures the state; None if it is exact.
 
     Raises:

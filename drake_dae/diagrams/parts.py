@@ -144,21 +144,21 @@ def add_feasible(
     controller: Controller,
     governed: MotionLimits,
     control_limits: ArrayLike,
-    state: OutputPort,
 ) -> FeasibleControl:
     """Adds limits of the control under which errors deviate least from their prediction.
+
+    Its ports for the state and for exogenous signals are left open.
 
     Args:
         builder: The builder of the diagram, with the controller in it.
         controller: The controller.
         governed: The limits of joints and forces.
         control_limits: The largest |u|, shape (p,).
-        state: The state that the controller gets.
 
     Raises:
         WiringError: They do not fit.
     """
-    structure, names = controller.law.structure, controller.law.system.control_signals
+    structure, names = controller.law.damped_structure, controller.law.system.control_signals
     sizes = np.asarray(control_limits, dtype=float).reshape(-1).tolist()
     if len(sizes) != len(names):
         raise WiringError(
@@ -170,7 +170,6 @@ def add_feasible(
     except ModelError as error:
         raise WiringError(str(error)) from None
     builder.Connect(controller.GetOutputPort("control"), block.GetInputPort("control"))
-    builder.Connect(state, block.GetInputPort("estimated_state"))
     return block
 
 

@@ -15,6 +15,9 @@ from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 from drake_dae.systems.sensing.packets import MeasurementLink
 
+ENCODER_NOISE = "encoder_noise"
+"""The name of the source of the noise of encoders."""
+
 PACKET_NOISE = "packet_noise"
 """The name of the source of random numbers of late and lost measurements."""
 
@@ -105,7 +108,7 @@ def add_encoders(
     sensor = make_sensor(plant, encoders, period)
     builder.AddSystem(sensor)
     builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
-    return MeasuredState(sensor, add_noise(builder, sensor, period, "encoder_noise"))
+    return MeasuredState(sensor, add_noise(builder, sensor, period, ENCODER_NOISE))
 
 
 @dataclass(frozen=True, eq=False)

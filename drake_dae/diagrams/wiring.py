@@ -161,8 +161,6 @@ def wire_loop(
     observing = parts.observer if goal is not None else None
     if observing is None:
         builder.Connect(state, controller.GetInputPort("estimated_state"))
-    if reference is not None and reference.HasInputPort("estimated_state"):
-        builder.Connect(state, reference.GetInputPort("estimated_state"))
 
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
@@ -170,7 +168,7 @@ def wire_loop(
     control, control_limits = controller.GetOutputPort("control"), parts.control_limits
     feasible = None
     if parts.governed is not None and control_limits is not None:
-        feasible = add_feasible(builder, controller, parts.governed, control_limits, state)
+        feasible = add_feasible(builder, controller, parts.governed, control_limits)
         control, control_limits = feasible.GetOutputPort("control"), None
     control, link, limits = add_drives(builder, plant, control, sampling, control_limits)
     if controller.HasOutputPort("feedback"):
@@ -191,11 +189,21 @@ def wire_loop(
     # updated while a contact is open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if observing is not None and goal is not None:
-        ports = state, sampling, control, goal, limits
+        # What limits the control reads the state, which a state_rate estimates.
+        stops = limits or (feasible if observing.state_rate is None else None)
+        ports = state, sampling, control, goal, stops
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
         if packets is not None:
             builder.Connect(packets.missed, observer.GetInputPort("missed"))
+        if observing.state_rate is not None:
+            state = observer.GetOutputPort("estimated_state")
         holds.append(observer.GetOutputPort("hold"))
+    for block in (reference, feasible):
+        if block is not None and block.HasInputPort("estimated_state"):
+            builder.Connect(state, block.GetInputPort("estimated_state"))
+            if observer is not None:
+                estimates = observer.GetOutputPort("exogenous")
+                builder.Connect(estimates, block.GetInputPort("exogenous"))
     for block in (limits if observer is None else None, feasible):
         if block is not None:
             holds.append(block.GetOutputPort("is_limited"))
@@ -222,6 +230,9 @@ def wire_loop(
     if feasible is not None:
         named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
         named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
+        if observer is not None:
+            estimates = controller.law.system.exogenous.signals
+            named["compensated"] = (observer.GetOutputPort("exogenous"), estimates)
     if reference is not None:
         named |= further_signals(reference)
     sources = {"reference": reference, "exogenous": moving}

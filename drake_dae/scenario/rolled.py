@@ -13,7 +13,12 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import LINK_NOISE, link_seed
-from drake_dae.diagrams.state_feedback import PACKET_NOISE, encoder_seed, packet_seed
+from drake_dae.diagrams.state_feedback import (
+    ENCODER_NOISE,
+    PACKET_NOISE,
+    encoder_seed,
+    packet_seed,
+)
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
@@ -219,7 +224,7 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
     if scenario.force_feedback.is_measured:
         seeds["force_noise"] = scenario.force_feedback.seed
     if scenario.encoders is not None:
-        seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+        seeds[ENCODER_NOISE] = encoder_seed(scenario.encoders.seed)
     if scenario.sampling is not None:
         seeds[LINK_NOISE] = link_seed(scenario.sampling.seed)
         seeds[PACKET_NOISE] = packet_seed(scenario.sampling.seed)

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
@@ -130,13 +131,21 @@ def departure_remarks(record: Record, feasible: FeasibleControl | None) -> list[
         if size > 0.0
     )
     states, commanded = record["state"][is_off], record["control"] + record["excess"]
-    beyond = feasible.beyond(states, commanded[is_off])
+    beyond = feasible.beyond(states, commanded[is_off], _compensated(record, is_off))
     causes = ", ".join(name for name, over in beyond.items() if over.max() > 0.0)
     return [
         f"Between {times[0]:.4g} and {times[-1]:.4g} s, for {share:.2g} s in all, no motion along "
         f"the path was within the limits{f' ({causes})' if causes else ''}: the highest "
         f"derivatives of the errors left their prediction, of {amounts}."
     ]
+
+
+def _compensated(record: Record, rows: Booleans | None = None) -> FloatArray | None:
+    """The recorded estimates of an observer, at some rows; None without an observer."""
+    if "compensated" not in record:
+        return None
+    values = record["compensated"]
+    return values if rows is None else values[rows]
 
 
 def rate_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
@@ -148,7 +157,7 @@ def rate_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
     """
     if feasible is None:
         return []
-    beyond = feasible.beyond(record["state"], record["control"])
+    beyond = feasible.beyond(record["state"], record["control"], _compensated(record))
     over = {name: share for name, share in beyond.items() if name.endswith("'")}
     over = {name: share for name, share in over.items() if share.max(initial=0.0) > EXCEEDED}
     if not over:

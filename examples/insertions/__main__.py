@@ -1,8 +1,8 @@
 """Inserts a peg into holes that are 2 mm and 1 degree off in random directions.
 
-First it predicts the largest contact force. Then it prints for each run how its task ended, when,
-and the largest contact force, and last all runs together. The exit code is 1 if a peg is not
-inserted, or a force is above the predicted one.
+First it predicts the largest contact force, as `drake-dae analyze peg_in_hole` does. Then it prints
+for each run how its task ended, when, and the largest contact force, and last all runs together.
+The exit code is 1 if a peg is not inserted, or a force is above the predicted one.
 
 With --rollout the same contact is traced and compiled once: 2 s in place of 8 for a run.
 
@@ -16,11 +16,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 OFF, TILT = 0.002, math.radians(1.0)
 """How far the hole is from its place, in m, and its axis from its direction, in rad."""
@@ -101,59 +101,11 @@ def insert_rolled(
 
 
 def predicted(scenario: str, changes: Sequence[str]) -> dict[str, float]:
-    """The largest force in N for each phase that may hit: F + v sqrt(K m) + v K t.
-
-    F is the force of a Press before, and v the speed. A touch hits with all balls of the end of the
-    peg, K = count k, in a hole with two of them. The mass m at the tool is 1 / (P M^-1 P^T) along
-    the motion, and in the time t until the law reacts the tool moves on by v t. An Insert that lags
-    also pushes, at most by the first entry of W^-1 (K_1 e + K_2 e') of `impedance_gains`, with
-    e = lag and e' = v of the distance, for all outputs that the hole holds: see `pushed`.
-    """
-    chosen = dd.load_scenario(scenario, changes)
-    loop, context = dd.build_scenario(chosen)
-    model, plant = loop.plant.robot("masses"), chosen.plant
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    masses = 1.0 / np.diag(mobility(model, state, 2))
-    late, peaks, force = chosen.sampling.period + chosen.sampling.delay, {}, 0.0
-    for phase in chosen.task.phases:
-        push = 0.0
-        if isinstance(phase, dd.Press):
-            force = phase.force
-            continue
-        if isinstance(phase, dd.Approach):
-            count, m, speed, pressed = plant.pegs[0].balls, masses[0], phase.speed, 0.5
-        elif isinstance(phase, dd.Search):
-            count, m, speed, pressed = 2, masses[1:].max(), phase.speed, force
-        elif isinstance(phase, dd.Insert):
-            count, m, speed, pressed = 2, masses[0], phase.speed, 0.0
-            push = pushed(loop, phase)
-        else:
-            continue
-        stiffness = count * plant.stiffness
-        hit = speed * (math.sqrt(stiffness * m) + stiffness * late)
-        peaks[phase.name] = max(pressed + hit, push)
-    return peaks
-
-
-def mobility(model: dd.RobotModel, state: np.ndarray, count: int) -> np.ndarray:
-    """P M^-1 P^T of the distance and of the first outputs, for a state."""
-    size = model.links.q.numel()
-    moves = ca.jacobian(ca.vertcat(model.dae.k, model.dae.l[:count]), model.dae.state)[:, :size]
-    mass = model.dae.mass_matrix[size : 2 * size, size : 2 * size]
-    function = model.dae.trace("moves", {"value": ca.mtimes(moves, ca.solve(mass, moves.T))})
-    return function(state, model.dae.parameter_values)[0].reshape(1 + count, 1 + count)
-
-
-def pushed(loop: dd.ClosedLoop, phase: dd.Insert) -> float:
-    """The push along the hole, in N, of an Insert that lags as far as it may."""
-    law, held = loop.controller.free_law, 4  # Of the outputs, two places and two tilts.
-    at_hole = loop.controller.law.structure.states[0]
-    inertia = np.linalg.inv(mobility(loop.plant.robot("masses"), at_hole, held))
-    names = [signal.name for signal in law.system.output_signals]
-    distance = names.index("wall.distance")
-    rows, first = [distance, *range(held)], law.gains.layout.starts[distance]
-    gains = law.gains.matrix[rows, first : first + 2]
-    return float(inertia[0] @ gains @ [phase.lag, phase.speed])
+    """The largest force in N for each phase that touches, as `drake-dae analyze` prints it."""
+    needs = find_feasibility(dd.load_scenario(scenario, changes)).task
+    assert needs is not None
+    peaks = {touch.phase: touch.peak for touch in needs.touches if touch.peak is not None}
+    return peaks | {hole.phase: hole.peak for hole in needs.holes}
 
 
 def main(arguments: list[str] | None = None) -> int:

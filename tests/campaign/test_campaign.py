@@ -1,7 +1,6 @@
 """A small part of the campaign: a mistake ends as a message, a robot as numbers that are right."""
 
 import random
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +9,6 @@ import pytest
 from campaign import bad_files, bad_inputs, drops, random_limits, random_robots, random_tasks
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
-
-from drake_dae.dae.timing.profile import EXCESS
 
 FEW, MANY = range(40), range(40, 110)
 FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 48)
@@ -68,11 +65,13 @@ def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: in
     assert not found.startswith(random_tasks.BAD), found
 
 
-# 0 and 3 keep their limits, 2 is refused, and in 4 the plant is heavier than the law's model. The
+# 0 and 3 keep their limits, 2 is refused, and in 4 and 674 the plant is heavier than the law's
+# model: 674 exceeded a speed by 6 % while the governor kept the joints at its limit exactly. The
 # path of 602 is looked up in a table.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed", [0, 2, 3, 4, 602, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))]
+    "seed",
+    [0, 2, 3, 4, 602, 674, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))],
 )
 def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int, tmp_path: Path):
     run = random_limits.random_run(random.Random(seed), tmp_path, random_limits.CHEAP)
@@ -91,11 +90,10 @@ def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
 
 @pytest.mark.slow
 def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path):
-    """Within the accepted excess; with points spread by length alone a cone was exceeded twice."""
+    """With points spread by length alone a cone was exceeded twice."""
     run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
-    share = re.search(r": cone (\S+) of its limit", random_limits.outcome(run))
-    assert share is not None
-    assert float(share[1]) < 1.0 + EXCESS
+    found = random_limits.outcome(run)
+    assert found.startswith("kept: cone"), found
 
 
 @pytest.mark.slow

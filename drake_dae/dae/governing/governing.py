@@ -44,12 +44,15 @@ class Governing:
 
     where s' = 1 is the reference's own rate, which is not exceeded. A limit is met AHEAD of time: a
     change of s' by AHEAD s'' counts with its effect on r_ss s'^2, as far as the limits hold now.
-    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. Where
-    low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
+    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. The
+    accelerations are those of the model: a robot whose v' is d more exceeds V by d / APPROACH.
+    Where low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
     exceeded.
 
+    Exogenous signals of the law, such as the estimates of an observer, count as constant.
+
     Args:
-        law: The law, without exogenous signals.
+        law: The law, without derivatives of exogenous signals.
         references: The references, in the order of the outputs; expressions of time.
         limits: The limits.
 
@@ -59,8 +62,8 @@ class Governing:
             limits.
 
     Raises:
-        ReferenceSignalError: The law has outputs of other degrees than 0 and 2 or exogenous
-            signals, or a reference is no expression of time.
+        ReferenceSignalError: The law has outputs of other degrees than 0 and 2, or needs
+            derivatives of exogenous signals, or a reference is no expression of time.
         ModelError: A limit names no signal of the system.
     """
 
@@ -72,10 +75,11 @@ class Governing:
     def function(self) -> TracedFunction:
         """The governed reference as a function; see the class."""
         law, layout = self.law, self.law.layout
-        if any(d not in (0, 2) for d in law.degrees) or law.exogenous_degrees or law.deflection:
+        moves = any(law.exogenous_degrees)
+        if any(d not in (0, 2) for d in law.degrees) or moves or law.deflection:
             raise ReferenceSignalError(
-                "the time of references is governed for rigid joints and laws without exogenous "
-                "signals, observer or contact_stiffness"
+                "the time of references is governed for rigid joints and laws without "
+                "contact_stiffness and without derivatives of exogenous signals"
             )
         path = ca.SX.sym("path", 2)
         s, rate = path[0], path[1]
@@ -126,7 +130,7 @@ class Governing:
             now: d ubar / d s'', shape (p, 1).
             ahead: d ubar / d s'' with the effect AHEAD of time, shape (p, 1).
         """
-        structure = self.law.structure
+        structure = self.law.damped_structure
         limited = LimitedSignals(structure, self.limits)
         # By a symbol: to solve with what is looked up in a table, as a long path, crashes CasADi.
         desired = ca.SX.sym("commanded", commanded.numel())

@@ -24,6 +24,7 @@ class LimitedSignals:
     Attributes:
         signals: Names and units, k of them: controls, rates, forces, cones.
         low, high: The lowest and highest values, shape (k,), infinite without a limit.
+        are_forces: Which of them are constraint forces or friction cones, shape (k,).
         states: The indices of the limited states.
         state_signals: Names and units of the limited states.
         state_low, state_high: The lowest and highest values of the limited states.
@@ -56,6 +57,8 @@ class LimitedSignals:
         self._rows: list[int] = np.flatnonzero(np.isfinite(low) | np.isfinite(high)).tolist()
         self.signals = tuple(signals[i] for i in self._rows)
         self.low, self.high = low[self._rows], high[self._rows]
+        before = len(system.control_signals) + len(rates)
+        self.are_forces = np.array(self._rows, dtype=int) >= before
         low, high = limits.bounds("states", system.state_signals)
         self.states: list[int] = np.flatnonzero(np.isfinite(low) | np.isfinite(high)).tolist()
         self.state_signals = tuple(system.state_signals[i] for i in self.states)

@@ -20,7 +20,7 @@ from drake_dae.dae.timing.coarser import coarser
 from drake_dae.dae.timing.curve import Curve, Piece
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.timing.reachable import FastestMotion, LinearLimits, fastest_motion
-from drake_dae.dae.timing.rows import LimitRow, LimitRows, checked_pause, rows_along
+from drake_dae.dae.timing.rows import EXCESS, LimitRow, LimitRows, checked_pause, rows_along
 from drake_dae.dae.timing.smoothing import smoothed
 from drake_dae.dae.timing.time_table import at_rest_outside, stacked, time_table
 from drake_dae.dae.timing.tool_limits import tool_limits
@@ -36,10 +36,6 @@ SETTLED = 1e-7
 
 LOWERINGS = 3
 """The largest number of times that limits are lowered where the motion exceeds them."""
-
-EXCESS = 0.02
-"""The accepted excess over a limit at a few points, as a fraction of it: less than the part of the
-limits that is reserved for the feedback."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,12 +261,14 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
         fastest, before = _settled(rows, piece, largest, factor, before)
         b, a, times = smoothed(piece.distances, fastest.b, fastest.a)
         lines = rows.lines(b)
-        excess = np.max(lines.alpha * a[:, None] + lines.beta * b[:, None], axis=1, initial=0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            excess = np.maximum(excess, np.where(largest > 0.0, b / largest, 0.0))
-        if excess.max() <= 1.0 + EXCESS:
+            fast = np.where(largest > 0.0, b / largest, 0.0)
+        used = np.column_stack([lines.alpha * a[:, None] + lines.beta * b[:, None], fast])
+        accepted = np.append(rows.accepted, EXCESS)
+        if (used <= 1.0 + accepted).all():
             break
-        wide = np.pad(np.maximum(excess / (1.0 + EXCESS / 2.0), 1.0), 1, mode="edge")
+        over = np.max(used / (1.0 + accepted / 2.0), axis=1)
+        wide = np.pad(np.maximum(over, 1.0), 1, mode="edge")
         factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
     limiting = np.where(fastest.active >= 0, fastest.active, which[1:])
     return ProfilePiece(piece, times, b, a, fastest.highest, limiting)

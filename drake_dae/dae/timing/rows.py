@@ -23,6 +23,13 @@ TANGENT = 0.9
 """The largest part of friction that grows with the speed, as a share of the room in slow motion,
 for which its tangent is used: the tangent takes half of it where nothing moves."""
 
+EXCESS = 0.02
+"""The accepted excess over a limit of a drive or a path at a few points, as a fraction of it: less
+than the part of the limits that is reserved for the feedback."""
+
+EXCESS_OF_FORCE = 5e-4
+"""The same for contact forces and friction cones, of which nothing is reserved."""
+
 CHECKED = 20
 """Every n-th point is tested, with this n."""
 
@@ -128,6 +135,15 @@ class LimitRows:
         room = np.where(grown > 0.0, limited.high - still, still - limited.low)
         share = np.where(np.abs(grown) < room * TANGENT, 0.5, 1.0)
         return by_a, self.by_b + share * grown / speed[:, None] ** 2, still + (1.0 - share) * grown
+
+    @property
+    def accepted(self) -> FloatArray:
+        """The accepted excess over each of the lines, shape (k,)."""
+        limited = self.along.limited
+        are_forces = [limited.are_forces[np.isfinite(b)] for b in (limited.high, limited.low)]
+        other = sum(tool.of_a.shape[1] for tool in self.tools) + 1
+        columns = np.concatenate([*are_forces, np.zeros(other, dtype=bool)])
+        return np.where(columns, EXCESS_OF_FORCE, EXCESS)
 
     def largest(self, rate: float) -> tuple[FloatArray, Indices]:
         """Returns the largest b at each point, and its cause as an index into `names`.

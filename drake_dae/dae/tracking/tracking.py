@@ -56,6 +56,7 @@ class TrackingLaw:
             measured forces; see `IntegralAction`. They have one more pole.
 
     Attributes:
+        damped_structure: The structure with the `constraint_damping`; see `damped`.
         layout: The layout of reference vectors and chains.
         reference_signals: Names and units of R.
         function: The law as (state, reference, measured_force, parameters) -> control and
@@ -88,9 +89,9 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
-        self._model = self.structure
+        self.damped_structure = self.structure
         if constraint_damping is not None:
-            self._model = damped(self.structure, constraint_damping)
+            self.damped_structure = damped(self.structure, constraint_damping)
         self.system = system
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
@@ -115,7 +116,7 @@ class TrackingLaw:
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
-        structure, layout, measured = self._model, self.layout, self.measured_force
+        structure, layout, measured = self.damped_structure, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols only for nonzero entries of K: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
@@ -183,8 +184,9 @@ class TrackingLaw:
         Returns:
             A function of what `function` takes; None where there is none.
         """
-        motion = self.structure.motion_for(self._ubar) if self._model is self.structure else None
-        if motion is None:
+        if self.damped_structure is not self.structure:
+            return None
+        if (motion := self.structure.motion_for(self._ubar)) is None:
             return None
         rate, force, pivot = motion
         outputs = {"rate": rate, "force": force}
@@ -194,7 +196,7 @@ class TrackingLaw:
     def _trace_error_coordinates(self) -> TracedFunction:
         """The error coordinates as a function of state and reference: the initial value of (30)."""
         reference = ca.SX.sym("R", self.layout.reference_size)
-        chain = self._model.chain - reference[self.layout.chained.tolist(), :]
+        chain = self.damped_structure.chain - reference[self.layout.chained.tolist(), :]
         inputs = {"reference": reference, "integral": self.integral.symbol}
         outputs = {"coordinates": self.integral.coordinates(chain)}
         return self.system.trace("error coordinates", outputs, inputs, often=False)

@@ -248,6 +248,16 @@ class Constraint(ABC):
         """Whether its surface has edges or holes, which the law does not know."""
         return False
 
+    @property
+    def whole(self) -> Self:
+        """The same constraint with the surface that laws have, which does not end."""
+        return self
+
+    @property
+    def opening(self) -> tuple[float, float] | None:
+        """The radius and the chamfer of the hole in its surface in m; None without a hole."""
+        return None
+
     def edges(self, frames: Frames) -> ca.SX:
         """The distances of its point from the edges of its surface in m; see `Surface.edges`."""
         return ca.SX(0, 1)

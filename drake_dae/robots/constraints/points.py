@@ -1,7 +1,8 @@
 """Points on a surface, and points at a fixed distance."""
 
+from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -219,6 +220,16 @@ class PointOnSurface(Constraint):
     @property
     def ends(self) -> bool:
         return self.surface.ends
+
+    @property
+    def whole(self) -> Self:
+        changed = copy(self)
+        object.__setattr__(changed, "surface", self.surface.whole)
+        return changed
+
+    @property
+    def opening(self) -> tuple[float, float] | None:
+        return self.surface.opening
 
     def edges(self, frames: Frames) -> ca.SX:
         return self.surface.edges(self.offset(frames))

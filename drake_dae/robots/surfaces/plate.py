@@ -118,6 +118,14 @@ class Plate(Plane):
         inward = self.hole.radius - _length(x - center[0], y - center[1])
         return ca.fmax(box, _from_rim(inward, z, self.hole.chamfer))
 
+    @property
+    def whole(self) -> Plane:
+        return Plane(self.point, self.normal)
+
+    @property
+    def opening(self) -> Pair | None:
+        return None if self.hole is None else (self.hole.radius, self.hole.chamfer)
+
     def edges(self, offset: ca.SX) -> ca.SX:
         (x, y), (a, b) = ca.vertsplit(self.coordinates(offset)), self.half_widths
         sides = [a - x, a + x, b - y, b + y]

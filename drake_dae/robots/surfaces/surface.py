@@ -159,6 +159,16 @@ class Surface(ABC):
         """
         return self.distance(offset)
 
+    @property
+    def whole(self) -> "Surface":
+        """The surface that laws have in its place, which does not end; itself if it does not."""
+        return self
+
+    @property
+    def opening(self) -> Pair | None:
+        """The radius of its round hole and the width of the chamfer in m; None without a hole."""
+        return None
+
     def edges(self, offset: ca.SX) -> ca.SX:
         """The distances of the foot of a point from the edges in m; none without an edge.
 

@@ -44,7 +44,7 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
     )
 
 
-def _least(
+def least_damping(
     structure: Structure, damping: parts.Poles | parts.Coefficients | parts.Matrices
 ) -> float:
     """The least damping of a constraint, in 1/s."""
@@ -160,7 +160,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         touching = Touching(
             stiffness,
             mobility,
-            contact.constraint_damping if damping is None else _least(structure, damping),
+            contact.constraint_damping if damping is None else least_damping(structure, damping),
             contact.force_gain,
             period,
             reaction_time(sampling, period),

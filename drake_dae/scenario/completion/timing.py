@@ -81,14 +81,8 @@ def timed(
             points=settings.points,
         )
     reference = TimeOptimalReference(profile)
-    why_not = ""
-    if scenario.observer is not None:
-        why_not = "the law has an observer, whose estimates it does not know"
-    if settings.governor and why_not:
-        raise ScenarioError(("time_optimal.governor", why_not))
-    is_governed = not why_not and settings.governor is not False
     if settings.until is None:
-        duration = profile.duration + (LATE if is_governed else 0.0)
+        duration = profile.duration + (LATE if settings.governor else 0.0)
         scenario = replace(scenario, time_optimal=replace(settings, until=until), duration=duration)
     causes = [f"{name} {share:.0%}" for name, share in profile.shares.items() if share >= 0.005]
     note = (
@@ -96,14 +90,17 @@ def timed(
         f"by {', '.join(causes[:MOST_CAUSES])}" + (", ..." if len(causes) > MOST_CAUSES else "")
     )
     notes = [note]
-    if why_not and settings.governor is None:
-        notes.append(f"while it runs the motion is not slowed by a governor: {why_not}")
     pairs = zip(model.dae.control_signals, model.control_limits, strict=True)
     free = [signal.name for signal, limit in pairs if np.isinf(limit)]
-    if is_governed and free:
+    if settings.governor and free:
         notes.append(
             f"{', '.join(free)} has no effort limit: where no motion along the path is within the "
             "limits, the error stays as predicted and they are exceeded"
         )
-    governed = robot_motion_limits(model, **contacts) if is_governed else None
-    return Completed(scenario, tuple(notes)), TimedScenario(reference, governed)
+    # Half of what the profile leaves of the speeds is for errors of the model: a joint whose
+    # acceleration is da more than the model's exceeds its limit by da / APPROACH.
+    speeds = (1.0 + settings.joint_speeds) / 2.0
+    governed = robot_motion_limits(model, joint_speeds=speeds, **contacts)
+    return Completed(scenario, tuple(notes)), TimedScenario(
+        reference, governed if settings.governor else None
+    )

@@ -1,9 +1,9 @@
 """A task before it runs: its requirements phase by phase, by a run of the law's model."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
-from math import inf, isfinite, pi
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import SimulationError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.advice.touch import reaction_time, touch_peak
+from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces
+from drake_dae.scenario.feasibility.touches import TaskTouch, period_of, touches_of
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
 from drake_dae.scenario.plants import IdealConstraints
@@ -61,36 +62,6 @@ class PhaseNeeds:
     is_singular: bool
 
 
-@dataclass(frozen=True)
-class TaskTouch:
-    """A touch of a task.
-
-    Attributes:
-        phase: The phase that touches.
-        time: In s.
-        speed: The speed towards the surface, in m/s.
-        mass: The mass at the tool along the normal, 1 / A, in kg.
-        impulse: The impulse that stops it, speed / A, in N s.
-        peak: The largest expected force on the scenario's plant, in N; None for ideal contact.
-    """
-
-    phase: str
-    time: float
-    speed: float
-    mass: float
-    impulse: float
-    peak: float | None = None
-
-    def __str__(self) -> str:
-        text = (
-            f"{self.phase} touches at {self.time:.4g} s with {self.speed:.3g} m/s; the mass at the "
-            f"tool is {self.mass:.3g} kg: "
-        )
-        if self.peak is None:
-            return f"{text}an impulse of {self.impulse:.3g} N s"
-        return f"{text}at most {self.peak:.3g} N are expected"
-
-
 @dataclass(frozen=True, eq=False)
 class TaskNeeds:
     """The requirements of a task, in an ideal contact where the law's model has it.
@@ -100,6 +71,7 @@ class TaskNeeds:
         parameters: The values of all parameters at its times, shape (k, P).
         phases: The requirements of each phase, in order.
         touches: The touches.
+        holes: The forces at a hole that it searches, or inserts a tool into.
         outcome: The end of the task in words.
         problems: The problems, one text each.
     """
@@ -108,6 +80,7 @@ class TaskNeeds:
     parameters: FloatArray
     phases: tuple[PhaseNeeds, ...]
     touches: tuple[TaskTouch, ...]
+    holes: tuple[HoleForce, ...]
     outcome: str
     problems: tuple[str, ...]
 
@@ -145,8 +118,8 @@ class TaskNeeds:
 
     @property
     def lines(self) -> list[str]:
-        """The touches and the end of the task."""
-        return [*map(str, self.touches), self.outcome]
+        """The touches, the forces at a hole, and the end of the task."""
+        return [*map(str, self.touches), *map(str, self.holes), self.outcome]
 
     def to_dict(self) -> dict[str, Any]:
         """The requirements as plain data; None for an infinite number."""
@@ -156,6 +129,7 @@ class TaskNeeds:
         return {
             "phases": rows,
             "touches": [asdict(touch) for touch in self.touches],
+            "holes": [asdict(hole) for hole in self.holes],
             "outcome": self.outcome,
         }
 
@@ -174,14 +148,15 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
     from drake_dae.scenario.rolled import roll_scenario
 
     ideal = _ideal(scenario)
-    loop = build_loop(ideal, model, structure)
+    loop = build_loop(ideal, _without_holes(scenario, model), structure)
     controller, context = loop.controller, start_scenario(ideal, loop)
     assert isinstance(controller, TaskController)
     found = roll_scenario(ideal, loop, context)
     record, changes = found.record, loop.changes(found.context or context)
     phases = _phases(record, changes, controller, model)
-    touches, trips = _touches(record, changes, controller, scenario, model)
+    touches, trips = touches_of(record, changes, controller, scenario, model)
     plan = controller.task.plan.phases
+    holes = hole_forces(scenario, model, controller, record["state"][-1])
     problems = [
         f"{needs.name} passes a singular configuration, after {needs.begin:.4g} s"
         for needs in phases
@@ -193,19 +168,25 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
         problems.append(outcome)
     outcome = f"In the law's model {outcome}."
     parameters = np.tile(model.dae.parameter_values, (record.time.size, 1))
-    return TaskNeeds(record, parameters, phases, tuple(touches), outcome, tuple(problems))
+    return TaskNeeds(record, parameters, phases, tuple(touches), holes, outcome, tuple(problems))
 
 
-def _period(scenario: Scenario) -> float:
-    material, sampling = scenario.plant.material, scenario.sampling
-    if sampling is not None:
-        return sampling.period
-    return 0.0 if material is None else material.time_step
+def _without_holes(scenario: Scenario, model: RobotModel) -> RobotModel:
+    """The model without the edges and holes of its surfaces, if the task enters a hole.
+
+    The law has the hole right under its tool, which would fall into it without a touch.
+    """
+    assert scenario.task is not None
+    if not any(phase.enters_holes for phase in scenario.task.phases):
+        return model
+    whole = copy(model)
+    whole.constraints = tuple(constraint.whole for constraint in model.constraints)
+    return whole
 
 
 def _ideal(scenario: Scenario) -> Scenario:
     """The scenario with the plant of the law's model, exact sensors and an exact link."""
-    force, sampling, period = scenario.force_feedback, scenario.sampling, _period(scenario)
+    force, sampling, period = scenario.force_feedback, scenario.sampling, period_of(scenario)
     if isinstance(force, MeasuredForce):
         force = replace(force, bias=0.0, noise_deviation=0.0, drift=0.0)
     if sampling is not None:
@@ -305,46 +286,3 @@ def _nearest_joint(record: Record, rows: Indices, limits: Limits) -> tuple[str, 
     room[[index for index in range(room.size) if signals[index].unit.endswith("/s")]] = inf
     index = int(np.argmin(room))
     return (signals[index].name, float(room[index])) if isfinite(room[index]) else ("", inf)
-
-
-def _touches(
-    record: Record,
-    changes: Sequence[PhaseChange],
-    controller: TaskController,
-    scenario: Scenario,
-    model: RobotModel,
-) -> tuple[list[TaskTouch], list[str]]:
-    """The touches, and the guards of the force that they may trip."""
-    touches, problems, material = list[TaskTouch](), list[str](), scenario.plant.material
-    task, forces = controller.task, list(controller.contact.forces)
-    for before, after in () if task.plan.latches else pairwise(changes):  # Latches close at rest.
-        if not after.in_contact > before.in_contact or before.place >= task.plan.last:
-            continue
-        phase = task.plan.phases[before.place]
-        met = [event.time for event in record.events if before.time < event.time <= after.time]
-        # The last row before the impact, after which the rate is zero.
-        last = max(int(np.searchsorted(record.time, [*met, after.time][0])) - 1, 0)
-        speed = max(float(np.max(-record["distance"][last, len(forces) :])), 0.0)
-        matrix = controller.law.structure.constraint_matrix(record["state"][last])
-        mobility = float(np.min(np.diag(matrix)[forces]))
-        touch = TaskTouch(
-            before.phase, float(record.time[last]), speed, 1.0 / mobility, speed / mobility
-        )
-        if material is not None:
-            felt = phase.felt(task.contact_force)
-            stiffness = material.stiffness_on(model, felt)
-            late = reaction_time(scenario.sampling, material.time_step)
-            peak = touch_peak(felt, speed, stiffness, mobility, late)
-            touch = replace(touch, peak=peak)
-            lasts = pi / (stiffness * mobility) ** 0.5
-            near = [phase, *task.plan.phases[after.place : task.plan.last][:1]]
-            problems += [
-                f"{before.phase} may touch with {peak:.3g} N, and a guard of {guarded.name} ends "
-                f"it at {guard.most:g} N: touch more slowly, or give the guard more samples"
-                for guarded in near
-                for guard in guarded.guards
-                if guard.of == "force" and guard.most < peak
-                if (guard.samples - 1) * _period(scenario) < lasts
-            ]
-        touches.append(touch)
-    return touches, problems

@@ -23,7 +23,9 @@ class TimeOptimal:
     Attributes:
         efforts: The fraction of the drives' effort limits that the motion may use; the rest is left
             for feedback.
-        joint_speeds: The fraction of the joints' velocity limits that the motion may use.
+        joint_speeds: The fraction of the joints' velocity limits that the motion may use. Half of
+            the rest is left for feedback; with the other half a governor keeps the limits where the
+            model's accelerations are not exact.
         joint_accelerations: The fraction of the joints' acceleration limits that the motion may
             use, if the robot's file has such limits.
         forces: Constraint force -> its least and its largest value in N or N m; null
@@ -34,9 +36,8 @@ class TimeOptimal:
         until: The time of the references at which the path ends, in s. If left out it is
             `duration`, and the run lasts as long as the motion, with a governor 0.5 s longer.
         points: The number of intervals of the grid along the path.
-        governor: Whether the motion is slowed down during the run if the robot, off its path, would
-            exceed a limit. If left out, it is if possible: the law must have no observer and no
-            exogenous signals.
+        governor: Whether the motion is slowed down during the run where the robot, off its path,
+            would exceed a limit.
     """
 
     efforts: float = 0.95
@@ -47,7 +48,7 @@ class TimeOptimal:
     largest_rate: float | None = None
     until: float | None = None
     points: int = 1000
-    governor: bool | None = None
+    governor: bool = True
 
     def __post_init__(self) -> None:
         for name in ("efforts", "joint_speeds", "joint_accelerations"):

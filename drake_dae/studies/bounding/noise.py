@@ -5,9 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.state_feedback import ENCODER_NOISE
 from drake_dae.errors import DrakeDaeError
-from drake_dae.running.rollout.noise import NoiseSpread, noise_spread
 from drake_dae.running.rollout.problems import start_values
+from drake_dae.running.rollout.spread.noise import NoiseSpread, spread_with_rounding
+from drake_dae.running.rollout.spread.waves import Rounding
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
@@ -61,10 +64,8 @@ class NoiseOutlook:
 def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     """Predicts the deviations of outputs and controls by the noise of encoders and force sensor.
 
-    It is `noise_spread` of the scenario's loop, on the plant that rollouts have, from its start.
-    The resolution h of encoders counts as noise of h / sqrt(12) at each sample, which it is where a
-    joint passes several steps in the time in which the loop settles. Where joints rest, it is
-    a constant error of up to h / 2, of which this prediction knows nothing.
+    It is `noise_spread` of the scenario's loop, on the plant that rollouts have, from its start; of
+    the resolution of encoders with the waves of `Rounding`.
 
     Args:
         scenario: The scenario, as `load_scenario` returns it.
@@ -73,7 +74,7 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
         The outlook, or why there is none; None for a scenario without noise, and for a task.
     """
     encoders = scenario.encoders
-    if encoders is not None:
+    if encoders is not None and np.any(encoders.resolution):
         # What rounds has no slope.
         noise = encoders.position_deviation
         encoders = replace(encoders, resolution=0.0, position_noise=noise)
@@ -88,7 +89,9 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     try:
         completed, loop = build_completed(replace(for_rollout(scenario)[0], encoders=encoders))
         start, parameters = start_values(loop, start_scenario(completed.scenario, loop))
-        whole = noise_spread(loop, start, parameters, times, config=scenario.integrator)
+        rounding = None if encoders is scenario.encoders else _rounding(scenario, loop)
+        config = scenario.integrator
+        whole = spread_with_rounding(loop, start, parameters, times, config, rounding)
     except DrakeDaeError as error:
         return NoiseOutlook({}, reason=str(error))
     late = slice(_LOOKED // 2, None)
@@ -103,3 +106,16 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     units = {signal.unit for signal in loop.signals["control"]}
     unit = units.pop() if len(units) == 1 else ""
     return NoiseOutlook(outputs, spread.roughness("control"), unit)
+
+
+def _rounding(scenario: Scenario, loop: ClosedLoop) -> Rounding:
+    """How the encoders of a scenario round the positions of its robot."""
+    encoders, model = scenario.encoders, loop.plant.model
+    assert encoders is not None
+    assert model is not None
+    count = model.links.q.numel()
+    steps, noise = (
+        np.broadcast_to(np.asarray(each, dtype=float), count)
+        for each in (encoders.resolution, encoders.position_noise)
+    )
+    return Rounding(ENCODER_NOISE, "state", steps, noise)

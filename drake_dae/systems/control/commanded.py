@@ -68,8 +68,8 @@ class CommandedReferences(ReferenceGenerator):
         """Names and units of the commands, the entries of numeric parameter 0."""
         return self.filter.commands
 
-    def _sources(self) -> set[DependencyTicket]:
-        return {self.all_sources_ticket()}
+    def _declare_reference(self, sources: set[DependencyTicket]) -> None:
+        super()._declare_reference({self.all_sources_ticket()})
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
         state, time = context.get_continuous_state_vector().CopyToVector(), context.get_time()

@@ -67,16 +67,17 @@ class ReferenceGenerator(DifferentiableSystem):
         if self.reference_parameters:
             values = np.concatenate([*self.reference_parameters.values()])
             self.DeclareNumericParameter(BasicVector(values))
-        self.DeclareVectorOutputPort(
-            "reference",
-            sum(degree + 1 for degree in degrees),
-            weakly(self._calc_reference),
-            self._sources(),
-        )
+        self._declare_reference({self.time_ticket(), self.all_parameters_ticket()})
 
-    def _sources(self) -> set[DependencyTicket]:
-        """The dependencies of R."""
-        return {self.time_ticket(), self.all_parameters_ticket()}
+    def _declare_reference(self, sources: set[DependencyTicket]) -> None:
+        """Declares the port of R.
+
+        Args:
+            sources: The dependencies of R.
+        """
+        size = sum(degree + 1 for degree in self.degrees)
+        calculate = weakly(self._calc_reference)
+        self.DeclareVectorOutputPort("reference", size, calculate, sources)
 
     @property
     def further_signals(self) -> dict[str, tuple[Signal, ...]]:

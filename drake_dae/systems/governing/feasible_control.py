@@ -3,7 +3,7 @@
 from functools import cached_property
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -12,10 +12,9 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation
-from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
 
 OUTPUTS = ("control", "excess", "departure", "is_limited")
@@ -23,7 +22,7 @@ OUTPUTS = ("control", "excess", "departure", "is_limited")
 
 
 @checked(ModelError)
-class FeasibleControl(LeafSystem):
+class FeasibleControl(ParameterizedSystem):
     """The control within limits that is nearest to the commanded one in the outputs' derivatives.
 
     See `feasible_control` for the law. If the commanded control is within all limits, it does not
@@ -32,6 +31,8 @@ class FeasibleControl(LeafSystem):
     Input ports:
         estimated_state: x, shape (n,).
         control: The commanded control, shape (p,).
+        exogenous: The exogenous signals of the system with their derivatives, such as the
+            estimates of an observer; only if it has any.
 
     Output ports:
         control: u, shape (p,).
@@ -51,17 +52,18 @@ class FeasibleControl(LeafSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    no_gradient = "its control has kinks where limits are reached"
 
     def __init__(self, structure: Structure, limits: MotionLimits) -> None:
-        super().__init__()
-        self.set_name("feasible_control")
         system = structure.system
+        names = {"state": system.state_signals, "control": system.control_signals}
+        super().__init__(system, system.parameter_values, names)
+        self.set_name("feasible_control")
         self._structure, self._limits = structure, limits
-        self.dae, self.function = system, feasible_control(structure, limits)
-        self._steps = StepWatch(self)
-        self.DeclareNumericParameter(BasicVector(system.parameter_values))
+        self.function = feasible_control(structure, limits)
         self._state = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._commanded = self.DeclareVectorInputPort("control", system.num_controls)
+        self._declare_exogenous(system.exogenous.degrees(structure.drift, structure.control_matrix))
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         for index, name in enumerate(OUTPUTS):
             size = self.function.outputs[index].size
@@ -81,45 +83,44 @@ class FeasibleControl(LeafSystem):
     def _reached(self) -> tuple[TracedFunction, tuple[str, ...]]:
         return limits_reached(self._structure, self._limits)
 
-    def beyond(self, states: FloatArray, controls: FloatArray) -> dict[str, FloatArray]:
+    def beyond(
+        self, states: FloatArray, controls: FloatArray, exogenous: FloatArray | None = None
+    ) -> dict[str, FloatArray]:
         """Name of a limit, such as "largest joint1_motor" -> by what share of it it is exceeded.
 
         Args:
             states: States, shape (k, n).
             controls: Controls, shape (k, p).
+            exogenous: The values of the port `exogenous`, shape (k, e); those of the model's
+                parameters if None.
 
         Returns:
             For each limit an array of shape (k,), negative within the limit.
         """
         function, names = self._reached
-        parameters = self.dae.parameter_values
-        over = [function(x, u, parameters)[0] for x, u in zip(states, controls, strict=True)]
+        parameters = np.tile(self.dae.parameter_values, (len(states), 1))
+        if exogenous is not None:
+            parameters[:, self.exogenous_places] = exogenous
+        rows = zip(states, controls, parameters, strict=True)
+        over = [function(*row)[0] for row in rows]
         found: dict[str, FloatArray] = {}
         # A friction cone has several rows of one name.
         for name, share in zip(names, np.reshape(over, (-1, len(names))).T, strict=True):
             found[name] = np.maximum(share, found.get(name, share))
         return found
 
-    def _values(self, context: Context) -> tuple[FloatArray, ...]:
-        state, control = self._state.Eval(context), self._commanded.Eval(context)
-        parameters = context.get_numeric_parameter(0).value()
-        values = self.function.evaluate(state, control, parameters)
-        if self.function.is_finite:
-            return values
-        names = {"state": self.dae.state_signals, "control": self.dae.control_signals}
-        error = simulation_error(self.function.failure(), context.get_time(), state, names)
-        self._steps.tolerate(context, error)
-        return self.function.nowhere()
-
     def _calc(self, index: int, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._values(context)[index].reshape(-1))
+        state, control = self._state.Eval(context), self._commanded.Eval(context)
+        values = self._checked(self.function, context, state, control)
+        output.SetFromVector(values[index].reshape(-1))
 
     def traced(self) -> Block:
         sources = ("estimated_state", "control", PARAMETERS)
         return Block(
             self,
             (Computation.of(self.function, sources, OUTPUTS),),
+            moving=tuple(self.exogenous_places),
             model=self.dae,
-            signals={"state": self.dae.state_signals, "control": self.dae.control_signals},
+            signals=self._signals,
             ports={"control": tuple(self.dae.control_signals)},
         )

@@ -34,6 +34,7 @@ from drake_dae.systems.blocks.traced import (
 )
 from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.trace.functions import TracedFunction
 
 PATH_SIGNALS = (Signal("s", "s"), Signal("s'", ""), Signal("s''", "1/s"), Signal("room", "1/s"))
 """Names and units of the port `path`."""
@@ -45,17 +46,20 @@ class PathGovernor(ReferenceGenerator):
 
     s starts at the start time with s' = 0, and s' returns to 1 if the limits allow it.
 
-    Input port:
+    Input ports:
         estimated_state: x, shape (n,).
+        exogenous: The exogenous signals of the law, such as the estimates of an observer, shape
+            (k,); only for a law that has any. The values of the sample before count, since an
+            observer reads the reference.
 
     Output ports:
         reference: R of (28) for r(s(t)), shape (sum (mu_i + 1),).
         path: s, s', s'' and the range of s'' between its limits, shape (4,): the range is negative
             if no s'' is within all limits.
 
-    The state is (s, s'), continuous, or with a sample period discrete; s'' is then constant in a
-    sample. Numeric parameter 0 is that of the law's function. The block does not convert to
-    AutoDiffXd, since s'' has kinks.
+    The state is (s, s'), continuous, or with a sample period discrete, followed by the exogenous
+    signals; s'' is then constant in a sample. Numeric parameter 0 is that of the law's function.
+    The block does not convert to AutoDiffXd, since s'' has kinks.
 
     Args:
         references: The references, in the order of the outputs; expressions of time.
@@ -65,7 +69,8 @@ class PathGovernor(ReferenceGenerator):
         sample_period: The sample period in s; 0 for continuous s.
 
     Raises:
-        ReferenceSignalError, ModelError: As of `Governing`.
+        ReferenceSignalError, ModelError: As of `Governing`; or a law with exogenous signals has no
+            samples.
     """
 
     no_gradient = "the rate of its references has kinks where limits are reached"
@@ -78,43 +83,62 @@ class PathGovernor(ReferenceGenerator):
         start_time: float = 0.0,
         sample_period: float = 0.0,
     ) -> None:
+        self.law = law
         super().__init__(references, law.degrees)
         if self.reference_parameters:
             raise ModelError(
                 "a governor takes references without parameters, these have "
                 f"{', '.join(self.reference_parameters)}: write their numbers into the expressions"
             )
-        self.law, self.governing = law, Governing(law, tuple(references), limits)
+        self.governing = Governing(law, tuple(references), limits)
         self.sample_period = sample_period
         self._steps = StepWatch(self)
         self.DeclareNumericParameter(BasicVector(law.all_parameters()))
-        size = law.system.num_states
-        self._state_port = self.DeclareVectorInputPort("estimated_state", size)
-        start = np.array([start_time, 0.0])
+        start, places = np.array([start_time, 0.0]), list[int]()
+        if law.exogenous_degrees:
+            if not sample_period:
+                raise ReferenceSignalError(
+                    "the time of references is governed beside exogenous signals, such as an "
+                    "observer's estimates, only at samples: give a sample_period"
+                )
+            places = law.system.exogenous.places(law.exogenous_degrees)
+            self._exogenous_port = self.DeclareVectorInputPort("exogenous", len(places))
+        self._places = places
         if sample_period:
-            self.DeclareDiscreteState(start)
+            known = law.system.parameter_values[places]
+            self.DeclareDiscreteState(np.concatenate([start, known]))
             self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._step))
         else:
             self.DeclareContinuousState(BasicVector(start))
-        self.DeclareVectorOutputPort("path", len(PATH_SIGNALS), weakly(self._calc_path))
+        calculate = weakly(self._calc_path)
+        self.DeclareVectorOutputPort("path", len(PATH_SIGNALS), calculate, self._read)
 
     @property
     def further_signals(self) -> dict[str, tuple[Signal, ...]]:
         """Name of an output port -> names and units of its entries, for a record."""
         return {"path": PATH_SIGNALS}
 
-    def _sources(self) -> set[DependencyTicket]:
-        return {self.all_sources_ticket()}
+    def _declare_reference(self, sources: set[DependencyTicket]) -> None:
+        # Not the port `exogenous`: an observer reads R.
+        self._state_port = self.DeclareVectorInputPort(
+            "estimated_state", self.law.system.num_states
+        )
+        read = self.input_port_ticket(self._state_port.get_index())
+        self._read = {read, self.all_state_ticket(), self.all_parameters_ticket()}
+        super()._declare_reference(self._read)
 
     def _path(self, context: Context) -> FloatArray:
         if self.sample_period:
-            return context.get_discrete_state(0).CopyToVector()
+            return context.get_discrete_state(0).value()[:2]
         return context.get_continuous_state_vector().CopyToVector()
 
     def _values(self, context: Context) -> tuple[FloatArray, ...]:
         function, path = self.governing.function, self._path(context)
         state = self._state_port.Eval(context)
         parameters = context.get_numeric_parameter(0).value()
+        if self._places:
+            parameters = parameters.copy()
+            parameters[self._places] = context.get_discrete_state(0).value()[2:]
         values = function.evaluate(path, state, parameters)
         if function.is_finite:
             return values
@@ -137,24 +161,28 @@ class PathGovernor(ReferenceGenerator):
     def _step(self, context: Context, state: State) -> EventStatus:
         rate = self._values(context)[1]
         after = _after(self._path(context), rate, self.sample_period)
-        state.get_mutable_discrete_state().set_value(0, after)
+        known = self._exogenous_port.Eval(context) if self._places else []
+        state.get_mutable_discrete_state().set_value(0, [*after, *known])
         return EventStatus.Succeeded()
 
     def traced(self) -> Block:
-        function = self.governing.function
         memory = HELD if self.sample_period else STATE
-        sources = (memory, "estimated_state", PARAMETERS)
-        path, rate, room = ca.SX.sym("path", 2), ca.SX.sym("rate", 2), ca.SX.sym("room")
-        shown = ca.Function("path", [path, rate, room], [ca.vertcat(path, rate[1], room)])
+        sources, count = (memory, "estimated_state", PARAMETERS), len(self._places)
+        held, rate, room = ca.SX.sym("held", 2 + count), ca.SX.sym("rate", 2), ca.SX.sym("room")
+        path, known = held[:2], held[2:]
+        shown = ca.Function("path", [held, rate, room], [ca.vertcat(path, rate[1], room)])
         computations = [
-            Computation.of(function, sources, ("reference", "path_rate", "room")),
+            Computation.of(self._governed(held), sources, ("reference", "path_rate", "room")),
             Computation(shown, (memory, "path_rate", "room"), ("path",)),
         ]
         updates: tuple[Update, ...] = ()
         if self.sample_period:
-            after = ca.vertcat(*_after(path, rate, self.sample_period))
-            step = ca.Function("step", [path, rate], [after])
-            stepped = Computation(step, (HELD, "path_rate"), (HELD,))
+            arguments, read = [held, rate], [HELD, "path_rate"]
+            if count:
+                known = ca.SX.sym("exogenous", count)
+                arguments, read = [*arguments, known], [*read, "exogenous"]
+            after = ca.vertcat(*_after(path, rate, self.sample_period), known)
+            stepped = Computation(ca.Function("step", arguments, [after]), tuple(read), (HELD,))
             updates = (Update(stepped, self.sample_period, 0.0, True),)
         else:
             same = ca.Function("rate", [rate], [rate])
@@ -166,6 +194,23 @@ class PathGovernor(ReferenceGenerator):
             model=self.law.system,
             signals={"state": self.law.system.state_signals},
             ports={"reference": tuple(self.law.reference_signals), "path": PATH_SIGNALS},
+        )
+
+    def _governed(self, held: ca.SX) -> TracedFunction:
+        """The function of `Governing` with the discrete state in place of the path."""
+        function = self.governing.function
+        if not self._places:
+            return function
+        system = self.law.system
+        numbers = self.law.inputs["parameters"]
+        parameters = ca.SX(numbers)
+        parameters[self._places] = held[2:]
+        values = function.function.call([held[:2], system.state, parameters])
+        return TracedFunction(
+            function.name,
+            {"held": held, "state": system.state, "parameters": numbers},
+            dict(zip(function.output_names, values, strict=False)),
+            compiled=system.compiled,
         )
 
 

@@ -92,9 +92,9 @@ def narrow():
     return MotionLimits(controls, forces={"wall.force": (5.0, None)})
 
 
-def governor(period):
+def governor(period, of=None):
     own = references().references
-    return PathGovernor(own, law("two_link"), narrow(), 0.4, period)
+    return PathGovernor(own, of or law("two_link"), narrow(), 0.4, period)
 
 
 def robot(kind):
@@ -223,7 +223,11 @@ BLOCKS = {
     ),
     "PathGovernor": lambda: governor(0.0),
     "PathGovernor with samples": lambda: governor(0.01),
+    "PathGovernor beside an observer": lambda: governor(0.01, found_friction()),
     "FeasibleControl": lambda: FeasibleControl(arm("two_link").structure, narrow()),
+    "FeasibleControl beside an observer": lambda: FeasibleControl(
+        found_friction().structure, narrow()
+    ),
     "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
     "ForceSensor that drifts": lambda: ForceSensor(2, 0.02, drift=[0.4, -0.3]),
 }

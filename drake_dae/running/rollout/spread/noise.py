@@ -10,13 +10,15 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans, FloatArray, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
 from drake_dae.running.rollout.events import distribution_of
 from drake_dae.running.rollout.problems import problems_of
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
+from drake_dae.running.rollout.spread.recursion import after, of_signals, reached
+from drake_dae.running.rollout.spread.waves import RoundedPositions, Rounding
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
 from drake_dae.running.rollout.stepping.interpreted import run
 
@@ -101,7 +103,7 @@ def noise_spread(
     and that of the change of the signals to the next period is that of (C A - C) dz_k + (C B - D)
     n_k + D n_(k+1). A, B, C and D are differences of the step at each time of interest, and until
     then the same since the time before: so there should be several during a motion. What rounds
-    has no slope: of the resolution of encoders nothing is counted.
+    has no slope: of the resolution of encoders nothing is counted (`drake-dae analyze` does).
 
     Args:
         loop: The closed loop, or a diagram of blocks that can be traced, as for `rollout`.
@@ -117,6 +119,27 @@ def noise_spread(
             periods; signals are late or lost at random; blocks change at times that a run locates;
             Drake steps a block; or the run without noise ends early.
         InconsistentStateError: The start is not on N*.
+    """
+    return spread_with_rounding(loop, start, parameters, times, config, None)
+
+
+def spread_with_rounding(
+    loop: ClosedLoop | Diagram,
+    start: ArrayLike,
+    parameters: ArrayLike | None,
+    times: ArrayLike,
+    config: SimulatorConfig | None,
+    rounding: Rounding | None,
+) -> NoiseSpread:
+    """`noise_spread` of a loop whose encoders round.
+
+    Args:
+        loop: The loop, whose encoders have `rounding.deviations` as noise instead.
+        start, parameters, times, config: As for `noise_spread`.
+        rounding: How they round; None if they do not.
+
+    Raises:
+        ModelError, InconsistentStateError: As for `noise_spread`.
     """
     if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
         raise ModelError(
@@ -134,7 +157,7 @@ def noise_spread(
     problems = problems_of(program, start, parameters, request.times, None)
     if len(problems) != 1:
         raise ModelError(f"the spread by noise is that of one run, got {len(problems)} starts")
-    samples = _Samples(functions_of(program), request.settings, problems[0])
+    samples = _Samples(functions_of(program), request.settings, problems[0], rounding)
     found = [samples.at(time) for time in request.times[1:].tolist()]
     whole, changes = (np.array(part) for part in zip(*((d, c) for _, d, c in found), strict=True))
     stops = np.cumsum([0, *map(len, program.signals.values())])[:-1]
@@ -149,7 +172,11 @@ class _Samples:
     """The periods of the samples in a run without noise, one after the other."""
 
     def __init__(
-        self, functions: DiagramFunctions, settings: Settings, problem: RunProblem
+        self,
+        functions: DiagramFunctions,
+        settings: Settings,
+        problem: RunProblem,
+        rounding: Rounding | None,
     ) -> None:
         periods = [rate.period for rate in functions.program.compiled.rates]
         self._period = max(periods, default=0.0)
@@ -167,44 +194,55 @@ class _Samples:
             self._quiet[:, part], self._deviations[part] = mean, deviation
         size = problem.state.size + problem.held.size
         self._spread = np.zeros((size, size))
+        self._rounded = None
+        if rounding is not None:
+            self._rounded = RoundedPositions(functions.program, rounding, size)
 
     def at(self, time: float) -> tuple[float, FloatArray, FloatArray]:
         """The time of a period, and the deviations of all signals and of their changes there."""
         # The signals are those at the end of the period that begins here.
         index = max(round((time - self._begun) / self._period), 1) - 1
         since = index - self._index
+        middles = self._index + 0.5 + np.arange(since + 1)
+        passed = []
         if since:
-            reached = self._run(since)
-            self._state, self._held, self._index = reached.state, reached.held, index
+            done = self._run(np.array([self._index, *middles[:-1], index]))
+            passed.append(done.rows[1:-1])
+            self._state, self._held, self._index = done.state, done.held, index
         of_state, of_noise = self._slopes()
         size = self._state.size + self._held.size
         (a, c), (b, d) = np.split(of_state, [size]), np.split(of_noise, [size])
         # Without these, differences of counters would count, which no noise reaches.
-        reached_by_noise = _reached(a, b)
+        reached_by_noise = reached(a, b)
         a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
         a[~reached_by_noise] = 0.0
-        self._spread = spread = _after(a, b @ b.T, since, self._spread)
-        changed, drawn = c @ a - c, c @ b - d
-        whole, change = (
-            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", row, spread, row) + rest, 0.0))
-            for row, rest in (
-                (c, np.sum(d**2, axis=1)),
-                (changed, np.sum(drawn**2, axis=1) + np.sum(d**2, axis=1)),
-            )
+        self._spread = after(a, b @ b.T, since, self._spread)
+        whole, change = of_signals((a, b, c, d), self._spread)
+        if self._rounded is not None:
+            passed.append(self._run(np.array([index, middles[-1], index + 1])).rows[1:-1])
+            whole, change = self._rounded.after((a, b, c, d), np.vstack(passed), whole)
+        return (
+            self._begun + (index + 1) * self._period,
+            np.sqrt(np.maximum(whole, 0.0)),
+            np.sqrt(np.maximum(change, 0.0)),
         )
-        return self._begun + (index + 1) * self._period, whole, change
 
     def _run(
-        self, count: int, change: FloatArray | None = None, noise: FloatArray | None = None
+        self, times: FloatArray, change: FloatArray | None = None, noise: FloatArray | None = None
     ) -> Run:
-        """Runs some periods from here, with a change of state and held values, and with noise."""
-        state, held, last = self._state, self._held, self._index + count
-        part = self._updates(last)
+        """Runs from here, with a change of state and held values, and with noise.
+
+        Args:
+            times: The times of its rows in periods, from this one to another.
+            change, noise: The changes; None for none.
+        """
+        state, held = self._state, self._held
+        part = self._updates(times[-1])
         if change is not None:
             state, held = state + change[: state.size], held + change[state.size :]
         problem = replace(
             self._problem,
-            times=self._begun + self._period * np.array([self._index, last]),
+            times=self._begun + self._period * times,
             state=state,
             held=held,
             events=self._problem.events[part],
@@ -219,7 +257,7 @@ class _Samples:
             )
         return done
 
-    def _updates(self, last: int) -> slice:
+    def _updates(self, last: float) -> slice:
         """The updates from here to a period, which may be at times that differ by round-off."""
         ends = self._begun + self._period * (np.array([self._index, last]) - SAME)
         return slice(*np.searchsorted(self._problem.events, ends).tolist())
@@ -228,10 +266,11 @@ class _Samples:
         """The slopes of states, held values and signals after a period, by both and by noise."""
         values = np.concatenate([self._state, self._held])
         sizes = _CHANGE * np.maximum(np.abs(values), _LEAST)
+        period = np.array([self._index, self._index + 1.0])
 
         def column(change: FloatArray | None, noise: FloatArray | None) -> FloatArray:
-            after = self._run(1, change, noise)
-            return np.concatenate([after.state, after.held, after.rows[-1]])
+            done = self._run(period, change, noise)
+            return np.concatenate([done.state, done.held, done.rows[-1]])
 
         drawn = self._quiet[self._updates(self._index + 1)].shape
         count = int(np.prod(drawn))
@@ -250,23 +289,3 @@ class _Samples:
 
 def _divides(part: float, period: float) -> bool:
     return abs(period / part - round(period / part)) < SAME
-
-
-def _reached(a: FloatArray, b: FloatArray) -> Booleans:
-    """The states that noise reaches by z+ = A z + B n."""
-    found: Booleans = np.any(b != 0.0, axis=1)
-    while True:
-        more = found | np.any(a[:, found] != 0.0, axis=1)
-        if (more == found).all():
-            return found
-        found = more
-
-
-def _after(a: FloatArray, noise: FloatArray, count: int, spread: FloatArray) -> FloatArray:
-    """P after a number of times P = A P A^T + Q, by doubling."""
-    part, step = noise, a  # Q and A of 2^j times.
-    while count:
-        if count & 1:
-            spread = step @ spread @ step.T + part
-        part, step, count = part + step @ part @ step.T, step @ step, count >> 1
-    return spread
