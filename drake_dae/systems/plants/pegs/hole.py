@@ -152,7 +152,7 @@ def peg_in_hole(contact: Constraint, peg: Peg, model: RobotModel) -> PegInHole:
         "side": inside,
         "rim": inside,
     }
-    on_tip = {contact.name, f"{contact.name}.chamfer", f"{contact.name}.side"}
+    on_tip = frozenset(contact.name + part for part in ("", ".chamfer", ".side"))
     openings = [
         _opening(
             f"{contact.name}.{name}",

@@ -93,3 +93,10 @@ def with_openings(model: RobotModel, openings: Sequence[Opening]) -> DaeSystem:
         least_margin=LEAST_MARGIN,
         contacts=(*dae.contacts, *contacts) if dae.contacts else (),
     )
+
+
+def may_close(openings: Sequence[Opening], closed: Sequence[bool]) -> bool:
+    """Whether contacts can be closed together by the shapes of bodies, one flag for each."""
+    shut = [opening for opening, flag in zip(openings, closed, strict=True) if flag]
+    names = {opening.name for opening in shut}
+    return not any(names & opening.excludes for opening in shut)

@@ -92,6 +92,7 @@ class UnilateralContacts:
 
     Attributes:
         names: The names of the contacts, in the order of the model's constraints, then of pegs.
+        openings: The contacts.
         shown: The names of those of the model's constraints.
         latches: The argument.
         every: The names of contacts and latches, in the order of a mode.
@@ -151,9 +152,9 @@ class UnilateralContacts:
             raise ModelError(f"{model.name}: a robot with latches has no pegs in ideal contact")
         openings, self.restitution_of = openings_of(model, self.shown, pegs)
         self.names = tuple(openings)
-        self._excludes = [opening.excludes for opening in openings.values()]
+        self.openings = tuple(openings.values())
         self.of_model = model.dae
-        self.dae = dae = with_openings(model, list(openings.values())[len(self.shown) :])
+        self.dae = dae = with_openings(model, self.openings[len(self.shown) :])
         self.touches = [_touch_rows(*parts[name]) for name in self.shown]
         further = range(model.dae.num_constraints, dae.num_constraints)
         self.touches += [TouchRows(row, np.array([row])) for row in further]
@@ -181,16 +182,16 @@ class UnilateralContacts:
         self.gaps = dae.trace(
             "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         )
-        self.edges = Edges(dae, list(openings.values()))
+        self.edges = Edges(dae, self.openings)
         self.off = dae.trace("latches", {"value": dae.k}) if latches else None
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
-        slides = [opening.sliding for opening in openings.values()]
+        slides = [opening.sliding for opening in self.openings]
         ends = dae.num_constraints + np.cumsum([0, *(each.numel() for each in slides)])
         self.along: list[Indices] = [np.arange(*pair) for pair in pairwise(ends)]
         self._friction = [
             dae.parameter_slice(opening.friction).start if opening.friction else None
-            for opening in openings.values()
+            for opening in self.openings
         ]
         every = ca.vertcat(self.rates, *slides)
         control = ca.SX.sym("u", dae.num_controls)
@@ -224,12 +225,6 @@ class UnilateralContacts:
         return FrictionalContact(
             touch.normal, self.along[place], float(parameters[mu]), restitution
         )
-
-    def may_close(self, closed: Sequence[bool]) -> bool:
-        """Whether contacts can be closed together, one flag for each, by the shapes of bodies."""
-        shut = {name for name, flag in zip(self.names, closed, strict=False) if flag}
-        pairs = zip(self.names, self._excludes, strict=True)
-        return not any(name in shut and shut & others for name, others in pairs)
 
     def rows(self) -> list[Indices]:
         """The rows of each contact and latch."""

@@ -22,6 +22,7 @@ from drake_dae.systems.blocks.traced import (
     Projection,
     not_traced,
 )
+from drake_dae.systems.plants.pegs.opening import may_close
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.plants.unilateral.log import MARGIN
@@ -57,8 +58,9 @@ class TracedContacts:
         latch_sets: Sequence[Closed],
     ) -> None:
         count = len(contacts.every)
-        touching = filter(contacts.may_close, product((False, True), repeat=len(contacts.names)))
-        every = [(*closed, *latched) for closed, latched in product(touching, latch_sets)]
+        touching = product((False, True), repeat=len(contacts.names))
+        fitting = [closed for closed in touching if may_close(contacts.openings, closed)]
+        every = [(*closed, *latched) for closed, latched in product(fitting, latch_sets)]
         if len(every) > MOST:
             raise not_traced(f"a plant with {len(every)} modes of its contacts, more than {MOST},")
         dae = self._dae = contacts.dae
