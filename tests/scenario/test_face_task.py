@@ -16,6 +16,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import GainError, ModelError, ScenarioError
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.rolled import roll_scenario
 
@@ -102,6 +103,30 @@ def test_points_carry_what_force_and_moment_imply_and_leave_together(file):
     assert_allclose(record["distance"][-1], [0.01, 0.01, 0.0, 0.0], atol=1e-9)
     # Where it is open the forces are zero, and so is their desired value.
     assert not record["tracking_error"][-1, :2].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.6, 0.95])
+def test_a_force_along_the_face_tips_it_as_analyze_says(share, file):
+    """A push along the face takes the same share of the force of a point as it has of `tips`.
+
+    Once it has grown to its full size. Both points hold the arm, which has no other outputs, so
+    nothing balances the push, and the share is exact.
+    """
+    phases = "task.phases=[!Press {force: 20, over: 0.1}, !Dwell {duration: 0.3}]"
+    needs = find_feasibility(load_scenario(file, [phases])).task
+    press, dwell = needs.phases
+    assert press.face is None
+    assert dwell.face.eccentricity < 1e-6
+    assert f"{dwell.face.tips:.2g} N along it" in needs.tipping
+    lost = []
+    for sign in (-1.0, 1.0):
+        force = [0.0, 0.0, sign * share * dwell.face.tips]
+        push = f"{{frame: tool, force: {force}, start_time: 0.25, end_time: 0.9}}"
+        record, _ = rolled(file, phases, "sampling={period: 0.001}", f"plant_disturbances=[{push}]")
+        after = np.searchsorted(record.time, 0.35)
+        lost.append(1.0 - record["constraint_force"][after].min() / 10.0)
+    assert_allclose(max(lost), share, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import least_damping
 from drake_dae.scenario.advice.touch import reaction_time, touch_peak
 from drake_dae.scenario.controllers.task_controller import opening_contact
+from drake_dae.scenario.feasibility.touches import angle_between, normals_at, plant_values
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.contact_material import Peg
 from drake_dae.systems.task.contacts.laws import FREE
@@ -247,12 +248,8 @@ def _tool(
     links, dae = model.links, model.dae
     touch = contact.touch(links)
     assert touch is not None
-    values = dae.parameter_values
-    changed = values.copy()
-    for name in {own.name for own in contact.parameters} & scenario.plant_parameters.keys():
-        changed[dae.parameter_slice(name)] = scenario.plant_parameters[name]
-    normal = dae.trace("normal", {"normal": touch.normal})
-    n, turned = normal(state, values)[0].ravel(), normal(state, changed)[0].ravel()
+    values, changed = dae.parameter_values, plant_values(scenario, model, contact)
+    n, turned = normals_at(scenario, model, contact, state)
     across = np.linalg.svd(n[None])[2][1:]
     here, there = (
         contact.placement(own_values(contact, dae, own)).translation() for own in (values, changed)
@@ -279,7 +276,7 @@ def _tool(
         stiff,
         damped,
         float(np.linalg.norm(across @ (there - here))),
-        float(np.arctan2(np.linalg.norm(np.cross(n, turned)), n @ turned)),
+        angle_between(n, turned),
     )
 
 

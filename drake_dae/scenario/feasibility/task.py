@@ -16,6 +16,8 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import SimulationError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.controllers.task_controller import opening_contact
+from drake_dae.scenario.feasibility.faces import FaceNeeds, FaceTips
 from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces
 from drake_dae.scenario.feasibility.touches import TaskTouch, period_of, touches_of
 from drake_dae.scenario.loop import build_loop
@@ -48,6 +50,7 @@ class PhaseNeeds:
         force: The largest force of the contact, in N.
         margin: The smallest margin of the matrix that the active law inverts, B(x); 0 if singular.
         is_singular: Whether that is singular.
+        face: How near its face is to tipping; None without a face that presses.
     """
 
     name: str
@@ -60,6 +63,7 @@ class PhaseNeeds:
     force: float
     margin: float
     is_singular: bool
+    face: FaceNeeds | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,7 @@ class TaskNeeds:
         phases: The requirements of each phase, in order.
         touches: The touches.
         holes: The forces at a hole that it searches, or inserts a tool into.
+        tipping: Where its face is nearest to tipping, in words; empty without a face.
         outcome: The end of the task in words.
         problems: The problems, one text each.
     """
@@ -81,6 +86,7 @@ class TaskNeeds:
     phases: tuple[PhaseNeeds, ...]
     touches: tuple[TaskTouch, ...]
     holes: tuple[HoleForce, ...]
+    tipping: str
     outcome: str
     problems: tuple[str, ...]
 
@@ -107,19 +113,25 @@ class TaskNeeds:
     def table(self) -> Table:
         """A row for each phase."""
         head = ["phase", "from [s]", "to [s]", "force [N]", "margin", "drive", "", "joint", ""]
-        rows = []
+        faces, rows = any(needs.face for needs in self.phases), []
         for needs in self.phases:
             drive = f"{needs.share:.0%}" if needs.drive else ""
             room = f"{needs.room:.3g} left" if isfinite(needs.room) else ""
             numbers = [digits(number) for number in (needs.begin, needs.end, needs.force)]
             texts = [f"{needs.margin:.2g}", drive, needs.drive, room, needs.joint]
+            if needs.face is not None:
+                texts += [f"{needs.face.eccentricity:.2f}", f"{needs.face.tips:.2g}"]
+            elif faces:
+                texts += ["", ""]
             rows.append([needs.name, *numbers, *texts])
+        head += ["eccentricity", "tips at [N]"] if faces else []
         return Table(head, rows)
 
     @property
     def lines(self) -> list[str]:
-        """The touches, the forces at a hole, and the end of the task."""
-        return [*map(str, self.touches), *map(str, self.holes), self.outcome]
+        """The touches, the forces at a hole, the face, and the end of the task."""
+        told = [*self.touches, *self.holes, self.tipping, self.outcome]
+        return [text for text in map(str, told) if text]
 
     def to_dict(self) -> dict[str, Any]:
         """The requirements as plain data; None for an infinite number."""
@@ -130,6 +142,7 @@ class TaskNeeds:
             "phases": rows,
             "touches": [asdict(touch) for touch in self.touches],
             "holes": [asdict(hole) for hole in self.holes],
+            "tipping": self.tipping,
             "outcome": self.outcome,
         }
 
@@ -153,9 +166,12 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
     assert isinstance(controller, TaskController)
     found = roll_scenario(ideal, loop, context)
     record, changes = found.record, loop.changes(found.context or context)
-    phases = _phases(record, changes, controller, model)
+    points = opening_contact(scenario, model)
+    tips = FaceTips(model, controller, points) if len(points) > 1 else None
+    phases = _phases(record, changes, controller, model, tips)
     touches, trips = touches_of(record, changes, controller, scenario, model)
     plan = controller.task.plan.phases
+    tipping = "" if tips is None else tips.nearest(scenario, phases, record["state"][-1])
     holes = hole_forces(scenario, model, controller, record["state"][-1])
     problems = [
         f"{needs.name} passes a singular configuration, after {needs.begin:.4g} s"
@@ -168,7 +184,9 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
         problems.append(outcome)
     outcome = f"In the law's model {outcome}."
     parameters = np.tile(model.dae.parameter_values, (record.time.size, 1))
-    return TaskNeeds(record, parameters, phases, tuple(touches), holes, outcome, tuple(problems))
+    return TaskNeeds(
+        record, parameters, phases, tuple(touches), holes, tipping, outcome, tuple(problems)
+    )
 
 
 def _without_holes(scenario: Scenario, model: RobotModel) -> RobotModel:
@@ -237,6 +255,7 @@ def _phases(
     changes: Sequence[PhaseChange],
     controller: TaskController,
     model: RobotModel,
+    tips: FaceTips | None,
 ) -> tuple[PhaseNeeds, ...]:
     limits, needs = Limits.of(model), []
     ends = [*(change.time for change in changes[1:]), float(record.time[-1])]
@@ -246,6 +265,7 @@ def _phases(
             continue
         pair = controller.pairs[change.law // 2]
         forces = record["constraint_force"][rows][:, list(pair.contact.forces)]
+        holds = tips is not None and controller.task.plan.phases[change.place].holds_contact
         margin = _margin(pair.laws[change.law % 2].structure, record["state"][rows])
         needs.append(
             PhaseNeeds(
@@ -257,6 +277,7 @@ def _phases(
                 float(np.max(pair.contact.total(forces), initial=0.0)),
                 margin.relative,
                 margin.is_singular,
+                tips.needs(record, rows) if tips is not None and holds else None,
             )
         )
     return tuple(needs)

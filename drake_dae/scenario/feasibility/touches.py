@@ -7,6 +7,8 @@ from math import pi
 
 import numpy as np
 
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.touch import reaction_time, touch_peak
 from drake_dae.scenario.scenario import Scenario
@@ -94,3 +96,28 @@ def touches_of(
             ]
         touches.append(touch)
     return touches, problems
+
+
+def normals_at(
+    scenario: Scenario, model: RobotModel, contact: Constraint, state: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The normal of a contact in a state, and that with the scenario's `plant_parameters`."""
+    dae, touch = model.dae, contact.touch(model.links)
+    assert touch is not None
+    function = dae.trace("normal", {"normal": touch.normal})
+    values = dae.parameter_values, plant_values(scenario, model, contact)
+    first, second = (function(state, own)[0].ravel() for own in values)
+    return first, second
+
+
+def plant_values(scenario: Scenario, model: RobotModel, contact: Constraint) -> FloatArray:
+    """The parameters of the model, with those of a contact from `plant_parameters`."""
+    values = model.dae.parameter_values.copy()
+    for name in {own.name for own in contact.parameters} & scenario.plant_parameters.keys():
+        values[model.dae.parameter_slice(name)] = scenario.plant_parameters[name]
+    return values
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> float:
+    """The angle between two unit vectors, in rad."""
+    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
