@@ -14,12 +14,12 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, positive
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial, Peg, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
@@ -70,18 +70,23 @@ class ScenarioPlant(ABC):
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
     6. With `has_sides` its contacts include the sides of a body that ends, as those of a hole in a
-       `Plate`, and not only its face.
+       `Plate`, and not only its face. `pegs` are the pegs that enter them.
     """
 
     carries: ClassVar[bool] = False
-    has_sides: ClassVar[bool] = True
     adjusts: ClassVar[bool] = True
+    pegs: Sequence[Peg] = ()
     in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
     def material(self) -> PointMaterial | None:
         """The material of compliant contacts; None for ideal ones."""
         return None
+
+    @property
+    def has_sides(self) -> bool:
+        """Whether a body that ends has sides too, as those of a hole."""
+        return True
 
     @property
     def rolled(self) -> "ScenarioPlant":
@@ -104,19 +109,33 @@ class ScenarioPlant(ABC):
         """
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
-    """The plant is a `RobotPlant`: its constraints hold exactly."""
+    """The plant is a `RobotPlant`: its constraints hold exactly.
 
-    has_sides = False
+    In a task its contacts open, without bouncing: it is then a `UnilateralRobotPlant`.
+
+    Attributes:
+        pegs: The pegs with which a task enters holes, as for `!Unilateral`.
+    """
+
+    pegs: Sequence[Peg] = ()
+
+    @property
+    def has_sides(self) -> bool:
+        return bool(self.pegs)
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        if robot.latches:
+        if robot.latches and not self.pegs:
             return UnilateralRobotPlant(
                 robot.model, {}, latches=robot.latches, latch_sets=robot.latch_sets
             )
-        if robot.opens:  # In a task its contacts open, without bouncing.
-            return Unilateral(dict.fromkeys(robot.opens, 0.0)).plant(robot)
+        if robot.opens:
+            return Unilateral(dict.fromkeys(robot.opens, 0.0), pegs=self.pegs).plant(robot)
+        if self.pegs:
+            text = "a peg is for a contact that opens: give a task, or take !Unilateral"
+            raise ScenarioError(("plant.pegs", text))
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
 
 
@@ -134,6 +153,8 @@ class Unilateral(ScenarioPlant):
             pure number. Other constraints stay closed. If left out, all unilateral contacts open,
             without bouncing.
         settling_time: Bouncing that would end within this time, in s, is ended immediately.
+        pegs: The pegs with which it enters holes, each at a contact that opens, with the friction
+            of that contact. Here a peg is round and smooth, so its rings and balls do not count.
 
     Raises:
         ModelError: A number makes no sense.
@@ -141,7 +162,11 @@ class Unilateral(ScenarioPlant):
 
     restitution: dict[str, float] = field(default_factory=dict)
     settling_time: float = 1e-3
-    has_sides = False
+    pegs: Sequence[Peg] = ()
+
+    @property
+    def has_sides(self) -> bool:
+        return bool(self.pegs)
 
     def __post_init__(self) -> None:
         positive("settling_time", self.settling_time)
@@ -162,6 +187,7 @@ class Unilateral(ScenarioPlant):
                 self.restitution or dict.fromkeys(pushing, 0.0),
                 settling_time=self.settling_time,
                 structure=robot.structure,
+                pegs=self.pegs,
             )
 
 

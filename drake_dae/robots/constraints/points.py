@@ -119,21 +119,22 @@ class PointOnSurface(Constraint):
 
     def offset(self, frames: Frames) -> ca.SX:
         """The point relative to the surface, in its axes, m, shape (3, 1)."""
-        return self._offset(frames.position(self.frame, self.point))
+        return self.offset_of(frames.position(self.frame, self.point))
 
-    def _offset(self, point: ca.SX) -> ca.SX:
-        """The same of any point in the world."""
+    def offset_of(self, point: ca.SX) -> ca.SX:
+        """The same of any point in the world, shape (3, 1)."""
         offset = point - self.parameters[0].symbol
-        return ca.mtimes(self._rotation().T, offset) if self.rpy is not None else offset
+        return offset if self.rpy is None else ca.mtimes(self.rotation.T, offset)
 
-    def _rotation(self) -> ca.SX:
-        """The orientation of the surface, shape (3, 3)."""
-        return rotation_of(self.parameters[1].symbol)
+    @property
+    def rotation(self) -> ca.SX:
+        """The orientation of the surface in the world, shape (3, 3)."""
+        return ca.SX.eye(3) if self.rpy is None else rotation_of(self.parameters[1].symbol)
 
     def _normal(self, frames: Frames) -> ca.SX:
         """The gradient of phi in the world, shape (3, 1)."""
         normal = self.surface.unit_normal(self.offset(frames))
-        return normal if self.rpy is None else ca.mtimes(self._rotation(), normal)
+        return normal if self.rpy is None else ca.mtimes(self.rotation, normal)
 
     def _friction(self, kinematics: Kinematics) -> Friction | None:
         """The friction on the point; None without friction."""
@@ -152,25 +153,24 @@ class PointOnSurface(Constraint):
     def _bent(self, sliding: ca.SX, normal: ca.SX) -> tuple[ca.SX, FrictionState]:
         """The traction of the bristles in the world, and their state."""
         assert self.bristles is not None
-        rotation = ca.SX.eye(3) if self.rpy is None else self._rotation()
-        return self.bristles.bent(sliding, normal, rotation)
+        return self.bristles.bent(sliding, normal, self.rotation)
 
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         if self.is_ideal:
             return None
-        moved = self._surface_velocity(kinematics.position(self.frame, self.point))
+        moved = self.surface_velocity(kinematics.position(self.frame, self.point))
         velocity = kinematics.velocity(self.frame, self.point) - moved
         normal = self._normal(kinematics)
         return velocity - normal * ca.dot(normal, velocity)
 
-    def _surface_velocity(self, point: ca.SX) -> ca.SX:
+    def surface_velocity(self, point: ca.SX) -> ca.SX:
         """The velocity of the surface at a point in the world, m/s, shape (3, 1)."""
         moved = self.parameters[0].rate
         if self.rpy is None:
             return moved
         turn, offset = self.parameters[1], ca.SX.sym("offset", 3)
-        turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
-        return moved + ca.substitute(turning, offset, self._offset(point))
+        turning = ca.jtimes(ca.mtimes(self.rotation, offset), turn.symbol, turn.rate)
+        return moved + ca.substitute(turning, offset, self.offset_of(point))
 
     @property
     def is_ideal(self) -> bool:
@@ -204,8 +204,8 @@ class PointOnSurface(Constraint):
             self.frame,
             self.point,
             self._normal(frames),
-            lambda point: self.surface.clearance(self._offset(point)),
-            self._surface_velocity,
+            lambda point: self.surface.clearance(self.offset_of(point)),
+            self.surface_velocity,
             self.surface.has_exact_distance,
             None if self.bristles is None else self._bent,
         )

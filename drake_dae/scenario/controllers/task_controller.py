@@ -6,7 +6,9 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.plate import Plate
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts.parts import Impedance
 from drake_dae.scenario.scenario import Scenario
@@ -37,13 +39,38 @@ def check_task(scenario: Scenario) -> None:
         if ending and entering and not scenario.plant.has_sides:
             text = (
                 f"{entering[0]} enters a hole, and the ideal contact of '{ending[0]}' has a face "
-                "that ends, and no sides; take !MultibodyPlant or !CompliantContact"
+                "that ends, and no sides without a peg; give it, as pegs: [{constraint: "
+                f"{ending[0]}, radius: 0.00495, length: 0.02}}], or take !MultibodyPlant"
             )
             problems.append(("plant", text))
+        problems += _too_deep(scenario)
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
         raise ScenarioError(*problems)
+
+
+def _too_deep(scenario: Scenario) -> list[tuple[str, str]]:
+    """Insertions beyond the ends of ideal holes and pegs, which the plant does not have."""
+    plant, task = scenario.plant, scenario.task
+    assert task is not None
+    if plant.material is not None or not plant.has_sides:
+        return []
+    surfaces = {c.name: c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)}
+    problems = []
+    for peg in plant.pegs:
+        plate = surfaces.get(peg.constraint)
+        end = min(peg.length, plate.thickness if isinstance(plate, Plate) else np.inf)
+        problems += [
+            (
+                "task.phases",
+                f"{phase.name} is {phase.depth:g} m deep, and in ideal contact it must be less "
+                f"than {end:g} m, the length of the peg or the thickness of the plate",
+            )
+            for phase in task.phases
+            if isinstance(phase, Insert) and not phase.depth < end
+        ]
+    return problems
 
 
 def task_controller(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from falling import ball, box, mass_point, planar_box, rocking_block, standing_on_right
 from painleve import rod, sliding
+from pegs import peg_of, planar_peg
 from polishing import CLIMB, push, run_on, started, task_loop
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
@@ -119,7 +120,7 @@ def alone(plant):
     """A plant without controls in a diagram, and its context."""
     builder = DiagramBuilder()
     builder.AddSystem(plant)
-    for name in ("state", "mode", "gap", "constraint_force"):
+    for name in ("state", *plant.further_signals, "constraint_force"):
         builder.ExportOutput(plant.GetOutputPort(name), name)
     diagram = builder.Build()
     return diagram, diagram.CreateDefaultContext()
@@ -262,6 +263,13 @@ FALLING = {
         [-0.28, 0.004, 0.02, 0.5, 0.0, 0.0],
         1.3,
     ),
+    "a peg that slides down a chamfer into its hole": (
+        lambda: UnilateralRobotPlant(
+            planar_peg(driven=False, friction=0.2), {"wall": 0.3}, pegs=[peg_of(1e-4)]
+        ),
+        [0.0005, 0.052, 0.0, 0.0, 0.0, 0.0],
+        0.05,
+    ),
 }
 
 
@@ -282,7 +290,7 @@ def test_bodies_fall_as_in_drake(name, compiled):
     simulate(diagram, context, duration, fixed(duration / 100))
     own = plant.GetMyContextFromRoot(context)
     assert len(plant.events(own)) > 1
-    for port in ("state", "mode", "gap"):
+    for port in ("state", *plant.further_signals):
         wanted = plant.GetOutputPort(port).Eval(own)
         np.testing.assert_allclose(found.record[port][-1], wanted, rtol=0.0, atol=1e-9)
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,9 @@ from drake_dae.errors import ModelError, PainleveError, SimulationError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.contact.contact_material import Peg
+from drake_dae.systems.plants.pegs.hole import openings_of
+from drake_dae.systems.plants.pegs.opening import with_openings
 from drake_dae.systems.plants.unilateral.edges import Edges
 from drake_dae.systems.plants.unilateral.frictional import FrictionalContact
 from drake_dae.systems.plants.unilateral.impacts import TouchRows, is_p_matrix
@@ -84,14 +88,18 @@ class UnilateralContacts:
         model: The robot.
         restitution: Name of a constraint -> its coefficient of restitution e, 0 to 1.
         latches: The names of holonomic bilateral constraints.
+        pegs: The pegs, whose contacts with their holes follow those of the model's constraints.
 
     Attributes:
-        names: The names of the contacts, in the order of the model's constraints.
+        names: The names of the contacts, in the order of the model's constraints, then of pegs.
+        openings: The contacts.
+        shown: The names of those of the model's constraints.
         latches: The argument.
         every: The names of contacts and latches, in the order of a mode.
         latch_rows: The rows of each latch.
-        dae: The system with all contacts closed.
-        restitution: e of each contact, shape (k,).
+        dae: The system with all contacts closed; that of the model is `of_model`.
+        restitution: e of each contact of the model's constraints, shape (k,).
+        restitution_of: The place in `restitution` for each contact.
         touches: The rows of each contact.
         along: The rows of the sliding velocities of each contact in `all_rates`.
         bilateral: The rows of all other constraints.
@@ -100,14 +108,19 @@ class UnilateralContacts:
         gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
             derivatives from exogenous signals.
-        residual: phi_i, phi_i' of each, or nonholonomic rows; `sizes` are the numbers of entries.
+        residual: phi_i, phi_i' of each constraint of the model, or nonholonomic rows; `sizes` are
+            the numbers of entries.
 
     Raises:
         ModelError: There is no such constraint, or it is not unilateral, or not fit for a latch.
     """
 
     def __init__(
-        self, model: RobotModel, restitution: Mapping[str, float], latches: Sequence[str] = ()
+        self,
+        model: RobotModel,
+        restitution: Mapping[str, float],
+        latches: Sequence[str] = (),
+        pegs: Sequence[Peg] = (),
     ) -> None:
         parts = {c.name: (c, part) for c, part in ConstraintSet(model.constraints).parts()}
         fitting = [
@@ -134,47 +147,53 @@ class UnilateralContacts:
                 f"{model.name}: redundant constraints share their forces, which contacts that open "
                 "and close cannot; leave `compliances` out"
             )
-        self.names = tuple(name for name in parts if name in restitution)
-        self.touches = list[TouchRows]()
-        for name in self.names:
-            constraint, part = parts[name]
-            normal = part.start + constraint.is_unilateral.index(True)
-            self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
+        self.shown = tuple(name for name in parts if name in restitution)
+        if latches and pegs:
+            raise ModelError(f"{model.name}: a robot with latches has no pegs in ideal contact")
+        openings, self.restitution_of = openings_of(model, self.shown, pegs)
+        self.names = tuple(openings)
+        self.openings = tuple(openings.values())
+        self.of_model = model.dae
+        self.dae = dae = with_openings(model, self.openings[len(self.shown) :])
+        self.touches = [_touch_rows(*parts[name]) for name in self.shown]
+        further = range(model.dae.num_constraints, dae.num_constraints)
+        self.touches += [TouchRows(row, np.array([row])) for row in further]
         self.latches, self.every = tuple(latches), (*self.names, *latches)
         self.latch_rows = [_latch_rows(model, parts, name) for name in latches]
         opening = [*(touch.rows for touch in self.touches), *self.latch_rows]
         self.bilateral: Indices = np.setdiff1d(
-            np.arange(model.dae.num_constraints), np.concatenate(opening)
+            np.arange(dae.num_constraints), np.concatenate(opening)
         )
         self.normals = [touch.normal for touch in self.touches]
         self.restitution = np.array(
-            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names],
+            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.shown],
             dtype=float,
         )
-        dae, links = model.dae, model.links
-        self.dae = dae
+        links = model.links
         rate = ca.jtimes(dae.k, dae.state, dae.f) + dae.exogenous.rate(dae.k)
-        rows = [
-            dae.k[i] if ca.depends_on(dae.k[i], links.v) else rate[i]
-            for i in range(dae.num_constraints)
-        ]
-        self.rates = ca.vertcat(ca.SX(0, 1), *rows)
+        by_velocity = [ca.depends_on(row, links.v) for row in ca.vertsplit(dae.k)]
+        pairs = zip(ca.vertsplit(dae.k), ca.vertsplit(rate), by_velocity, strict=True)
+        held = [(k,) if moves else (k, slope) for k, slope, moves in pairs]
+        self.rates = ca.vertcat(ca.SX(0, 1), *(rows[-1] for rows in held))
         self.drift = dae.exogenous.rate(self.rates)
-        holds = [
-            dae.k[i] if ca.depends_on(dae.k[i], links.v) else ca.vertcat(dae.k[i], rate[i])
-            for i in range(dae.num_constraints)
-        ]
-        self.residual = ca.vertcat(ca.SX(0, 1), *holds)
-        self.sizes = [held.numel() for held in holds]
+        self.sizes = [len(rows) for rows in held[: model.dae.num_constraints]]
+        every_row = [row for rows in held for row in rows]
+        self.residual = ca.vertcat(ca.SX(0, 1), *every_row[: sum(self.sizes)])
         self.gaps = dae.trace(
             "gaps", {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         )
-        self.edges = Edges(model, [parts[name][0] for name in self.names])
+        self.edges = Edges(dae, self.openings)
         self.off = dae.trace("latches", {"value": dae.k}) if latches else None
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
-        sliding = self._sliding(model, parts)
-        every = ca.vertcat(self.rates, sliding)
+        slides = [opening.sliding for opening in self.openings]
+        ends = dae.num_constraints + np.cumsum([0, *(each.numel() for each in slides)])
+        self.along: list[Indices] = [np.arange(*pair) for pair in pairwise(ends)]
+        self._friction = [
+            dae.parameter_slice(opening.friction).start if opening.friction else None
+            for opening in self.openings
+        ]
+        every = ca.vertcat(self.rates, *slides)
         control = ca.SX.sym("u", dae.num_controls)
         self._control = bool(dae.num_controls)
         self._terms = dae.trace(
@@ -190,23 +209,6 @@ class UnilateralContacts:
             {"control": control},
             often=False,
         )
-
-    def _sliding(self, model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]]) -> ca.SX:
-        """The sliding velocities of frictional contacts, shape (s, 1); stores rows and mu."""
-        kinematics, rows = model.links.kinematics(), [ca.SX(0, 1)]
-        start = self.dae.num_constraints
-        self.along: list[Indices] = []
-        self._friction: list[int | None] = []
-        for name in self.names:
-            constraint = parts[name][0]
-            sliding, mu = constraint.sliding(kinematics), constraint.friction_parameter
-            size = 0 if sliding is None or mu is None else sliding.numel()
-            self.along.append(np.arange(start, start + size))
-            self._friction.append(self.dae.parameter_slice(mu).start if size and mu else None)
-            if sliding is not None and size:
-                rows.append(sliding)
-            start += size
-        return kinematics.value(ca.vertcat(*rows))
 
     def frictional_contact(
         self, place: int, parameters: FloatArray, restitution: float
@@ -261,7 +263,7 @@ class UnilateralContacts:
     def residual_signals(self) -> tuple[Signal, ...]:
         """Names and units of `residual`."""
         signals = list[Signal]()
-        for signal, size in zip(self.dae.constraint_output_signals, self.sizes, strict=True):
+        for signal, size in zip(self.of_model.constraint_output_signals, self.sizes, strict=True):
             signals += [signal, signal.derivative(1)][:size]
         return tuple(signals)
 
@@ -270,7 +272,7 @@ class UnilateralContacts:
         rows = np.ones(self.dae.num_constraints)
         for own, shut in zip(self.rows(), closed, strict=True):
             rows[own] = shut
-        return np.repeat(rows, self.sizes)
+        return np.repeat(rows[: len(self.sizes)], self.sizes)
 
     def terms(
         self, state: FloatArray, control: FloatArray, parameters: FloatArray
@@ -309,6 +311,11 @@ class UnilateralContacts:
             state,
             outcome,
         )
+
+
+def _touch_rows(constraint: Constraint, part: slice) -> TouchRows:
+    normal = part.start + constraint.is_unilateral.index(True)
+    return TouchRows(normal, np.arange(part.start, part.stop))
 
 
 def _latch_rows(

@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.dips import TOUCHING
+from drake_dae.systems.plants.pegs.opening import Opening
 
 Beside = tuple[bool, ...]
 """For each contact whether it is beside its face."""
@@ -45,24 +45,23 @@ class Edges:
     motion decides.
 
     Args:
-        model: The robot.
-        constraints: The constraints of all contacts.
+        dae: The system of the robot.
+        openings: All contacts.
 
     Attributes:
         places: The indices of the contacts with edges.
         size: The number of their distances, e.
     """
 
-    def __init__(self, model: RobotModel, constraints: Sequence[Constraint]) -> None:
-        links, dae = model.links, model.dae
-        edges = [constraint.edges(links) for constraint in constraints]
-        self._name, self._contacts = dae.name, [constraint.name for constraint in constraints]
+    def __init__(self, dae: DaeSystem, openings: Sequence[Opening]) -> None:
+        edges = [opening.edges for opening in openings]
+        self._name, self._contacts = dae.name, [opening.name for opening in openings]
         self.places = [i for i, own in enumerate(edges) if own.numel()]
         ends = np.cumsum([0, *(edges[i].numel() for i in self.places)]).tolist()
         self.size, self._parts = ends[-1], [slice(*pair) for pair in pairwise(ends)]
         every = ca.vertcat(ca.SX(0, 1), *(edges[i] for i in self.places))
         rate = ca.jtimes(every, dae.state, dae.f) + dae.exogenous.rate(every)
-        inside = ca.vertcat(ca.SX(0, 1), *(_depth(constraints[i], model) for i in self.places))
+        inside = ca.vertcat(ca.SX(0, 1), *(openings[i].clearance for i in self.places))
         self.function = dae.trace("edges", {"edges": every, "rates": rate})
         self._bodies = dae.trace("bodies", {"clearance": inside}, often=False)
 
@@ -160,10 +159,3 @@ def until_passed(
     """
     outward = on < 0.5
     return np.where(outward, TOUCHING - edges, edges), np.where(outward, -rates, rates)
-
-
-def _depth(constraint: Constraint, model: RobotModel) -> ca.SX:
-    """The distance of the point of a constraint from the body that it touches, in m."""
-    touch = constraint.touch(model.links)
-    assert touch is not None
-    return touch.clearance(model.links.position(touch.frame, touch.point))

@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, find_constraint_structure
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.plants.unilateral.edges import Feet
 from drake_dae.systems.plants.unilateral.impacts import rows_of
@@ -19,6 +19,10 @@ Closed = tuple[bool, ...]
 
 ROUND_OFF = 1e-12
 """A force between zero and minus this, relative to the terms that it is made of, is round-off."""
+
+NEAR = 1e-6
+"""The part of their usual spread of states at which the contacts of a peg are examined, since they
+depend on each other where its end is at the rim."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,7 @@ class Modes:
 
     Args:
         contacts: The contacts.
-        structure: The structure of the system with all contacts closed, if it is known.
+        structure: The structure of the model's system, all contacts closed, if it is known.
     """
 
     def __init__(
@@ -74,6 +78,31 @@ class Modes:
             self._traced_modes[closed] = self._traced(closed, state)
         return self._traced_modes[closed]
 
+    def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a state where no run may start, by the parameters that its system has.
+
+        Args:
+            state: x, shape (n,).
+            parameters: The values of all parameters of the plant.
+
+        Raises:
+            InconsistentStateError: It is off the bilateral constraints, or inside a body.
+        """
+        contacts = self._contacts
+        dae, values = contacts.dae, parameters[: contacts.dae.parameter_symbol.numel()]
+        bilateral = self((False,) * len(contacts.every), state).structure.manifold
+        if not bilateral.is_consistent(state, values):
+            residual = bilateral.residual(state, values)
+            worst = int(np.argmax(np.abs(residual)))
+            signal = bilateral.residual_signals[worst]
+            raise InconsistentStateError(
+                f"{dae.name}: the start state is not on the constraints that stay: "
+                f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
+                residual,
+            )
+        gaps = contacts.gaps.evaluate(state, values)[0]
+        contacts.edges.check_outside(state, values, gaps)
+
     def _traced(self, closed: Closed, state: FloatArray) -> Mode:
         contacts = self._contacts
         names = [n for n, shut in zip(contacts.every, closed, strict=True) if shut]
@@ -88,10 +117,12 @@ class Modes:
                 "the constraints depend on each other there"
             )
         rows = sorted(independent.tolist())
-        whole = self._whole if len(rows) == dae.num_constraints else None
+        whole = self._whole if rows == list(range(contacts.of_model.num_constraints)) else None
         system = _subsystem(contacts, rows, state) if whole is None else whole.system
         try:
-            structure = whole or find_constraint_structure(system)
+            in_hole = rows[-1:] >= [contacts.of_model.num_constraints]
+            spread = NEAR * system.usual_spread(state) if in_hole else None
+            structure = whole or find_constraint_structure(system, spread=spread)
         except DrakeDaeError as error:
             note = f"While {', '.join(names) or 'no contact'} is closed: {error}"
             error.args = (note, *error.args[1:])
@@ -129,7 +160,8 @@ def _subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatAr
         rows: The constraints that hold.
         state: A state near which it is examined, shape (n,).
     """
-    dae, rows = contacts.dae, list(rows)
+    rows, own = list(rows), contacts.of_model
+    dae = own if all(row < own.num_constraints for row in rows) else contacts.dae
     embed = ca.SX.eye(dae.num_constraints)[:, rows]
     whole = dae.implicit
 

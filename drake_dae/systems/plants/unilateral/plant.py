@@ -23,6 +23,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, ones
+from drake_dae.systems.plants.contact.contact_material import Peg
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
 from drake_dae.systems.plants.unilateral.log import RunLog, clearance, edges_passed
@@ -46,7 +47,8 @@ class UnilateralRobotPlant(ModalPorts):
     - It opens when lambda falls through zero, or when a jump of the control makes it negative. A
       force that is zero except for round-off, as under a law that leaves none, keeps it closed.
     - On a surface that ends, as a `Plate`, it opens where the foot of its point leaves the face,
-      and closes on the face alone; see `Edges`.
+      and closes on the face alone; see `Edges`. A peg also has the chamfer, the side and the rim
+      of its hole, which the law does not know.
     - With dependent contacts, such as four feet of a table, as few as possible carry the force, and
       the others touch without force. If friction leaves no motion or two, the run ends with a
       PainleveError.
@@ -75,6 +77,8 @@ class UnilateralRobotPlant(ModalPorts):
         constraint_residual: phi_i, phi_i' of each constraint (or nonholonomic rows),
             constraint-major; zero for open contacts.
         controlled_output: z.
+        hole_mode, hole_gap, hole_force: With pegs, the same of their contacts with the sides of
+            their holes: 1 if it is closed, its gap in m, and its normal force in N.
         link_state: (q, v) of the links, shape (nq + nv,).
         constraint_wrenches: The wrench of each constraint on each of its frames; see `RobotPlant`.
 
@@ -90,6 +94,9 @@ class UnilateralRobotPlant(ModalPorts):
         capture: The largest distance in m, or angle in rad, at which a latch closes.
         latch_sets: The sets of latches that a run closes together, for rollouts and exports; all
             sets if empty.
+        pegs: The pegs with which it enters holes of a `Plate`, each at a contact of `contacts` and
+            with its coefficients of restitution and friction. Radius and axis count here, and no
+            balls; see `PegInHole`.
 
     Attributes:
         model: The robot.
@@ -124,9 +131,10 @@ class UnilateralRobotPlant(ModalPorts):
         latches: Sequence[str] = (),
         capture: float = 1e-3,
         latch_sets: Collection[Collection[str]] = (),
+        pegs: Sequence[Peg] = (),
     ) -> None:
         settling = positive(f"{model.name}: settling_time", settling_time)
-        super().__init__(model, contacts, structure, latches)
+        super().__init__(model, contacts, structure, latches, pegs)
         captured = positive(f"{model.name}: capture", capture)
         self._latch_sets = [
             tuple(name in closed for name in self.latches) for closed in latch_sets
@@ -145,13 +153,14 @@ class UnilateralRobotPlant(ModalPorts):
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
+        every = self._contacts.every
         guards = [
-            *(("gap, force or command", self._guard, i) for i in range(len(self.contacts))),
+            *(("gap, force or command", self._guard, i) for i in range(len(every))),
             *(("edge", self._edge_guard, i) for i in self._edges.places),
         ]
         self._witnesses = [
             self.MakeWitnessFunction(
-                f"{self.contacts[place]}: {text}",
+                f"{every[place]}: {text}",
                 WitnessFunctionDirection.kPositiveThenNonPositive,
                 weakly(guard, place),
                 UnrestrictedUpdateEvent(weakly(self._at_guard)),
@@ -195,7 +204,9 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _edge_guard(self, place: int, context: Context) -> float:
         """Positive until the foot of a contact passes an edge."""
-        return float(self._margins(context)[len(self.contacts) + self._edges.places.index(place)])
+        return float(
+            self._margins(context)[len(self._contacts.every) + self._edges.places.index(place)]
+        )
 
     def _margins(self, context: Context) -> FloatArray:
         """For each contact its `grip` if closed; otherwise positive until it penetrates its face.
@@ -243,7 +254,7 @@ class UnilateralRobotPlant(ModalPorts):
                 self.state(context),
             )
         x, values = self.state(context), self._values(context)
-        self._check(x, values)
+        self.modes.check_start(x, values)
         if np.isnan(self._control(context)).any():
             # Values held between samples change with this event, at the start of the first step.
             log.waits = True
@@ -259,22 +270,6 @@ class UnilateralRobotPlant(ModalPorts):
             if event.time < now or event.kind is not ContactChange.CLOSING
         ]
         return status
-
-    def _check(self, state: FloatArray, parameters: FloatArray) -> None:
-        """Refuses a state where no run may start, by the parameters that its system has."""
-        values = parameters[: self.dae.parameter_symbol.numel()]
-        bilateral = self.modes((False,) * len(self.contacts), state).structure.manifold
-        if not bilateral.is_consistent(state, values):
-            residual = bilateral.residual(state, values)
-            worst = int(np.argmax(np.abs(residual)))
-            signal = bilateral.residual_signals[worst]
-            raise InconsistentStateError(
-                f"{self.dae.name}: the start state is not on the constraints that stay: "
-                f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
-                residual,
-            )
-        gaps = self._contacts.gaps.evaluate(state, values)[0]
-        self._edges.check_outside(state, values, gaps)
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         log = self._log(context)
@@ -304,7 +299,7 @@ class UnilateralRobotPlant(ModalPorts):
         time, x, values = context.get_time(), self.state(context), self._values(context)
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
-            e = context.get_numeric_parameter(1).value()
+            e = context.get_numeric_parameter(1).value()[self._contacts.restitution_of]
             latched = self._commanded(context)
             control = self._control(context)
             after = self._resets(time, x, closed, control, values, e, latched, beside)
@@ -331,7 +326,7 @@ class UnilateralRobotPlant(ModalPorts):
         return Block(
             self,
             traced.computations(self._ports),
-            check_start=self._check,
+            check_start=self.modes.check_start,
             projection=traced.projection(),
             scale=dae.scale,
             moving=tuple(self.exogenous_places),

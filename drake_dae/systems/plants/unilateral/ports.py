@@ -18,12 +18,16 @@ from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.plants.contact.contact_material import Peg
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, coefficient
 from drake_dae.systems.plants.unilateral.edges import Feet
 from drake_dae.systems.plants.unilateral.modes import Closed, Mode, Modes, closed_of, feet_of
 from drake_dae.trace.functions import TracedFunction
+
+_FORCES = ("constraint_force", "hole_force")
+_OF_HOLES = (("hole_mode", "closed", ""), ("hole_gap", "gap", "m"), ("hole_force", "force", "N"))
 
 
 @checked(ModelError)
@@ -35,6 +39,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         contacts: Name of a unilateral constraint -> its coefficient of restitution.
         structure: The structure of `model.dae`, if it is known.
         latches: The names of bilateral constraints that open and close by commands.
+        pegs: The pegs that enter holes.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -46,24 +51,34 @@ class ModalPorts(ParameterizedSystem, Plant):
         contacts: Mapping[str, float],
         structure: ConstraintStructure | None = None,
         latches: Sequence[str] = (),
+        pegs: Sequence[Peg] = (),
     ) -> None:
         if structure is not None:
             structure = constraint_structure_of(type(self).__name__, model.dae, structure)
-        self._contacts = bound = UnilateralContacts(model, contacts, latches)
-        dae = bound.dae
+        self._contacts = bound = UnilateralContacts(model, contacts, latches, pegs)
+        dae = model.dae
         signals = {"state": dae.state_signals, "control": dae.control_signals}
         super().__init__(dae, dae.parameter_values, signals)
         self.DeclareNumericParameter(BasicVector(bound.restitution))
         self.set_name(model.name)
         self.model: RobotModel = model
-        self.contacts, self.latches = bound.every, bound.latches
-        self.normals = tuple(bound.normals)
-        self.gap_signals = tuple(Signal(f"{name}.gap", "m") for name in bound.names)
-        self.mode_signals = tuple(Signal(f"{name}.closed") for name in bound.every)
+        self.contacts, self.latches = (*bound.shown, *latches), bound.latches
+        count = len(bound.every)
+        self.normals = tuple(bound.normals[: len(bound.shown)])
+        self.gap_signals = tuple(Signal(f"{name}.gap", "m") for name in bound.shown)
+        self.mode_signals = tuple(Signal(f"{name}.closed") for name in self.contacts)
+        own, m, in_holes = len(bound.shown), dae.num_constraints, bound.names[len(bound.shown) :]
+        self.hole_signals = {
+            name: tuple(Signal(f"{contact}.{kind}", unit) for contact in in_holes)
+            for name, kind, unit in _OF_HOLES
+            if in_holes
+        }
+        parts = {"mode": slice(len(self.contacts)), "gap": slice(own), "constraint_force": slice(m)}
+        in_hole = {"hole_mode": own, "hole_gap": own, "hole_force": m}
+        self._parts = parts | {name: slice(start, None) for name, start in in_hole.items()}
         self.modes = Modes(bound, structure)
         self._by_numbers: dict[bytes, Mode] = {}
         self._now: Mode | None = None
-        count = len(self.contacts)
         opened = self.modes((False,) * count, dae.nominal_state)
         start = opened.structure.manifold.project(dae.nominal_state)
         self.DeclareContinuousState(BasicVector(start))
@@ -75,7 +90,7 @@ class ModalPorts(ParameterizedSystem, Plant):
             self._latch_port = self.DeclareVectorInputPort("latch", len(latches))
         residual = bound.residual
         self._residual = dae.trace("constraint residual", {"value": residual})
-        moved = (dae.f, dae.g, dae.h, dae.l, dae.m, residual, dae.exogenous.rate(bound.drift))
+        moved = (dae.f, bound.dae.g, dae.h, dae.l, dae.m, residual, dae.exogenous.rate(bound.drift))
         self._by_state = state_tickets(self) | self._declare_exogenous(
             dae.exogenous.degrees(*moved)
         )
@@ -93,18 +108,24 @@ class ModalPorts(ParameterizedSystem, Plant):
         by_state, by_control, by_mode = self._by_state, self._by_control, {self.xd_ticket()}
         for name, size, value, tickets in (
             ("state", dae.num_states, self._state, by_state),
-            ("mode", count, self._mode_numbers, by_mode),
-            ("gap", len(bound.names), self._gap, by_state),
-            ("constraint_force", dae.num_constraints, self._force, by_control),
+            ("mode", len(self.contacts), self._mode_numbers, by_mode),
+            ("gap", own, self._gap, by_state),
+            ("constraint_force", m, self._force, by_control),
             ("constraint_residual", residual.numel(), self._held_residual, by_state),
             ("controlled_output", dae.num_outputs, self._output, by_control),
+            ("hole_mode", len(in_holes), self._mode_numbers, by_mode),
+            ("hole_gap", len(in_holes), self._gap, by_state),
+            ("hole_force", len(in_holes), self._force, by_control),
         ):
-            self.DeclareVectorOutputPort(name, size, port_value(value), tickets)
+            if in_holes or name not in in_hole:
+                part = [self._parts[name]] if name in self._parts else []
+                self.DeclareVectorOutputPort(name, size, port_value(value, *part), tickets)
         values, force = weakly(self._values), weakly(self._mode_force)
         self._ports = RobotPorts(self, model, values, force, self._by_state, self._by_control)
         self.wrench_signals = self._ports.wrench_signals
         names = ("gap", "constraint_force", "constraint_residual", "controlled_output")
-        self.functions = (*names, *self._ports.loop_signals)
+        of_hole = ("hole_gap", "hole_force") if in_holes else ()
+        self.functions = (*names, *of_hole, *self._ports.loop_signals)
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,), such as "<contact>.restitution".
@@ -138,13 +159,13 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     def _restitution_place(self, name: str) -> int | None:
         """The index of the contact whose coefficient of restitution has a name, or None."""
-        names = [f"{contact}.restitution" for contact in self._contacts.names]
+        names = [f"{contact}.restitution" for contact in self._contacts.shown]
         return names.index(name) if name in names else None
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         contacts = {"mode": self.mode_signals, "gap": self.gap_signals}
-        return {**self._ports.loop_signals, **contacts}
+        return {**self._ports.loop_signals, **contacts, **self.hole_signals}
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets x as given, shape (n,), all contacts open: a run finds its mode at its start.
@@ -153,11 +174,12 @@ class ModalPorts(ParameterizedSystem, Plant):
             ModelError: The shape is wrong.
         """
         super().set_state(context, state)
-        context.SetDiscreteState(np.zeros(len(self.contacts) + self._contacts.edges.size))
+        context.SetDiscreteState(np.zeros(len(self._contacts.every) + self._contacts.edges.size))
 
     def gaps(self, context: Context) -> FloatArray:
         """phi of each contact, m, shape (k,)."""
-        return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
+        gaps = self._contacts.gaps.evaluate(self.state(context), self._values(context))[0]
+        return gaps[: len(self.gap_signals)].copy()
 
     @cached_property
     def structure(self) -> ConstraintStructure:  # type: ignore[override]
@@ -166,9 +188,11 @@ class ModalPorts(ParameterizedSystem, Plant):
         Raises:
             ModelError: The contacts cannot be closed together, likewise as an AssumptionError.
         """
-        touching, nominal = (True,) * len(self._contacts.names), self.dae.nominal_state
+        contacts, nominal = self._contacts, self.dae.nominal_state
+        own = len(contacts.shown)
+        touching = (*(True for _ in contacts.shown), *(False for _ in contacts.names[own:]))
         try:
-            return self.modes((True,) * len(self.contacts), nominal).structure
+            return self.modes((*touching, *(True for _ in self.latches)), nominal).structure
         except (ModelError, AssumptionError):
             if not self.latches:
                 raise
@@ -180,17 +204,19 @@ class ModalPorts(ParameterizedSystem, Plant):
         return {**super().port_signals, "constraint_residual": residual}
 
     def closed(self, context: Context) -> tuple[str, ...]:
-        """The names of the contacts that are closed."""
+        """The names of the contacts that are closed, with those of pegs and latches."""
         self.check_context(context)
         shut = closed_of(self._numbers(context))
-        return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
+        every = self._contacts.every
+        return tuple(name for name, is_shut in zip(every, shut, strict=True) if is_shut)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """The values of a port of `functions` at given times, one row each; nan without a value.
 
         Args:
             port: The port's name.
-            given: "state", "mode", "parameters" and "control", one row for each time.
+            given: "state", "mode", "parameters" and "control", and with pegs "hole_mode", one row
+                for each time.
 
         Raises:
             ModelError: There is no such port.
@@ -198,8 +224,9 @@ class ModalPorts(ParameterizedSystem, Plant):
         if port not in self.functions:
             raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
         table = np.full((len(given["state"]), self.GetOutputPort(port).size()), np.nan)
-        for flags in np.unique(given["mode"], axis=0):
-            rows = np.flatnonzero((given["mode"] == flags).all(axis=1))
+        modes = np.column_stack([given["mode"], given.get("hole_mode", given["mode"][:, :0])])
+        for flags in np.unique(modes, axis=0):
+            rows = np.flatnonzero((modes == flags).all(axis=1))
             in_mode = {name: values[rows] for name, values in given.items()}
             mode = self.modes(closed_of(flags), in_mode["state"][0])
             if port == "constraint_residual":
@@ -207,12 +234,16 @@ class ModalPorts(ParameterizedSystem, Plant):
             else:
                 functions = {
                     "gap": self._contacts.gaps,
+                    "hole_gap": self._contacts.gaps,
                     "constraint_force": mode.force,
+                    "hole_force": mode.force,
                     "controlled_output": mode.output,
                     **self._ports.joints,
                 }
-                table[rows] = function_along(functions[port], in_mode)
-        return self._pushing(table) if port == "constraint_force" else table
+                values = function_along(functions[port], in_mode)
+                values = self._pushing(values) if port in _FORCES else values
+                table[rows] = values[:, self._parts.get(port, slice(None))]
+        return table
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         derivatives.SetFromVector(self._evaluate(self._mode(context).dynamics, context))
@@ -259,29 +290,29 @@ class ModalPorts(ParameterizedSystem, Plant):
         outcome = terms.painleve_outcome(bilateral, normals)
         if outcome is None:
             return error
-        names = [self.contacts[i] for i in places]
+        names = [contacts.names[i] for i in places]
         return contacts.painleve_error(error.time, error.state, names, outcome)
 
     def _numbers(self, context: Context) -> FloatArray:
         """The numbers of contacts and latches: 1 closed, 0 open, -1 beside a face; (k + l,)."""
         numbers: FloatArray = context.get_discrete_state_vector().value()
-        return numbers[: len(self.contacts)]
+        return numbers[: len(self._contacts.every)]
 
     def _feet(self, context: Context) -> Feet:
-        return feet_of(context.get_discrete_state_vector().value(), len(self.contacts))
+        return feet_of(context.get_discrete_state_vector().value(), len(self._contacts.every))
 
     def _state(self, context: Context) -> FloatArray:
         return context.get_continuous_state_vector().value()
 
-    def _mode_numbers(self, context: Context) -> FloatArray:
+    def _mode_numbers(self, part: slice, context: Context) -> FloatArray:
         # Beside a face a contact is open.
-        return np.maximum(self._numbers(context), 0.0)
+        return np.maximum(self._numbers(context), 0.0)[part]
 
     def _mode_force(self, context: Context) -> FloatArray:
-        return self._evaluate(self._mode(context).force, context)
+        return self._evaluate(self._mode(context).force, context)[: self.dae.num_constraints]
 
-    def _force(self, context: Context) -> FloatArray:
-        return self._pushing(self._mode_force(context))
+    def _force(self, part: slice, context: Context) -> FloatArray:
+        return self._pushing(self._evaluate(self._mode(context).force, context))[part]
 
     def _pushing(self, force: FloatArray) -> FloatArray:
         """Forces, along the last axis; those of contacts are at least zero.
@@ -298,5 +329,5 @@ class ModalPorts(ParameterizedSystem, Plant):
     def _held_residual(self, context: Context) -> FloatArray:
         return self._mode(context).holds * self._evaluate(self._residual, context)
 
-    def _gap(self, context: Context) -> FloatArray:
-        return self._evaluate(self._contacts.gaps, context)
+    def _gap(self, part: slice, context: Context) -> FloatArray:
+        return self._evaluate(self._contacts.gaps, context)[part]

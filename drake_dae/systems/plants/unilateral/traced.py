@@ -5,6 +5,7 @@ from functools import partial
 from itertools import product
 
 import casadi as ca
+import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import AssumptionError, ModelError
@@ -21,6 +22,7 @@ from drake_dae.systems.blocks.traced import (
     Projection,
     not_traced,
 )
+from drake_dae.systems.plants.pegs.opening import may_close
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.plants.unilateral.log import MARGIN
@@ -29,6 +31,10 @@ from drake_dae.trace.functions import TracedFunction
 
 MOST = 8
 """The largest number of modes, as of three contacts: each function contains all of them."""
+
+BESIDE = 1e-3
+"""The part of their usual spread by which states are off the nominal one, at which modes of pegs
+are examined."""
 
 
 class TracedContacts:
@@ -53,7 +59,8 @@ class TracedContacts:
     ) -> None:
         count = len(contacts.every)
         touching = product((False, True), repeat=len(contacts.names))
-        every = [(*closed, *latched) for closed, latched in product(touching, latch_sets)]
+        fitting = [closed for closed in touching if may_close(contacts.openings, closed)]
+        every = [(*closed, *latched) for closed, latched in product(fitting, latch_sets)]
         if len(every) > MOST:
             raise not_traced(f"a plant with {len(every)} modes of its contacts, more than {MOST},")
         dae = self._dae = contacts.dae
@@ -64,14 +71,19 @@ class TracedContacts:
         self._control = ca.SX.sym("control", dae.num_controls)
         size = dae.parameter_symbol.numel()
         # The coefficients of restitution come last; no motion depends on them.
-        self._all = ca.SX.sym("parameters", size + len(contacts.names))
+        self._all = ca.SX.sym("parameters", size + len(contacts.shown))
         self._parameters = self._all[:size]
         self._all_modes = [(closed, self._mode(closed)) for closed in every]
 
     def _mode(self, closed: Closed) -> Mode | None:
         """A mode; None if its contacts cannot be closed together."""
+        dae, state = self._dae, self._dae.nominal_state
+        if dae is not self._contacts.of_model:
+            # A peg at the very axis of its hole has no direction to its side.
+            random = np.random.default_rng(0).standard_normal(state.size)
+            state = state + BESIDE * dae.usual_spread(state) * random
         try:
-            return self._modes(closed, self._dae.nominal_state)
+            return self._modes(closed, state)
         except (AssumptionError, ModelError):
             return None
 
@@ -141,27 +153,30 @@ class TracedContacts:
         acting = ca.SX.sym("force", dae.num_constraints)
         pushing = ca.SX(acting)
         pushing[contacts.normals] = ca.fmax(pushing[contacts.normals], 0)
-        pushed = ca.Function("pushing", [acting], [pushing])
-        computations.append(Computation(pushed, ("acting_force",), ("constraint_force",)))
         x, mode, inputs = self._state, self._held, (self._state, self._parameters)
+        m, own = contacts.of_model.num_constraints, len(contacts.shown)
+        pushed = ca.Function("pushing", [acting], _apart(pushing, m))
+        forces = ("constraint_force", "hole_force")
+        computations.append(Computation(pushed, ("acting_force",), forces))
+        closed = _apart(ca.fmax(self._numbers, 0), own + len(contacts.latches))
         same = ca.Function(
-            "shown",
-            [x, mode],
-            [x, ca.fmax(self._numbers, 0), *(x[part] for part in ports.parts.values())],
+            "shown", [x, mode], [x, *closed, *(x[part] for part in ports.parts.values())]
         )
-        computations.append(Computation(same, (STATE, HELD), ("state", "mode", *ports.parts)))
+        shown_state = ("state", "mode", "hole_mode", *ports.parts)
+        computations.append(Computation(same, (STATE, HELD), shown_state))
         holds = {row: ca.fmax(mode[i], 0) for i, own in enumerate(contacts.rows()) for row in own}
         rows = [
             ca.repmat(ca.SX(holds.get(row, 1)), size, 1) for row, size in enumerate(contacts.sizes)
         ]
         residual = ca.vertcat(*rows) * self._residual.function.call(inputs)[0]
-        gap = contacts.gaps.function.call(inputs)[0]
-        shown = ca.Function("shown", [x, mode, self._all], [residual, gap])
-        computations.append(Computation(shown, by_state, ("constraint_residual", "gap")))
+        gaps = _apart(contacts.gaps.function.call(inputs)[0], own)
+        shown = ca.Function("shown", [x, mode, self._all], [residual, *gaps])
+        outputs = ("constraint_residual", "gap", "hole_gap")
+        computations.append(Computation(shown, by_state, outputs))
         wrenches = ca.Function(
             "wrenches",
             [x, acting, self._all],
-            ports.wrench_function.function.call([x, acting, self._parameters])[:1],
+            ports.wrench_function.function.call([x, acting[:m], self._parameters])[:1],
         )
         by_force = (STATE, "acting_force", PARAMETERS)
         computations.append(Computation(wrenches, by_force, ("constraint_wrenches",)))
@@ -215,6 +230,12 @@ class TracedContacts:
         return Projection(newton, self._dae.scale, partial(_project, self._modes, self._contacts))
 
 
+def _apart(values: ca.SX, count: int) -> list[ca.SX]:
+    """The values of the contacts of the model, as many, and those of pegs in holes."""
+    parts: list[ca.SX] = ca.vertsplit(ca.densify(values), [0, count, values.numel()])
+    return parts
+
+
 def _project(
     modes: Modes,
     contacts: UnilateralContacts,
@@ -222,6 +243,6 @@ def _project(
     parameters: FloatArray,
     held: FloatArray,
 ) -> FloatArray:
-    of_system = parameters[: parameters.size - len(contacts.names)]
+    of_system = parameters[: parameters.size - len(contacts.shown)]
     closed = closed_of(held[: len(contacts.every)])
     return modes(closed, state).structure.manifold.project(state, of_system)

@@ -1,0 +1,1 @@
+"""The contacts of a round peg with a hole in which it has clearance, which only a plant has."""
