@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from pydrake.common import RandomDistribution
+from pydrake.symbolic import Variable
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import (
     ConstantVectorSource,
@@ -10,6 +11,7 @@ from pydrake.systems.primitives import (
     Integrator,
     LinearSystem,
     RandomSource,
+    SymbolicVectorSystem,
     ZeroOrderHold,
 )
 from scipy.linalg import solve_discrete_lyapunov
@@ -66,6 +68,34 @@ def test_samples_of_several_rates_repeat_after_the_longest():
     assert found.rms("held").shape == (1,)
     with pytest.raises(ModelError, match="no signal 'hold'; did you mean 'held'"):
         found.rms("hold")
+
+
+def test_slopes_that_change_are_computed_as_often_as_needed():
+    """Noise times t^2 through z+ = 0.99 z: beside the sum over all samples, by one time alone.
+
+    With the slopes at the end for all samples it would be 70 per cent too much.
+    """
+    builder = DiagramBuilder()
+    source = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, PERIOD))
+    time, z, noise = Variable("t"), Variable("z"), Variable("n")
+    memory = builder.AddSystem(
+        SymbolicVectorSystem(
+            time=time,
+            state=[z],
+            input=[noise],
+            dynamics=[0.99 * z + time**2 * noise],
+            output=[z],
+            time_period=PERIOD,
+        )
+    )
+    builder.Connect(source.get_output_port(), memory.get_input_port())
+    builder.ExportOutput(memory.get_output_port(), "z")
+    diagram = builder.Build()
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    found = noise_spread(diagram, start, parameters, [1.0])
+    k = np.arange(100)
+    wanted = np.linalg.norm(0.99 ** (99 - k) * (PERIOD * k) ** 2)
+    assert found.rms("z")[0] == pytest.approx(wanted, rel=0.1)
 
 
 def test_other_random_numbers_have_their_own_deviation():

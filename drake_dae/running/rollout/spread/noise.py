@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,17 +17,15 @@ from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
 from drake_dae.running.rollout.events import distribution_of
 from drake_dae.running.rollout.problems import problems_of
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
-from drake_dae.running.rollout.spread.recursion import after, of_signals, reached
+from drake_dae.running.rollout.run import Run, RunProblem, Settings
+from drake_dae.running.rollout.spread.recursion import Step, of_signals, passed, reached
+from drake_dae.running.rollout.spread.slopes import PeriodSlopes, undisturbed
 from drake_dae.running.rollout.spread.waves import RoundedPositions, Rounding
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
-from drake_dae.running.rollout.stepping.interpreted import run
 
-_CHANGE, _LEAST = 1e-6, 1e-2
-"""The change of a value for a difference, relative to its size, of which the least is 0.01."""
-
-_OF_NOISE = 1e-3
-"""The change of a random number for a difference, relative to its deviation."""
+_OTHERWISE, _SHORTEST = 0.5, 12
+"""Between times by whose slopes a deviation differs by more than 50 %, there is another time,
+unless they are at most 12 periods apart."""
 
 _MOMENTS = {
     RandomDistribution.kUniform: (0.5, 12.0**-0.5),
@@ -101,9 +100,10 @@ def noise_spread(
         P_(k+1) = A P_k A^T + B B^T,    C P C^T + D D^T,
 
     and that of the change of the signals to the next period is that of (C A - C) dz_k + (C B - D)
-    n_k + D n_(k+1). A, B, C and D are differences of the step at each time of interest, and until
-    then the same since the time before: so there should be several during a motion. What rounds
-    has no slope: of the resolution of encoders nothing is counted (`drake-dae analyze` does).
+    n_k + D n_(k+1). A, B, C and D are differences of the step at each time of interest, and at
+    times between, where they change much; they hold for half of the way to the next time. What
+    rounds has no slope: of the resolution of encoders nothing is counted (`drake-dae analyze`
+    does).
 
     Args:
         loop: The closed loop, or a diagram of blocks that can be traced, as for `rollout`.
@@ -168,6 +168,22 @@ def spread_with_rounding(
     return NoiseSpread(np.array([time for time, _, _ in found]), signals(whole), signals(changes))
 
 
+class _Point(NamedTuple):
+    """A period of a run.
+
+    Attributes:
+        state, held: The states where it begins.
+        passed, middle: The rows of signals in the middle of periods before it, and in its own.
+        step: Its A, B, C and D.
+    """
+
+    state: FloatArray
+    held: FloatArray
+    passed: FloatArray
+    middle: FloatArray
+    step: Step
+
+
 class _Samples:
     """The periods of the samples in a run without noise, one after the other."""
 
@@ -186,7 +202,7 @@ class _Samples:
                 "with the longest of their periods"
             )
         self._functions, self._settings, self._problem = functions, settings, problem
-        self._state, self._held, self._index = problem.state, problem.held, 0
+        self._index = 0
         self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
         self._deviations = np.zeros(problem.noise.shape[1])
         for source, part in functions.program.compiled.noise:
@@ -197,94 +213,87 @@ class _Samples:
         self._rounded = None
         if rounding is not None:
             self._rounded = RoundedPositions(functions.program, rounding, size)
+        self._points: dict[int, _Point] = {}
+        self._points[0] = self._point(problem.state, problem.held, 0, np.zeros((0, 0)))
 
     def at(self, time: float) -> tuple[float, FloatArray, FloatArray]:
         """The time of a period, and the deviations of all signals and of their changes there."""
         # The signals are those at the end of the period that begins here.
         index = max(round((time - self._begun) / self._period), 1) - 1
-        since = index - self._index
-        middles = self._index + 0.5 + np.arange(since + 1)
-        passed = []
-        if since:
-            done = self._run(np.array([self._index, *middles[:-1], index]))
-            passed.append(done.rows[1:-1])
-            self._state, self._held, self._index = done.state, done.held, index
-        of_state, of_noise = self._slopes()
-        size = self._state.size + self._held.size
-        (a, c), (b, d) = np.split(of_state, [size]), np.split(of_noise, [size])
-        # Without these, differences of counters would count, which no noise reaches.
-        reached_by_noise = reached(a, b)
-        a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
-        a[~reached_by_noise] = 0.0
-        self._spread = after(a, b @ b.T, since, self._spread)
-        whole, change = of_signals((a, b, c, d), self._spread)
-        if self._rounded is not None:
-            passed.append(self._run(np.array([index, middles[-1], index + 1])).rows[1:-1])
-            whole, change = self._rounded.after((a, b, c, d), np.vstack(passed), whole)
+        whole, change = self._go_on(index)
         return (
             self._begun + (index + 1) * self._period,
             np.sqrt(np.maximum(whole, 0.0)),
             np.sqrt(np.maximum(change, 0.0)),
         )
 
-    def _run(
-        self, times: FloatArray, change: FloatArray | None = None, noise: FloatArray | None = None
-    ) -> Run:
-        """Runs from here, with a change of state and held values, and with noise.
+    def _go_on(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Goes on to a period; the variances of the signals and of their changes there."""
+        begun, since = self._index, index - self._index
+        if index not in self._points:
+            middles = begun + 0.5 + np.arange(since + 1 if self._rounded is not None else 1)
+            done = self._run(begun, np.array([begun, *middles[:-1], index]))
+            self._points[index] = self._point(done.state, done.held, index, done.rows[1:-1])
+        first, last = self._points[begun], self._points[index]
+        if since > _SHORTEST and self._differ(first.step, last.step, since):
+            self._go_on(begun + since // 2)
+            return self._go_on(index)
+        self._index = index
+        for before in [each for each in self._points if each < index]:
+            del self._points[before]
+        self._spread = passed(first.step, last.step, since, self._spread)
+        whole, change = of_signals(last.step, self._spread)
+        if self._rounded is not None:
+            rows = np.vstack([last.passed[len(last.passed) - since :], last.middle])
+            whole, change = self._rounded.after(first.step, last.step, rows, whole)
+        return whole, change
 
-        Args:
-            times: The times of its rows in periods, from this one to another.
-            change, noise: The changes; None for none.
-        """
-        state, held = self._state, self._held
-        part = self._updates(times[-1])
-        if change is not None:
-            state, held = state + change[: state.size], held + change[state.size :]
-        problem = replace(
+    def _differ(self, first: Step, last: Step, since: int) -> bool:
+        """Whether signals spread otherwise by periods like the first than like the last."""
+        by_each = (
+            of_signals(last, passed(each, each, since, self._spread))[0] for each in (first, last)
+        )
+        less, more = np.sort(np.sqrt(np.maximum(list(by_each), 0.0)), axis=0)
+        return bool(np.any(more > (1.0 + _OTHERWISE) * less))
+
+    def _point(
+        self, state: FloatArray, held: FloatArray, index: int, passed: FloatArray
+    ) -> "_Point":
+        """A period, with the rows in the middle of those before it."""
+        point = _Point(state, held, passed, passed, (passed,) * 4)
+        self._points[index] = point
+        period = self._problem_of(index, np.array([index, index + 1.0]))
+        a, b, c, d = PeriodSlopes(self._functions, self._settings, period, self._deviations).step()
+        # Without these, differences of counters would count, which no noise reaches.
+        reached_by_noise = reached(a, b)
+        a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
+        a[~reached_by_noise] = 0.0
+        middle = passed
+        if self._rounded is not None:
+            middle = self._run(index, index + np.array([0.0, 0.5, 1.0])).rows[1:-1]
+            passed = passed.reshape(-1, middle.shape[1])
+        return _Point(state, held, passed, middle, (a, b, c, d))
+
+    def _problem_of(self, index: int, times: FloatArray) -> RunProblem:
+        """The run from a period without noise, with rows at these times in periods."""
+        point, part = self._points[index], self._updates(index, times[-1])
+        return replace(
             self._problem,
             times=self._begun + self._period * times,
-            state=state,
-            held=held,
+            state=point.state,
+            held=point.held,
             events=self._problem.events[part],
             due=self._problem.due[part],
-            noise=self._quiet[part] if noise is None else self._quiet[part] + noise,
+            noise=self._quiet[part],
         )
-        done = run(self._functions, self._settings, problem)
-        if done.ending != RunEnding.DONE:
-            raise ModelError(
-                f"{self._functions.program.name} has no spread by noise: its run without noise "
-                f"ends at {done.time:.6g} s"
-            )
-        return done
 
-    def _updates(self, last: float) -> slice:
-        """The updates from here to a period, which may be at times that differ by round-off."""
-        ends = self._begun + self._period * (np.array([self._index, last]) - SAME)
+    def _run(self, index: int, times: FloatArray) -> Run:
+        return undisturbed(self._functions, self._settings, self._problem_of(index, times))
+
+    def _updates(self, first: int, last: float) -> slice:
+        """The updates from a period to another, which may be at times that differ by round-off."""
+        ends = self._begun + self._period * (np.array([first, last]) - SAME)
         return slice(*np.searchsorted(self._problem.events, ends).tolist())
-
-    def _slopes(self) -> tuple[FloatArray, FloatArray]:
-        """The slopes of states, held values and signals after a period, by both and by noise."""
-        values = np.concatenate([self._state, self._held])
-        sizes = _CHANGE * np.maximum(np.abs(values), _LEAST)
-        period = np.array([self._index, self._index + 1.0])
-
-        def column(change: FloatArray | None, noise: FloatArray | None) -> FloatArray:
-            done = self._run(period, change, noise)
-            return np.concatenate([done.state, done.held, done.rows[-1]])
-
-        drawn = self._quiet[self._updates(self._index + 1)].shape
-        count = int(np.prod(drawn))
-        by_values = [
-            (column(change, None) - column(-change, None)) / (2.0 * size)
-            for change, size in zip(np.diag(sizes), sizes, strict=True)
-        ]
-        by_noise = [
-            (column(None, noise) - column(None, -noise)) / (2.0 * _OF_NOISE)
-            for one in np.eye(count)
-            for noise in [_OF_NOISE * self._deviations * one.reshape(drawn)]
-        ]
-        rows = values.size + self._functions.program.width
-        return np.array(by_values).T, np.array(by_noise).T.reshape(rows, count)
 
 
 def _divides(part: float, period: float) -> bool:

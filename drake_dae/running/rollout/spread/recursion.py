@@ -13,7 +13,7 @@ def of_signals(step: Step, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
     a, b, c, d = step
     changed, drawn = c @ a - c, c @ b - d
     whole, change = (
-        np.einsum("ij,jk,ik->i", row, spread, row) + rest
+        np.sum((row @ spread) * row, axis=1) + rest
         for row, rest in (
             (c, np.sum(d**2, axis=1)),
             (changed, np.sum(drawn**2, axis=1) + np.sum(d**2, axis=1)),
@@ -30,6 +30,13 @@ def reached(a: FloatArray, b: FloatArray) -> Booleans:
         if (more == found).all():
             return found
         found = more
+
+
+def passed(first: Step, last: Step, count: int, spread: FloatArray) -> FloatArray:
+    """P after some periods, the first half of which are like one and the others like another."""
+    for (a, b, _, _), some in ((first, count // 2), (last, count - count // 2)):
+        spread = after(a, b @ b.T, some, spread)
+    return spread
 
 
 def after(a: FloatArray, noise: FloatArray, count: int, spread: FloatArray) -> FloatArray:

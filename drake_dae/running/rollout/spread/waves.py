@@ -8,7 +8,7 @@ from scipy.linalg import schur, solve_triangular
 
 from drake_dae.arrays import FloatArray
 from drake_dae.running.rollout.program import RolloutProgram
-from drake_dae.running.rollout.spread.recursion import Step, after, of_signals
+from drake_dae.running.rollout.spread.recursion import Step, of_signals, passed
 
 ComplexArray = NDArray[np.complex128]
 
@@ -95,16 +95,16 @@ class RoundedPositions:
         self._spread, self._count = np.zeros((size, size)), 0
 
     def after(
-        self, step: Step, rows: FloatArray, as_noise: FloatArray
+        self, first: Step, last: Step, rows: FloatArray, as_noise: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """The variances of all signals and of their changes after further periods.
 
         Args:
-            step: Of each of these periods.
+            first, last: Steps like those of the first and of the second half of these periods.
             rows: The signals without noise in the middle of each of them, and of the next.
             as_noise: The variances of the signals if all that is rounded were white noise.
         """
-        (a, b, c, d), rounding, since = step, self._rounding, len(rows) - 1
+        (a, b, c, d), rounding, since = last, self._rounding, len(rows) - 1
         positions, entries = self._positions, self._entries
         waves = rounding.waves(np.sqrt(as_noise[positions]))
         # Of the updates in a period, those at which encoders are read.
@@ -120,12 +120,19 @@ class RoundedPositions:
         square = np.einsum("jf,frj->fr", shares, np.square(np.abs(gains)))
         turned = np.square(2.0 * np.sin(np.pi * frequencies))
         follows = -np.einsum("jf,fjj->j", shares, gains[:, positions].real) / rounding.unit
-        left = np.ones((b.shape[1] // self._draws, self._draws))
-        left[:, entries] += 2.0 * np.maximum(follows, 0.0) - np.sum(waves, axis=0)
-        root = np.sqrt(np.maximum(left.ravel(), 0.0))
-        self._spread = after(a, (b * root) @ (b * root).T, since, self._spread)
-        whole, change = of_signals((a, b * root, c, d * root), self._spread)
+        left = np.ones(self._draws)
+        left[entries] += 2.0 * np.maximum(follows, 0.0) - np.sum(waves, axis=0)
+        root = np.sqrt(np.maximum(left, 0.0))
+        first, last = (self._weighed(each, root) for each in (first, last))
+        self._spread = passed(first, last, since, self._spread)
+        whole, change = of_signals(last, self._spread)
         return whole + np.sum(square, axis=0), change + turned @ square
+
+    def _weighed(self, step: Step, root: FloatArray) -> Step:
+        """A step with other deviations of the random numbers that are drawn at each update."""
+        a, b, c, d = step
+        roots = np.tile(root, b.shape[1] // self._draws)
+        return a, b * roots, c, d * roots
 
 
 def _shares(waves: FloatArray, turns: FloatArray, frequencies: FloatArray) -> FloatArray:
