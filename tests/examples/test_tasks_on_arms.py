@@ -49,6 +49,18 @@ def test_each_arm_inserts_the_peg_with_no_more_force_than_predicted(arm, example
     assert 1.0 < forces.max() < max(peaks.values())
 
 
+@pytest.mark.parametrize("arm", ["ur5", "panda"])
+def test_each_arm_inserts_the_peg_in_ideal_contact_into_a_hole_that_is_half_a_degree_off(
+    arm, example
+):
+    peg = "plant=!IdealConstraints {pegs: [{constraint: wall, radius: 0.00495, length: 0.02}]}"
+    tilted = "plant_parameters.wall.rpy=[0.007, 0.00525, 0]"
+    _, found, changes = rolled(example, f"peg_in_hole-{arm}", peg, tilted)
+    assert found.failure is None
+    assert (changes[-1].phase, changes[-1].reason) == ("done", "after a depth of 0.015 m")
+    assert found.record["hole_force"].max() < 15.0
+
+
 def test_pegs_that_are_too_thick_are_counted_as_not_inserted(example, capsys):
     """The command of many pegs is that of `examples/insertions`, with the settings of the arm."""
     thick = "plant.pegs.0.radius=0.0051"

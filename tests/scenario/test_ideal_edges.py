@@ -106,3 +106,35 @@ def test_an_insertion_on_ideal_contact_is_refused_before_the_run(plant):
     with pytest.raises(ScenarioError, match=r"plant: .* face that ends, and no sides") as caught:
         build_scenario(scenario("peg_in_hole", f"plant={plant}"))
     assert "Insert enters a hole" in str(caught.value)
+
+
+PEG = "plant=!IdealConstraints {pegs: [{constraint: wall, radius: 0.00495, length: 0.02}]}"
+
+
+def test_pegs_of_ideal_contact_need_a_contact_that_opens_and_do_not_end_in_the_hole():
+    with pytest.raises(ScenarioError, match=r"plant\.pegs: a peg is for a contact that opens"):
+        build_scenario(scenario("two_link_wall", PEG))
+    with pytest.raises(
+        ScenarioError, match=r"task\.phases: Insert is 0\.02 m deep, .* less than 0\.02"
+    ):
+        build_scenario(scenario("peg_in_hole", PEG, "task.phases.4.depth=0.02"))
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_peg_is_inserted_in_ideal_contact():
+    """Into a hole that is 2 mm and 0.3 degrees off, in which it may tilt by 0.4 degrees."""
+    tilted = "plant_parameters.wall.rpy=[0, 0.0042, 0.00315]"
+    chosen = scenario("peg_in_hole", PEG, tilted)
+    loop, context = build_scenario(chosen)
+    found = roll_scenario(chosen, loop, context)
+    assert found.failure is None
+    last = loop.changes(found.context)[-1]
+    assert (last.phase, last.reason) == ("done", "after a depth of 0.015 m")
+    record = found.record
+    # It slides through the chamfer, and then along the side or at the rim.
+    assert 0.1 < record["hole_force"].max() < 1.0
+    assert {"wall.chamfer"} < {name for event in record.events for name in event.contacts}
+    inside = record["gap"][:, 0] < -0.002
+    assert record["hole_gap"][inside][:, 1:].min() > -1e-9
+    assert 0.0 < record["hole_gap"][inside][:, 1:].max() <= 1e-4 + 1e-9
