@@ -19,7 +19,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.feasibility.faces import FaceNeeds, FaceTips
 from drake_dae.scenario.feasibility.holding import HoldingWatch
-from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces
+from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces, misfit
 from drake_dae.scenario.feasibility.touches import TaskTouch, period_of, touches_of
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
@@ -184,7 +184,7 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
         for needs in phases
         if needs.is_singular
     ]
-    problems += trips
+    problems += [*trips, *filter(None, [misfit(scenario, model)])]
     outcome, failed = _outcome(record, changes, found.failure)
     if failed and not (changes and _feels_shape(plan, changes)):
         problems.append(outcome)
