@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from runs import scenario
 
 from drake_dae import build_scenario, load_scenario
+from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
@@ -127,3 +128,44 @@ def test_a_tool_that_is_thicker_than_its_hole_is_told():
 def test_a_tool_that_is_thicker_than_its_hole_is_a_problem():
     thick = scenario("peg_in_hole", "plant.pegs.0.radius=0.005", "duration=0.1")
     assert re.search("Insert cannot enter the hole", "\n".join(find_feasibility(thick).problems))
+
+
+GUARDED = (
+    "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}, "
+    "!Move {references: {tool.z: 0.35, wall.force: 10}, duration: 0.4, over: 0.2, "
+    "guards: [{of: travel, most: 0.01}], on_failure: away}, !Release {}, "
+    "!Retreat {name: away, distance: 0.01, over: 0.1}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("settings", "outcome"),
+    [
+        ([], r"the task was done at \S+ s, in 4 phases"),
+        (["duration=0.5"], "the run ended during phase 5, away"),
+    ],
+)
+def test_analysis_tells_which_guard_ends_a_phase(file, settings, outcome):
+    needs = find_feasibility(load_scenario(file, [GUARDED, *settings])).task
+    after = r".*; at 0\.4\d* s Move is ended by a travel of 0.01\S* m, .* away followed, as chosen"
+    assert re.search(outcome + after, needs.outcome), needs.outcome
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "is_known"), [("", False), ("0.3", True)])
+def test_friction_that_the_law_does_not_know_is_a_reason(
+    file, friction, is_known, tmp_path, capsys
+):
+    """It pulls the tool back while it moves along the wall."""
+    settings = [
+        "plant=!MultibodyPlant {stiffness: 1.0e5, friction: 0.3}",
+        "task.phases=[!Approach {}, !Press {force: 10}, "
+        "!Move {references: {tool.z: 0.3, wall.force: 10}, duration: 0.5}]",
+        "duration=2",
+        *([f"constraints.0.friction={friction}"] if friction else []),
+    ]
+    command = ["simulate", str(file), "--out", str(tmp_path / "run"), "--rollout"]
+    main([*command, *(part for text in settings for part in ("--set", text))])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Likely because" in told
+    assert ("friction that the law does not know" in told) is not is_known

@@ -241,7 +241,7 @@ def _outcome(
         return str(failure), True
     empty = np.zeros_like(record["tracking_error"])
     job = judge_job(record, empty, changes=changes)
-    return [*job.problems, *job.remarks][0], job.outcome is not JobOutcome.GOOD
+    return "; ".join([*job.problems, *job.remarks]), job.outcome is not JobOutcome.GOOD
 
 
 def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:
