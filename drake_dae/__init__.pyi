@@ -4,9 +4,9 @@ from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
 from .compiler.compile import compile_diagram as compile_diagram
-from .dae.beyond.contact_advice import AdvisedGains as AdvisedGains
-from .dae.beyond.contact_advice import SensedContact as SensedContact
-from .dae.beyond.contact_advice import advised_gains as advised_gains
+from .dae.beyond.advising.contact_advice import AdvisedGains as AdvisedGains
+from .dae.beyond.advising.contact_advice import advised_gains as advised_gains
+from .dae.beyond.advising.directions import SensedContact as SensedContact
 from .dae.beyond.contact_gains import ContactGains as ContactGains
 from .dae.beyond.contact_gains import contact_gains as contact_gains
 from .dae.beyond.disturbance import with_disturbance as with_disturbance

@@ -43,6 +43,8 @@ class LoopSettings:
         governed: The limits that a `PathGovernor` keeps by slowing down the references; None for no
             governor. If `control_limits` are given as well, `FeasibleControl` keeps both, and the
             record has its "departure".
+        slowed: The limits at which the governor slows the references down, before those of
+            `governed` are reached, with room for errors of the model; those of `governed` if None.
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
         signals: Name -> reference of a signal for which a controller waits, such as phases of a
             task; the signal is set where the reference is above 1/2. For any other signal the loop
@@ -61,6 +63,7 @@ class LoopSettings:
     exogenous: Sequence[Reference] = ()
     plant_exogenous: Sequence[Reference] | None = None
     governed: MotionLimits | None = None
+    slowed: MotionLimits | None = None
     tolerances: Tolerances | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
     commands: CommandLimits | None = None

@@ -94,7 +94,8 @@ def make_closed_loop(
     reference = make_generator(references, law, settings)
     if settings.governed is not None:
         start = settings.start_time
-        reference = PathGovernor(references, law, settings.governed, start, period)
+        kept = settings.slowed or settings.governed
+        reference = PathGovernor(references, law, kept, start, period)
     try:
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:

@@ -116,6 +116,7 @@ def build_loop(
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
         governed=None if motion is None else motion.governed,
+        slowed=None if motion is None else motion.slowed,
         tolerances=scenario.tolerances,
         signals={} if task is None or commands is not None else task.signals,
         commands=commands,

@@ -32,6 +32,7 @@ from drake_dae.scenario.parts.families import (
     Force,
     ForceOutput,
     Gains,
+    LargestErrors,
     Law,
     Load,
     Observer,
@@ -138,6 +139,8 @@ class Scenario:
         largest_roughness: The largest permitted rms change of the controls from sample to sample by
             the noise of `encoders`, over all joints, in N m, for computed gains; if left out 0.3 %
             of the largest effort limit, or 1 N m without limits.
+        largest_errors: The largest permitted errors for computed gains: those are then the
+            smoothest ones within them, and without a bound the ones with the least errors.
         plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
             MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.
@@ -187,6 +190,7 @@ class Scenario:
     observer: Observer | None = None
     identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None
+    largest_errors: LargestErrors | None = None
     plant: Plant = field(default_factory=plants.IdealConstraints)
     sampling: Sampling | None = None
     encoders: Encoders | None = None

@@ -23,6 +23,7 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sensed import sensed_contact
 from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.parts import parts as parts
@@ -91,6 +92,28 @@ def test_a_roughness_without_use_is_refused():
 def test_a_noise_that_no_gains_smooth_is_named():
     with pytest.raises(ScenarioError, match="noise of the position changes"):
         chosen(two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4"))
+
+
+def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():
+    free, bound = (
+        build_completed(two_link("encoders={resolution: 1.0e-5}", *more))[0]
+        for more in ((), ("largest_errors={position: 1.0e-3}",))
+    )
+    assert bound.scenario.gains.outputs["tool.z"] < free.scenario.gains.outputs["tool.z"]
+    assert bound.scenario.largest_errors is None
+    with pytest.raises(ScenarioError, match="gains: the error in free directions is"):
+        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_errors={position: 1.0e-7}"))
+    with pytest.raises(ScenarioError, match="largest_errors: it is used only for gains"):
+        chosen(two_link("largest_errors={force: 0.1}"))
+    with pytest.raises(ScenarioError, match="largest force error must be positive"):
+        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_errors={force: 0}"))
+
+
+def test_gains_that_cannot_be_computed_are_a_problem_before_a_run():
+    found = find_feasibility(
+        two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4")
+    )
+    assert any("noise of the position changes" in problem for problem in found.problems)
 
 
 @pytest.mark.slow

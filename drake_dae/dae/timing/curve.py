@@ -26,6 +26,9 @@ from drake_dae.errors import ReferenceSignalError
 REST = 1e-9
 """A reference is at rest where its speed is below this fraction of the largest speed."""
 
+NEAR_REST = 1e3
+"""The speed at which a turn is a rest, relative to that of a rest."""
+
 TURN = 0.5
 """The cosine between directions of neighbouring samples below which a rest is looked for."""
 
@@ -188,7 +191,7 @@ class Curve:
         else:
             limits = (times[k], times[after])
             turn = float(minimize_scalar(speed, bounds=limits, method="bounded").x)
-        return turn if speed(turn) < 1e3 * self._rest else None
+        return turn if speed(turn) < NEAR_REST * self._rest else None
 
     def _pause(self, first: float, last: float, count: int) -> Piece:
         times = np.linspace(first, last, count + 1)  # Forces go on, as straight lines between.
@@ -205,7 +208,7 @@ class Curve:
         middle = np.linalg.norm(rates, axis=1)
         units = rates / np.maximum(middle, self._rest)[:, None]
         turned = np.linalg.norm(np.diff(units, axis=0, prepend=units[:1]), axis=1) / (2.0 * np.pi)
-        moves = middle > self._rest
+        moves = middle > NEAR_REST * self._rest  # The last of a motion has no direction.
         turned[~(moves & np.append(moves[0], moves[:-1]))] = 0.0
         lengths = middle * np.diff(fine)
         far = np.concatenate([[0.0], np.cumsum(lengths / lengths.sum() + turned)])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_dae.dae.beyond.contact_advice import advised_gains
+from drake_dae.dae.beyond.advising.contact_advice import advised_gains
 from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
 from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.dae.structure.structure import Structure
@@ -12,6 +12,7 @@ from drake_dae.dae.tracking.constraint_damping import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.sensed import (
+    largest_errors,
     largest_roughness,
     moved_points,
     predicted,
@@ -71,24 +72,14 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
 
     Raises:
         ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
-            enough; or `largest_roughness` is given and not used.
+            enough; or `largest_roughness` or `largest_errors` is given and not used.
     """
     material = scenario.plant.material
-    is_advised = material is not None and scenario.is_advised
-    if scenario.largest_roughness is not None:
-        if not is_advised or scenario.encoders is None or scenario.is_cascade:
-            text = (
-                "it is used only for gains that are computed for rigid joints with encoders in "
-                "Drake's contact; leave it out, or leave `gains` out and give encoders"
-            )
-            raise ScenarioError(("largest_roughness", text))
-        if not scenario.largest_roughness > 0.0:
-            value = f"must be positive, got {scenario.largest_roughness:g} N m"
-            raise ScenarioError(("largest_roughness", value))
+    _check_bounds(scenario)
     if scenario.is_cascade:
         scenario = with_loop(scenario)
         model, structure = law_robot(scenario, model, structure)
-    if material is None or not is_advised:
+    if material is None or not scenario.is_advised:
         return Completed(scenario)
     if model.stages:
         text = (
@@ -118,7 +109,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     else:
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
         with at("gains"):
-            best = advised_gains(sensed, largest_roughness(scenario, model))
+            errors = largest_errors(scenario)
+            best = advised_gains(sensed, largest_roughness(scenario, model), **errors)
         contact, fast = best.gains, best.state_rate
         known_by, outlook = "these encoders", f". {predicted(best)}"
     names = [signal.name for signal in model.dae.output_signals]
@@ -176,6 +168,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         observer=observer,
         force_feedback=force,
         largest_roughness=None,
+        largest_errors=None,
     )
     identified = ", ".join(observer.identify_friction) or "none"
     estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
@@ -190,3 +183,22 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{touch_note}"
     )
     return Completed(chosen, (note,))
+
+
+def _check_bounds(scenario: Scenario) -> None:
+    """Checks that bounds for computed gains are used.
+
+    Raises:
+        ScenarioError: One is not, or is not positive.
+    """
+    is_used = scenario.is_advised and scenario.encoders is not None and not scenario.is_cascade
+    for name in ("largest_roughness", "largest_errors"):
+        if getattr(scenario, name) is not None and not is_used:
+            text = (
+                "it is used only for gains that are computed for rigid joints with encoders in "
+                "Drake's contact; leave it out, or leave `gains` out and give encoders"
+            )
+            raise ScenarioError((name, text))
+    if scenario.largest_roughness is not None and not scenario.largest_roughness > 0.0:
+        value = f"must be positive, got {scenario.largest_roughness:g} N m"
+        raise ScenarioError(("largest_roughness", value))

@@ -4,7 +4,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.beyond.contact_advice import EVERY, MODEL_ERROR, AdvisedGains, SensedContact
+from drake_dae.dae.beyond.advising.contact_advice import AdvisedGains
+from drake_dae.dae.beyond.advising.directions import EVERY, MODEL_ERROR, SensedContact
 from drake_dae.dae.beyond.one_direction import SensorNoise
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.robots.links.links import velocities_are_rates
@@ -93,6 +94,12 @@ def largest_roughness(scenario: Scenario, model: RobotModel) -> float:
         return scenario.largest_roughness
     finite = model.control_limits[np.isfinite(model.control_limits)]
     return _SHARE * float(np.max(finite, initial=1.0 / _SHARE if not finite.size else 0.0))
+
+
+def largest_errors(scenario: Scenario) -> dict[str, float]:
+    """The bounds of errors, by the names that `advised_gains` has for them."""
+    given = {} if scenario.largest_errors is None else vars(scenario.largest_errors)
+    return {f"{name}_error": most for name, most in given.items() if most is not None}
 
 
 def moved_points(model: RobotModel) -> list[str]:

@@ -23,15 +23,20 @@ class TimedScenario:
 
     Attributes:
         reference: Its reference, for all outputs.
-        governed: The robot's limits, which a governor keeps during the run; None without governor.
+        governed: The robot's limits, which are kept during the run; None without governor.
+        slowed: The limits at which a governor slows the motion down; None without governor.
     """
 
     reference: TimeOptimalReference
-    governed: MotionLimits | None
+    governed: MotionLimits | None = None
+    slowed: MotionLimits | None = None
 
 
 LATE = 0.5
 """The time in s by which a run with a governor is longer than the motion."""
+
+OF_CONES = 0.99
+"""The fraction of the friction of cones that a motion may use; the rest is left for feedback."""
 
 MOST_CAUSES = 3
 """The largest number of limits in a note."""
@@ -71,7 +76,8 @@ def timed(
             efforts=settings.efforts,
             joint_speeds=settings.joint_speeds,
             joint_accelerations=settings.joint_accelerations,
-            **contacts,
+            forces=settings.forces,
+            cones=[replace(cone, friction=OF_CONES * cone.friction) for cone in settings.cones],
         )
         profile = PathTiming(structure, limits).profile(
             references,
@@ -97,10 +103,12 @@ def timed(
             f"{', '.join(free)} has no effort limit: where no motion along the path is within the "
             "limits, the error stays as predicted and they are exceeded"
         )
+    if not settings.governor:
+        return Completed(scenario, tuple(notes)), TimedScenario(reference)
     # Half of what the profile leaves of the speeds is for errors of the model: a joint whose
     # acceleration is da more than the model's exceeds its limit by da / APPROACH.
     speeds = (1.0 + settings.joint_speeds) / 2.0
-    governed = robot_motion_limits(model, joint_speeds=speeds, **contacts)
-    return Completed(scenario, tuple(notes)), TimedScenario(
-        reference, governed if settings.governor else None
+    governed, slowed = (
+        robot_motion_limits(model, joint_speeds=share, **contacts) for share in (1.0, speeds)
     )
+    return Completed(scenario, tuple(notes)), TimedScenario(reference, governed, slowed)

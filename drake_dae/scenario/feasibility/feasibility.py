@@ -9,11 +9,11 @@ from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.errors import AssumptionError
+from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
 from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
 from drake_dae.robots.link_side import link_side
@@ -112,6 +112,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             task=needs,
             sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
         )
+    gains = _without_gains(scenario, model, structure)
     in_time, motion_in_time = timed(scenario, model, structure)
     scenario = in_time.scenario
     laws = None
@@ -168,7 +169,17 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             if motion is None
             else sticking_note(scenario, model, motion.states, motion.constraint_inputs)
         ),
+        gains=gains,
     )
+
+
+def _without_gains(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
+    """Why no gains can be computed where they are left out, else empty."""
+    try:
+        advised(scenario, model, structure)
+    except ScenarioError as error:
+        return str(error)
+    return ""
 
 
 def sample_times(

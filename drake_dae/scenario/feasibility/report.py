@@ -85,6 +85,7 @@ class Feasibility:
         laws: The requirements of two laws for springs; None without springs or samples.
         task: The requirements of a task, phase by phase; None without a task.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
+        gains: Why no gains can be computed where they are left out, else empty.
     """
 
     analysis: Analysis
@@ -98,6 +99,7 @@ class Feasibility:
     laws: SpringLaws | None = None
     task: TaskNeeds | None = None
     sticking: str = ""
+    gains: str = ""
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -117,6 +119,7 @@ class Feasibility:
             *map(_left, _beyond(self.joints)),
             *self.wrong_sides,
             *(() if self.task is None else self.task.problems),
+            *([self.gains] if self.gains else []),
         )
 
     def __repr__(self) -> str:

@@ -119,6 +119,7 @@ Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 ErrorBound = Annotated[error_bound.ErrorBound, Form()]
 Observer = Annotated[parts.Observer, Form()]
+LargestErrors = Annotated[parts.LargestErrors, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]
 _Guards = Annotated[
     tuple[Annotated[phases.PhaseGuard, Form()], ...], pydantic.Strict(False)

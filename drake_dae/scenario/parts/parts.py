@@ -177,6 +177,24 @@ class SpringCascadeForm:
 
 
 @dataclass(frozen=True)
+class LargestErrors:
+    """The largest rms errors by which gains are computed, see `AdvisedGains`.
+
+    Attributes:
+        position: Of a point that follows a path, in m; no bound if left out.
+        force: Of a contact force, in N; no bound if left out.
+    """
+
+    position: float | None = None
+    force: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in vars(self).items():
+            if most is not None:
+                positive(f"largest {name} error", most)
+
+
+@dataclass(frozen=True)
 class Observer(Observing):
     """The settings of a `DisturbanceObserver` of model errors.
 

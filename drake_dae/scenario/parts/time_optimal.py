@@ -30,7 +30,7 @@ class TimeOptimal:
             use, if the robot's file has such limits.
         forces: Constraint force -> its least and its largest value in N or N m; null
             for none. Unilateral forces are 0 or more.
-        cones: Friction cones of contacts that must not slide.
+        cones: Friction cones of contacts that must not slide; the motion uses 99 % of them.
         largest_rate: The largest ratio of the motion's speed to that of the references. With 1 the
             motion is only slowed down. No limit if left out.
         until: The time of the references at which the path ends, in s. If left out it is

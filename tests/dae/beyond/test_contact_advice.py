@@ -76,6 +76,38 @@ def test_less_roughness_leaves_more_error():
     assert smooth.position_error * smooth.force_error > rough.position_error * rough.force_error
 
 
+def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
+    """Each bound alone leaves the other error as small as the roughness allows."""
+    given = situation(1e-5, 1e5, 0.03, 1)
+    best = advised_gains(given, 1.0)
+    near = advised_gains(given, 1.0, position_error=4.0 * best.position_error)
+    assert best.position_error < near.position_error <= 4.0 * best.position_error
+    assert near.roughness < 0.9 * best.roughness
+    assert near.force_error == pytest.approx(best.force_error, rel=0.1)
+    soft = advised_gains(given, 1.0, force_error=1.5 * best.force_error)
+    assert best.force_error < soft.force_error <= 1.5 * best.force_error
+    both = advised_gains(
+        given, 1.0, position_error=4.0 * best.position_error, force_error=1.5 * best.force_error
+    )
+    assert both.roughness <= near.roughness
+
+
+def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
+    """An unknown force with good sensors, their noise with bad ones, or the allowed roughness."""
+    good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)
+    least = advised_gains(bad, 1e3).position_error
+    with pytest.raises(GainError, match=r"in free directions is .* unknown force of 1 N"):
+        advised_gains(good, 1.0, position_error=1e-6)
+    with pytest.raises(GainError, match=r"in free directions is .* the noise of the position"):
+        advised_gains(bad, 1e3, position_error=0.5 * least)
+    with pytest.raises(GainError, match=r"along the contact is .* allowed: allow more"):
+        advised_gains(good, 1.0, force_error=1e-4)
+    with pytest.raises(GainError, match=r"errors within their bounds; 0\.2 N m are allowed"):
+        advised_gains(bad, 0.2, position_error=1.1 * least)
+    with pytest.raises(ModelError, match="position_error must be positive, got 0"):
+        advised_gains(good, 1.0, position_error=0.0)
+
+
 def test_what_no_gains_can_is_refused_with_its_reason():
     with pytest.raises(GainError, match="noise of the position changes the controls by"):
         advised_gains(situation(1e-3, 1e5, 0.03, 1), 1e-4)

@@ -11,6 +11,7 @@ from scipy.sparse import diags, vstack
 from drake_dae import (
     CircleReference,
     ConstantReference,
+    ExpressionReference,
     FlexibleJoints,
     JointPositions,
     LineReference,
@@ -26,6 +27,8 @@ from drake_dae import (
     TrajectoryReference,
     find_structure,
 )
+from drake_dae.dae.system.layout import DerivativeLayout
+from drake_dae.dae.timing.curve import Curve
 from drake_dae.errors import ModelError, ReferenceSignalError
 
 LINE = SinusoidReference(0.3, 0.3, 1.5)
@@ -353,3 +356,17 @@ def test_a_circle_on_the_wall_keeps_its_shape():
     radius = np.hypot(rows[:, 0], rows[:, 3] - 0.6)
     # The reference is within 1e-6 of its range.
     np.testing.assert_allclose(radius, 0.1, atol=4e-7)
+
+
+def test_a_turn_where_a_path_comes_to_rest_gets_no_points():
+    """Its last 1e-8 of the speed turns by 45 degrees, in the last 1e-4 of the time.
+
+    Points in it were 1e-12 apart, with large curvatures, so that a motion could not go on there.
+    """
+    references = [
+        ExpressionReference(lambda t: 2e-8 * t - (1.0 - t) ** 3),
+        ExpressionReference(lambda t: (1.0 - t) ** 3),
+    ]
+    (piece,) = Curve(references, DerivativeLayout((2, 2)), 0.0, 1.0, 100).pieces
+    assert np.diff(piece.distances[:-1]).min() > 1e-7
+    assert np.abs(piece.curvatures[:-1]).max() < 1.0

@@ -1,0 +1,1 @@
+"""Gains for a contact and given sensors, as an optimum."""

@@ -1,0 +1,215 @@
+"""Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from math import inf, prod
+
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive
+from drake_dae.dae.beyond.advising.directions import (
+    EVERY,
+    MODEL_ERROR,
+    SLOWER,
+    Part,
+    SensedContact,
+    contact_part,
+    free_part,
+    is_stable,
+    noisiest_sensor,
+)
+from drake_dae.dae.beyond.contact_gains import ContactGains
+from drake_dae.errors import GainError, ModelError
+
+_PHASE = 0.15
+"""As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
+it with an estimator: a force along the contact that it attributes to friction couples the contact
+to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
+
+
+@dataclass(frozen=True)
+class AdvisedGains:
+    """Gains, and the errors predicted for them.
+
+    Attributes:
+        gains: The gains.
+        state_rate: w of the estimator in 1/s; None without one.
+        position_error: The rms error of a point in m: by noise, and by an unknown force of
+            `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
+        force_error: The rms error of the contact force in N, also by a reference that changes by
+            `RAMP`.
+        noise_error, noise_force: The parts of the errors by noise.
+        roughness: The rms change of the controls from sample to sample, over all joints, in N m.
+    """
+
+    gains: ContactGains
+    state_rate: float | None
+    position_error: float
+    force_error: float
+    noise_error: float
+    noise_force: float
+    roughness: float
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """The largest roughness in N m and errors in m and N."""
+
+    roughness: float
+    position_error: float
+    force_error: float
+
+    @property
+    def along(self) -> float:
+        """The largest roughness along the contact."""
+        return self.roughness / 2.0**0.5
+
+    @property
+    def has_errors(self) -> bool:
+        return min(self.position_error, self.force_error) < inf
+
+    def order(self, free: Part, contact: Part) -> tuple[float, float]:
+        """What is least for the best gains: the errors without a bound, then the roughness."""
+        pairs = (free, self.position_error), (contact, self.force_error)
+        errors = [part.error for part, most in pairs if most == inf]
+        return prod(errors), float(np.hypot(free.roughness, contact.roughness))
+
+
+@checked(ModelError)
+def advised_gains(
+    situation: SensedContact,
+    roughness: float,
+    *,
+    position_error: float = inf,
+    force_error: float = inf,
+) -> AdvisedGains:
+    """Returns the gains with the least predicted errors that are smooth and stable enough.
+
+    The gains are those of `contact_gains`, as functions of its rate w, for which free directions
+    and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
+    For each of them the loop of one direction is a linear system with samples, delay, law,
+    observer and contact; its errors and its roughness follow from Lyapunov's equation, its
+    stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
+    is least among those gains that
+
+    - change the controls by at most `roughness` from sample to sample, in rms,
+    - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
+      as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
+      stiffness is up to 2 times the stated one,
+    - lose at most 0.15 rad of phase to samples and delay, with an estimator half of it.
+
+    Where an error is bounded, the gains of its direction are the smoothest ones within the bound.
+
+    Args:
+        situation: The contact and its sensors.
+        roughness: The largest rms change of the controls from sample to sample, in N m.
+        position_error, force_error: The largest predicted errors, as of `AdvisedGains`, in m and N;
+            infinite without a bound.
+
+    Raises:
+        GainError: No gains do so; the message names the noise or the limit that prevents it.
+        ModelError: The roughness or an error is not positive.
+    """
+    positive("roughness", roughness)
+    for name, most in (("position_error", position_error), ("force_error", force_error)):
+        if not most > 0.0:
+            raise ModelError(f"{name} must be positive, got {most:g}")
+    bounds = _Bounds(roughness, position_error, force_error)
+    phase = _PHASE / 2.0 if situation.estimates else _PHASE
+    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
+    rates = np.geomspace(highest, highest / 30.0, 14).tolist()
+    candidates = []
+    for fast in _state_rates(situation, highest):
+        tried = ([contact_part(situation, w, fast, share) for w in rates] for share in SLOWER)
+        best = (_best(situation, parts, bounds.along, force_error) for parts in tried)
+        if (contact := next(filter(None, best), None)) is None:
+            continue
+        remaining = (roughness**2 - contact.roughness**2) ** 0.5
+        if (
+            free := _best(
+                situation, [free_part(situation, w, fast) for w in rates], remaining, position_error
+            )
+        ) is not None:
+            candidates.append((free, contact, fast))
+    if not candidates:
+        raise GainError(_reason(situation, rates, bounds, highest))
+    free, contact, fast = min(candidates, key=lambda parts: bounds.order(*parts[:2]))
+    w, of_contact = free.rate, contact.rates
+    return AdvisedGains(
+        gains=ContactGains(
+            position_rate=1.5 * w,
+            force_gain=of_contact.force_gain,
+            constraint_damping=of_contact.gains[2],
+            observer_rate=2.0 * w,
+            observer_force_rate=of_contact.observer_rate,
+            friction_rate=w / 2.0,
+        ),
+        state_rate=fast,
+        position_error=free.error,
+        force_error=contact.error,
+        noise_error=free.by_noise,
+        noise_force=contact.by_noise,
+        roughness=float(np.hypot(free.roughness, contact.roughness)),
+    )
+
+
+def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | None]:
+    if not situation.estimates:
+        yield None
+        return
+    for share in (4.0, 7.0, 12.0, 20.0):
+        if share * highest * situation.period <= 0.5:
+            yield share * highest
+
+
+def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
+    """The part with the least error that is smooth and stable enough, if there is one.
+
+    Where the error may be at most a number, it is the smoothest one within it.
+    """
+    within = [part for part in parts if part.roughness <= allowed and part.error <= most]
+    for part in sorted(within, key=lambda part: part.error if most == inf else part.roughness):
+        if is_stable(situation, part):
+            return part
+    return None
+
+
+def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highest: float) -> str:
+    """Returns why no gains are found."""
+    smoothest, pairs = [], [*product(rates, _state_rates(situation, highest))]
+    free = [free_part(situation, *pair) for pair in pairs]
+    contact = [contact_part(situation, *pair, share) for pair, share in product(pairs, SLOWER)]
+    for parts, where, unit, most in (
+        (free, "in free directions", "m", bounds.position_error),
+        (contact, "along the contact", "N", bounds.force_error),
+    ):
+        stable = [part for part in parts if is_stable(situation, part)]
+        if not stable:
+            return (
+                f"no gains are stable {where} with a margin, for a contact of "
+                f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
+                f"{situation.delay} samples of delay: sample more often, or make it softer"
+            )
+        best = min(stable, key=lambda part: part.error)
+        if best.error > most:
+            cause = f"an unknown force of {MODEL_ERROR:g} N that appears every {EVERY:g} s"
+            if best.by_noise > best.error / 2.0:
+                cause = f"the noise of the {noisiest_sensor(situation, best, 0)}"
+            return (
+                f"the error {where} is {best.error:.3g} {unit} rms with the best gains that are "
+                f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
+                "more often, or use better sensors"
+            )
+        within = [part for part in stable if part.error <= most]
+        smoothest.append(min(within, key=lambda part: part.roughness))
+    across, along = smoothest
+    noisiest = noisiest_sensor(situation, across, 1)
+    gains = "all gains that are stable" + bounds.has_errors * " and have errors within their bounds"
+    return (
+        f"the noise of the {noisiest} changes the controls by {across.roughness:.3g} N m in free "
+        f"directions and {along.roughness:.3g} N m along the contact from sample to sample with "
+        f"{gains}; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
+        f"{bounds.along:.3g}: allow more roughness, or use a better sensor"
+    )
