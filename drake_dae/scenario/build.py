@@ -16,6 +16,7 @@ from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
+from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.loop import build_loop
@@ -69,8 +70,8 @@ def build_completed(
         motion=prepared.motion,
         commands=commands,
     )
-    sticking = sticking_before(scenario, model, structure)
-    return Completed(scenario, (*prepared.completed.notes, *filter(None, [sticking]))), loop
+    told = sticking_before(scenario, model, structure), misfit(scenario, model)
+    return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.own_model import begin_own_model
@@ -21,7 +22,7 @@ from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
 """The allowed excess over a joint limit at the start, rad or m: references may start at the
-limit."""
+limit. Also the allowed depth behind a surface, in m."""
 
 _TURNS = np.array([0.0, -1.0, 1.0])
 """The whole turns that are tried, relative to the number of turns nearest to a guess."""
@@ -115,8 +116,36 @@ def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> No
                 "a task begins at rest, and its first phase in contact with a surface that moves "
                 "then; begin with a phase without contact, such as Approach"
             )
+        _check_outside(scenario, model, at_rest, model.dae.parameters_of(plant.dae, parameters))
         plant.set_state(at_plant, at_rest)
     _begin_sensor(loop, context, q, forces)
+
+
+def _check_outside(
+    scenario: Scenario, model: RobotModel, state: FloatArray, parameters: FloatArray
+) -> None:
+    """Refuses a start behind a surface of a task that begins without contact.
+
+    On a contact that gives way it may be as deep as the force that counts as none presses it.
+    """
+    task, material = scenario.task, scenario.plant.material
+    if task is None or (plan := task.make().plan).latches or plan.contacts[0]:
+        return
+    for contact in opening_contact(scenario, model):
+        if (touch := contact.touch(model.links)) is None:
+            continue
+        place = model.links.position(touch.frame, touch.point)
+        above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
+        depth = -above(state, parameters)[0].item()
+        if depth > _SLACK and (
+            material is None
+            or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
+        ):
+            raise ModelError(
+                f"start.positions put the point of '{contact.name}' {depth:.3g} m behind its "
+                f"surface, and {plan.phases[0].name} begins in front of it; start outside, or turn "
+                "the normal of the surface around if its free side is the other one"
+            )
 
 
 def _begin_sensor(loop: ClosedLoop, context: Context, q: FloatArray, forces: FloatArray) -> None:

@@ -24,7 +24,7 @@ GRACE = 0.1
 
 
 _MOST_FAILURES = 3
-"""The number of failed phases, the last ones, that the verdict of a finished task names."""
+"""The number of failed phases, the last ones, that the verdict of a task names."""
 
 
 class JobOutcome(Enum):
@@ -149,6 +149,10 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
         for before, change in zip((None, *changes), changes, strict=False)
         if change.failed and not (before is not None and before.chosen == "leave")
     ]
+    followed = [
+        f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
+        for change in failures[-_MOST_FAILURES:]
+    ]
     leaves = last.failed and last.chosen == "leave" and last.phase != "done"
     if leaves or (last.phase == "held" and last.failed):
         why = failures[-1] if failures else last
@@ -161,15 +165,13 @@ def _judge_task(changes: Sequence[PhaseChange], problems: list[str], remarks: li
         repeated = f", {again} of them again" if again else ""
         ended = f"{len(changes) - 1} phases" if len(changes) > 2 else "1 phase"
         remarks.append(f"the task was done at {last.time:.4g} s, in {ended}{repeated}")
-        remarks += [
-            f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
-            for change in failures[-_MOST_FAILURES:]
-        ]
+        remarks += followed
     else:
         remarks.append(
             f"the run ended during phase {last.place + 1}, {last.phase}, which began at "
             f"{last.time:.4g} s"
         )
+        remarks += followed
         return True
     return False
 

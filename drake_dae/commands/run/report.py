@@ -157,6 +157,9 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "disturbance forces act on the plant, unknown to the law": bool(
             scenario.plant_disturbances
         ),
+        "the contact has friction that the law does not know (friction of its constraint)": (
+            _has_unknown_friction(scenario, loop)
+        ),
         "the contact is compliant": not loop.plant.is_ideal,
         "a contact was open": "mode" in record and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
@@ -171,3 +174,11 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]
+
+
+def _has_unknown_friction(scenario: Scenario, loop: ClosedLoop) -> bool:
+    """Whether contacts of the plant alone have friction, of which the law's model has none."""
+    material, model = scenario.plant.material, loop.plant.model
+    if material is None or model is None or not material.friction:
+        return False
+    return any(any(c.is_unilateral) and c.friction_parameter is None for c in model.constraints)

@@ -51,26 +51,52 @@ def check_task(scenario: Scenario) -> None:
 
 
 def _too_deep(scenario: Scenario) -> list[tuple[str, str]]:
-    """Insertions beyond the ends of ideal holes and pegs, which the plant does not have."""
+    """Insertions beyond the end of what the plant has in a hole.
+
+    A through hole lets a longer peg through, in ideal contact up to its far side. Nothing is in the
+    hole behind a peg, or where a ball has left it.
+    """
     plant, task = scenario.plant, scenario.task
     assert task is not None
-    if plant.material is not None or not plant.has_sides:
+    plates = {
+        c.name: c.surface
+        for c in scenario.constraints
+        if isinstance(c, PointOnSurface) and isinstance(c.surface, Plate)
+    }
+    inserts = [phase for phase in task.phases if isinstance(phase, Insert)]
+    if not inserts or not plant.has_sides:
         return []
-    surfaces = {c.name: c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)}
-    problems = []
-    for peg in plant.pegs:
-        plate = surfaces.get(peg.constraint)
-        end = min(peg.length, plate.thickness if isinstance(plate, Plate) else np.inf)
-        problems += [
-            (
-                "task.phases",
-                f"{phase.name} is {phase.depth:g} m deep, and in ideal contact it must be less "
-                f"than {end:g} m, the length of the peg or the thickness of the plate",
+    pegs = {peg.constraint: peg for peg in plant.pegs}
+    material, ends = plant.material, list[tuple[float, str]]()
+    if material is None:
+        for name, peg in pegs.items():
+            end = min(peg.length, plates[name].thickness if name in plates else np.inf)
+            text = "in ideal contact it must be less than {end:g} m, the length of the peg or the "
+            ends.append(
+                (float(np.nextafter(end, 0.0)), text.format(end=end) + "thickness of the plate")
             )
-            for phase in task.phases
-            if isinstance(phase, Insert) and not phase.depth < end
-        ]
-    return problems
+    else:
+        pegs = {peg.constraint: peg for peg in material.pegs}
+        for name, plate in plates.items():
+            if plate.hole is None:
+                continue
+            if name in pegs:
+                end = pegs[name].length
+                text = f"the peg of '{name}' (plant.pegs) is {end:g} m long"
+            else:
+                end = plate.thickness + 2.0 * material.radius
+                text = (
+                    f"the tool is a ball of {material.radius:g} m (plant.radius), which has left "
+                    f"the plate of '{name}' at its far side then, {plate.thickness:g} m below its "
+                    "face; give a smaller depth, or a peg as plant.pegs"
+                )
+            ends.append((end, text))
+    return [
+        ("task.phases", f"{phase.name} is {phase.depth:g} m deep, and {text}")
+        for phase in inserts
+        for end, text in ends
+        if phase.depth > end
+    ]
 
 
 def task_controller(

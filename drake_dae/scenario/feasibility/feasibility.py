@@ -21,6 +21,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.completion.timing import timed
+from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
@@ -84,6 +85,8 @@ def complete_and_examine(
     Raises:
         ScenarioError: As for `find_feasibility`.
     """
+    if scenario.task is not None:
+        check_task(scenario)
     completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
     return completed.scenario, _feasibility(completed.scenario, model, scene_graph)
 

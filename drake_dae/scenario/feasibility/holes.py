@@ -157,6 +157,33 @@ def hole_forces(
     return tuple(found)
 
 
+def misfit(scenario: Scenario, model: RobotModel) -> str:
+    """A sentence if a task enters a hole for which its tool is too thick on contact that gives way.
+
+    Args:
+        scenario: The completed scenario.
+        model: Its robot.
+    """
+    material, task = scenario.plant.material, scenario.task
+    entering = [] if task is None else [each.name for each in task.phases if each.enters_holes]
+    if material is None or not entering:
+        return ""
+    points = opening_contact(scenario, model)
+    if len(points) != 1 or points[0].opening is None:
+        return ""
+    (contact,), (radius, _) = points, points[0].opening
+    own, tool = material.radius, "the ball at the tool (plant.radius)"
+    for peg in material.pegs:
+        if peg.constraint == contact.name:
+            own, tool = peg.radius, "the peg (plant.pegs)"
+    if own < radius:
+        return ""
+    return (
+        f"{entering[0]} cannot enter the hole of '{contact.name}': its radius is {radius:g} m, and "
+        f"that of {tool} is {own:g} m"
+    )
+
+
 def fall_speed(push: float, damping: float, depth: float) -> float:
     """The speed of x'' = a - c x' from rest, in m/s, where x is the depth.
 

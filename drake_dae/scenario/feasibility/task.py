@@ -18,7 +18,8 @@ from drake_dae.errors import SimulationError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.feasibility.faces import FaceNeeds, FaceTips
-from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces
+from drake_dae.scenario.feasibility.holding import HoldingWatch
+from drake_dae.scenario.feasibility.holes import HoleForce, hole_forces, misfit
 from drake_dae.scenario.feasibility.touches import TaskTouch, period_of, touches_of
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.parts.parts import MeasuredForce
@@ -164,8 +165,13 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
     loop = build_loop(ideal, _without_holes(scenario, model), structure)
     controller, context = loop.controller, start_scenario(ideal, loop)
     assert isinstance(controller, TaskController)
-    found = roll_scenario(ideal, loop, context)
+    watch = HoldingWatch(model)
+    found = roll_scenario(ideal, loop, context, look=watch.look)
+    watch.look(found.record.after, always=True)
+    if watch.failure is not None:
+        found = found.ended(watch.failure)
     record, changes = found.record, loop.changes(found.context or context)
+    changes = tuple(change for change in changes if change.time <= record.time[-1])
     points = opening_contact(scenario, model)
     tips = FaceTips(model, controller, points) if len(points) > 1 else None
     phases = _phases(record, changes, controller, model, tips)
@@ -178,7 +184,7 @@ def task_needs(scenario: Scenario, model: RobotModel, structure: Structure) -> T
         for needs in phases
         if needs.is_singular
     ]
-    problems += trips
+    problems += [*trips, *filter(None, [misfit(scenario, model)])]
     outcome, failed = _outcome(record, changes, found.failure)
     if failed and not (changes and _feels_shape(plan, changes)):
         problems.append(outcome)
@@ -235,7 +241,7 @@ def _outcome(
         return str(failure), True
     empty = np.zeros_like(record["tracking_error"])
     job = judge_job(record, empty, changes=changes)
-    return [*job.problems, *job.remarks][0], job.outcome is not JobOutcome.GOOD
+    return "; ".join([*job.problems, *job.remarks]), job.outcome is not JobOutcome.GOOD
 
 
 def _feels_shape(plan: Sequence[Phase], changes: Sequence[PhaseChange]) -> bool:

@@ -4,13 +4,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import Booleans, FloatArray, show
+from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.dips import TOUCHING, lowest
 from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.systems.plants.unilateral.edges import until_passed
 
 MARGIN = 1e-13
 """The rate of an opening contact above minus this, in m/s, is round-off."""
+
+CROWD, CROWDED = 1000, 1e-6
+"""A run ends where so many events, and steps made shorter to find them, take less than this, s."""
 
 
 @dataclass
@@ -22,6 +26,10 @@ class RunLog:
         time: The start time of the current step, in s.
         gaps, rates: The gaps and rates of all contacts then, in m and m/s; empty before a run.
         edges, edge_rates: The distances from edges and their rates then; see `Edges`.
+        margins: The values of all guards then; empty after a reset.
+        passed: The guards that were not positive at a later trial; empty before the first trial.
+        counts: The number of events and of steps made shorter to find them, from 1 to `CROWD` anew.
+        mark, counted: The times of the first and the last of these, in s.
         before: Time and state before the last reset.
         held: Whether the step began in the previous mode, with positive forces of all its contacts.
         pulled: The indices of contacts with negative force since then, after a jump of the control.
@@ -34,10 +42,75 @@ class RunLog:
     rates: FloatArray = field(default_factory=lambda: np.zeros(0))
     edges: FloatArray = field(default_factory=lambda: np.zeros(0))
     edge_rates: FloatArray = field(default_factory=lambda: np.zeros(0))
+    margins: FloatArray = field(default_factory=lambda: np.zeros(0))
+    passed: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    counts: int = 0
+    counted: float = np.nan
+    mark: float = np.nan
     before: tuple[float, bytes] = (np.nan, b"")
     held: bool = False
     pulled: set[int] = field(default_factory=set)
     waits: bool = False
+
+    def note(self, time: float, margins: FloatArray) -> None:
+        """Notes the guards that are not positive at a trial within the current step.
+
+        Args:
+            time: The time of the trial, in s.
+            margins: The values of all guards then.
+        """
+        if time > self.time:
+            passed = margins <= 0.0
+            self.passed = passed | self.passed if self.passed.size else passed
+
+    def begin(self, name: str, margins: FloatArray, state: FloatArray) -> bool:
+        """Begins a step at `time`, and returns whether no guard is zero there.
+
+        Drake halves a step that passes the zero of a guard until it ends before the zero. In so
+        short a step a slow motion changes positions by less than their round-off: the guard keeps
+        its value, and such steps would follow without end. So a guard also counts as zero if it is
+        within `TOUCHING`, and the last step brought it no nearer although a longer one passed it.
+
+        Args:
+            name: The name of the robot.
+            margins: The values of all guards.
+            state: The state.
+
+        Raises:
+            SimulationError: See `count`.
+        """
+        passed, is_zero = self.passed, margins <= 0.0
+        self.passed = passed[:0]
+        self.pulled.clear()
+        if passed.any():
+            self.count(name, self.time, state)
+            if self.margins.size:
+                is_zero |= passed & (margins <= TOUCHING) & (margins >= self.margins)
+        self.margins = margins[:0] if is_zero.any() else margins.copy()
+        return not is_zero.any()
+
+    def count(self, name: str, time: float, state: FloatArray) -> None:
+        """Counts an event, or a step that was made shorter to find one.
+
+        Args:
+            name: The name of the robot.
+            time, state: The time in s and the state then.
+
+        Raises:
+            SimulationError: `CROWD` of them advanced the time by less than `CROWDED`.
+        """
+        if time != self.counted:  # Several guards may trigger at the same time.
+            if self.counts in (0, CROWD):
+                self.counts, self.mark = 0, time
+            self.counts, self.counted = self.counts + 1, time
+        if self.counts == CROWD and time - self.mark < CROWDED:
+            raise SimulationError(
+                f"{name}: the last {CROWD} steps led from t = {self.mark:.12g} s only to "
+                f"{time:.12g} s, state {show(state)}, and all of them to events of contacts; take "
+                "smaller coefficients of restitution or a larger settling_time",
+                time,
+                state,
+            )
 
 
 def clearance(log: RunLog, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:

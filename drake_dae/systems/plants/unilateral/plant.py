@@ -113,8 +113,9 @@ class UnilateralRobotPlant(ModalPorts):
         InconsistentStateError: A simulation starts off the bilateral constraints, or inside a
             surface.
         AssumptionError: The constraints of a mode are dependent.
-        SimulationError: No forces fit, impacts do not end, a latch is commanded to close too far
-            from its place, or the context has no accuracy.
+        SimulationError: No forces fit, impacts do not end or 1000 events follow each other within
+            1e-6 s, a latch is commanded to close too far from its place, or the context has no
+            accuracy.
         PainleveError: The Painleve paradox: a contact with no motion, or two.
     """
 
@@ -219,8 +220,8 @@ class UnilateralRobotPlant(ModalPorts):
     def _calc_margins(self, context: Context, value: AbstractValue) -> None:
         closed, latched = np.split(self._numbers(context) > 0.5, [len(self._contacts.names)])
         margins, further = np.zeros(closed.size), np.zeros(0)
+        log, time = self._log(context), context.get_time()
         if not closed.all() or self._edges:
-            log, time = self._log(context), context.get_time()
             state = context.get_continuous_state_vector().value()
             gaps, rates = self._checked(self._contacts.gaps, context, state)
             margins = clearance(log, time, gaps, rates)
@@ -234,7 +235,9 @@ class UnilateralRobotPlant(ModalPorts):
             grip = self._evaluate(self._mode(context).grip, context)
             margins[closed] = grip[self._contacts.normals][closed]
         as_commanded = latched == np.array(self._commanded(context), dtype=bool)
-        value.set_value(np.concatenate([margins, np.where(as_commanded, 1.0, -1.0), further]))
+        every = np.concatenate([margins, np.where(as_commanded, 1.0, -1.0), further])
+        log.note(time, every)
+        value.set_value(every)
 
     def _at_guard(
         self, context: Context, event: UnrestrictedUpdateEvent, state: State
@@ -274,11 +277,10 @@ class UnilateralRobotPlant(ModalPorts):
     def _advance(self, context: Context, state: State) -> EventStatus:
         log = self._log(context)
         log.time, waits, log.waits = context.get_time(), log.waits, False
-        log.held = not (waits or (self._margins(context) <= 0.0).any())
-        log.pulled.clear()
+        x, values = self.state(context), self._values(context)
+        log.held = log.begin(self.dae.name, self._margins(context), x) and not waits
         if not log.held:
             return self._reset(context, state)
-        x, values = self.state(context), self._values(context)
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
         except InconsistentStateError as error:
@@ -306,6 +308,7 @@ class UnilateralRobotPlant(ModalPorts):
         except InconsistentStateError as error:
             raise off_manifold(time, x, error) from error
         log, before = self._log(context), (time, x.tobytes())
+        log.count(self.dae.name, time, x)
         if log.before != before:  # Several guards may trigger at the same time.
             log.before = before
             log.events += after.events
