@@ -93,6 +93,11 @@ def make_closed_loop(
     period = settings.period(plant.time_step)
     reference = make_generator(references, law, settings)
     if settings.governed is not None:
+        if law.exogenous_degrees and settings.observer is None:
+            raise WiringError(
+                "governed: the law has exogenous signals that no observer estimates, and a "
+                "governor, which changes the time, does not know them; leave governed out"
+            )
         start = settings.start_time
         kept = settings.slowed or settings.governed
         reference = PathGovernor(references, law, kept, start, period)

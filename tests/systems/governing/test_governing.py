@@ -16,12 +16,14 @@ from drake_dae import (
     RobotPlant,
     SinusoidReference,
     TimeOptimalReference,
+    TrackingLaw,
     make_closed_loop,
     poles,
     robot_motion_limits,
     rollout,
     simulate,
     start_values,
+    with_disturbance,
 )
 from drake_dae.dae.governing.feasible import feasible_control
 from drake_dae.errors import ModelError, WiringError
@@ -255,3 +257,7 @@ def test_what_cannot_be_governed_is_refused_in_a_sentence():
     settings = LoopSettings(governed=limits_of((1.0, 1.0)), control_limits=[1.0])
     with pytest.raises(WiringError, match="control_limits has 1 entries, there are 2"):
         make_closed_loop(plant, law("two_link"), [ConstantReference(0.3), PRESS], settings)
+    names = [signal.name for signal in found.model.links.velocity_signals]
+    unknown = TrackingLaw(with_disturbance(found.model.dae, names), poles(-4.0))
+    with pytest.raises(WiringError, match="governed: the law has exogenous signals that no"):
+        make_closed_loop(plant, unknown, [ConstantReference(0.3), PRESS], settings)
