@@ -195,7 +195,7 @@ def wire_loop(
     # updated while a contact is open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if observing is not None and goal is not None:
-        # What limits the control reads the state, which a state_rate estimates.
+        # A state that is estimated must not depend on a control that depends on it.
         stops = limits or (feasible if observing.state_rate is None else None)
         ports = state, sampling, control, goal, stops
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)

@@ -10,6 +10,8 @@ from campaign import bad_files, bad_inputs, drops, random_limits, random_robots,
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
 
+from drake_dae.scenario.completion import timing
+
 FEW, MANY = range(40), range(40, 110)
 FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 48)
 
@@ -89,9 +91,21 @@ def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path):
-    """With points spread by length alone a cone was exceeded twice."""
+def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path, monkeypatch):
+    """With points spread by length alone a cone was exceeded twice.
+
+    Without a reserve of cones it was exceeded by 0.5 %, since a profile could exceed it by 2 %.
+    """
+    monkeypatch.setattr(timing, "OF_CONES", 1.0)
     run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
+    found = random_limits.outcome(run)
+    assert found.startswith("kept: cone"), found
+
+
+@pytest.mark.slow
+def test_what_is_reserved_of_a_cone_keeps_the_error_on_its_prediction(tmp_path: Path):
+    """Without it the control was limited while the tray follows its path exactly."""
+    run = random_limits.random_run(random.Random(550), tmp_path, {"tray": 1.0})
     found = random_limits.outcome(run)
     assert found.startswith("kept: cone"), found
 

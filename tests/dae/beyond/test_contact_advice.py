@@ -92,6 +92,16 @@ def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
     assert both.roughness <= near.roughness
 
 
+def test_a_bound_of_an_error_is_kept_wherever_the_roughness_allows_it():
+    """The contact leaves as much roughness to free directions as their bound needs."""
+    given = situation(1e-4, 1e5, 0.03, 1)
+    for most in (3e-3, 1e-3, 5e-4, 3e-4):
+        alone = advised_gains(given, 1e3, position_error=most, force_error=1e3).roughness
+        found = advised_gains(given, 1.05 * alone, position_error=most)
+        assert found.position_error <= most
+        assert found.roughness <= 1.05 * alone
+
+
 def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
     """An unknown force with good sensors, their noise with bad ones, or the allowed roughness."""
     good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)

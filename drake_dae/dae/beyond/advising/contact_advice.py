@@ -122,17 +122,9 @@ def advised_gains(
     rates = np.geomspace(highest, highest / 30.0, 14).tolist()
     candidates = []
     for fast in _state_rates(situation, highest):
-        tried = ([contact_part(situation, w, fast, share) for w in rates] for share in SLOWER)
-        best = (_best(situation, parts, bounds.along, force_error) for parts in tried)
-        if (contact := next(filter(None, best), None)) is None:
-            continue
-        remaining = (roughness**2 - contact.roughness**2) ** 0.5
-        if (
-            free := _best(
-                situation, [free_part(situation, w, fast) for w in rates], remaining, position_error
-            )
-        ) is not None:
-            candidates.append((free, contact, fast))
+        found = _pair(situation, rates, fast, bounds)
+        if found is not None:
+            candidates.append((*found, fast))
     if not candidates:
         raise GainError(_reason(situation, rates, bounds, highest))
     free, contact, fast = min(candidates, key=lambda parts: bounds.order(*parts[:2]))
@@ -164,6 +156,35 @@ def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | N
             yield share * highest
 
 
+def _pair(
+    situation: SensedContact, rates: list[float], fast: float | None, bounds: _Bounds
+) -> tuple[Part, Part] | None:
+    """The best gains of free directions and of the contact, if there are any.
+
+    The contact comes first, with at most its share of the roughness; but free directions do where
+    their error is bounded, since their smoothest gains leave the most.
+    """
+
+    def free(allowed: float) -> Part | None:
+        parts = [free_part(situation, w, fast) for w in rates]
+        return _best(situation, parts, allowed, bounds.position_error)
+
+    def contact(allowed: float) -> Part | None:
+        tried = ([contact_part(situation, w, fast, share) for w in rates] for share in SLOWER)
+        allowed = min(allowed, bounds.along)
+        best = (_best(situation, parts, allowed, bounds.force_error) for parts in tried)
+        return next(filter(None, best), None)
+
+    is_free_first = bounds.position_error < inf
+    first, second = (free, contact) if is_free_first else (contact, free)
+    if (one := first(bounds.roughness)) is None:
+        return None
+    remaining = (bounds.roughness**2 - one.roughness**2) ** 0.5
+    if (other := second(remaining)) is None:
+        return None
+    return (one, other) if is_free_first else (other, one)
+
+
 def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
     """The part with the least error that is smooth and stable enough, if there is one.
 
@@ -176,16 +197,25 @@ def _best(situation: SensedContact, parts: list[Part], allowed: float, most: flo
     return None
 
 
+def _stable(
+    situation: SensedContact, rates: list[float], fast: float | None
+) -> tuple[list[Part], list[Part]]:
+    """The stable parts of free directions and of the contact, for one estimator."""
+    free = (free_part(situation, w, fast) for w in rates)
+    contact = (contact_part(situation, w, fast, share) for w, share in product(rates, SLOWER))
+    return (
+        [part for part in free if is_stable(situation, part)],
+        [part for part in contact if is_stable(situation, part)],
+    )
+
+
 def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highest: float) -> str:
     """Returns why no gains are found."""
-    smoothest, pairs = [], [*product(rates, _state_rates(situation, highest))]
-    free = [free_part(situation, *pair) for pair in pairs]
-    contact = [contact_part(situation, *pair, share) for pair, share in product(pairs, SLOWER)]
-    for parts, where, unit, most in (
-        (free, "in free directions", "m", bounds.position_error),
-        (contact, "along the contact", "N", bounds.force_error),
-    ):
-        stable = [part for part in parts if is_stable(situation, part)]
+    found = [_stable(situation, rates, fast) for fast in _state_rates(situation, highest)]
+    most_of = bounds.position_error, bounds.force_error
+    names = ("in free directions", "m"), ("along the contact", "N")
+    for parts, (where, unit), most in zip(zip(*found, strict=True), names, most_of, strict=True):
+        stable = [part for some in parts for part in some]
         if not stable:
             return (
                 f"no gains are stable {where} with a margin, for a contact of "
@@ -202,9 +232,20 @@ def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highe
                 f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
                 "more often, or use better sensors"
             )
-        within = [part for part in stable if part.error <= most]
-        smoothest.append(min(within, key=lambda part: part.roughness))
-    across, along = smoothest
+    smoothest = []
+    for both in found:  # Of one estimator.
+        within = [
+            [part for part in parts if part.error <= most]
+            for parts, most in zip(both, most_of, strict=True)
+        ]
+        if all(within):
+            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
+    if not smoothest:
+        return (
+            "no rate of the estimator has both errors within their bounds: allow more of one of "
+            "them, sample more often, or use better sensors"
+        )
+    across, along = min(smoothest, key=lambda pair: np.hypot(pair[0].roughness, pair[1].roughness))
     noisiest = noisiest_sensor(situation, across, 1)
     gains = "all gains that are stable" + bounds.has_errors * " and have errors within their bounds"
     return (

@@ -120,7 +120,7 @@ class Modes:
         whole = self._whole if rows == list(range(contacts.of_model.num_constraints)) else None
         system = _subsystem(contacts, rows, state) if whole is None else whole.system
         try:
-            in_hole = rows[-1:] >= [contacts.of_model.num_constraints]
+            in_hole = bool(rows) and rows[-1] >= contacts.of_model.num_constraints
             spread = NEAR * system.usual_spread(state) if in_hole else None
             structure = whole or find_constraint_structure(system, spread=spread)
         except DrakeDaeError as error:
