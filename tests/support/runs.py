@@ -8,8 +8,8 @@ from typing import Any
 import jsonschema
 import pytest
 from _pytest.mark import ParameterSet
-from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator, SimulatorConfig
+from pydrake.systems.framework import Context, DiagramBuilder, System
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
 from drake_dae.scenario.scenario import Scenario, scenario_schema
@@ -94,6 +94,17 @@ def some(cases: Iterable[Any], of: int = 2, dear: Container[Any] = ()) -> list[P
         marks = [*given.marks, *[pytest.mark.thorough] * left_out]
         found.append(pytest.param(*given.values, marks=marks, id=given.id))
     return found
+
+
+def in_equal_steps(
+    builder: DiagramBuilder, plant: System, scheme: str, step: float
+) -> tuple[Simulator, Context, Context]:
+    """A simulator with steps of one length, its context, and that of a plant."""
+    simulator = Simulator(builder.Build())
+    ResetIntegratorFromFlags(simulator, scheme, step)
+    simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    root = simulator.get_mutable_context()
+    return simulator, root, plant.GetMyMutableContextFromRoot(root)
 
 
 def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder
+from runs import in_equal_steps
 
 from drake_dae import ConstantReference, Hole, Plate, ReferenceGenerator, SinusoidReference
 from drake_dae.errors import InconsistentStateError
@@ -242,11 +243,7 @@ def test_from_under_a_point_at_rest_a_plate_is_drawn_away():
     moving = ReferenceGenerator(moved, plant.exogenous_layout.degrees)
     table = builder.AddSystem(moving)
     builder.Connect(table.get_output_port(), plant.GetInputPort("exogenous"))
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.01)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    root = simulator.get_mutable_context()
-    context = plant.GetMyMutableContextFromRoot(root)
+    simulator, root, context = in_equal_steps(builder, plant, "runge_kutta5", 0.01)
     plant.set_state(context, [0.25, 0.0, 0.0, 0.0, 0.0, 0.0])
     root.SetAccuracy(1e-9)
     simulator.AdvanceTo(0.3)

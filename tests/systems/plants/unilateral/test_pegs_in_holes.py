@@ -9,8 +9,8 @@ from pegs import ARM, HOLE, INERTIA, MASS, peg_of, planar_peg, plate_of, upright
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder
+from runs import in_equal_steps
 
 from drake_dae import (
     ConstantReference,
@@ -170,11 +170,7 @@ def test_a_hole_that_moves_holds_its_peg_back():
     moved = [SinusoidReference(0.0, 0.01, 5.0, 0.5), ConstantReference([0.0, 0.0])]
     table = builder.AddSystem(ReferenceGenerator(moved, plant.exogenous_layout.degrees))
     builder.Connect(table.get_output_port(), plant.GetInputPort("exogenous"))
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.01)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    root = simulator.get_mutable_context()
-    context = plant.GetMyMutableContextFromRoot(root)
+    simulator, root, context = in_equal_steps(builder, plant, "runge_kutta5", 0.01)
     at, speed = 0.01 * np.sin(0.5), 0.05 * np.cos(0.5)
     plant.set_state(context, [CLEARANCE + at, 0.0, -5e-3, speed, 0.0, 0.0])
     root.SetAccuracy(1e-9)

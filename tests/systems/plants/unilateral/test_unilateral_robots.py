@@ -12,6 +12,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
+from runs import in_equal_steps
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -202,11 +203,7 @@ def test_a_control_that_jumps_opens_a_contact_at_once(hold):
         builder.Connect(source.get_output_port(), held.get_input_port())
         source = held
     builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, "runge_kutta3", 0.008)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    root = simulator.get_mutable_context()
-    context = plant.GetMyMutableContextFromRoot(root)
+    simulator, root, context = in_equal_steps(builder, plant, "runge_kutta3", 0.008)
     plant.set_state(context, [0.0, HEIGHT, 0.0, 0.0, 0.0, 0.0])
     root.SetAccuracy(1e-8)
     simulator.AdvanceTo(0.05)
@@ -268,11 +265,7 @@ def test_a_table_that_falls_away_faster_than_g_leaves_the_ball():
     )
     table = builder.AddSystem(moving)
     builder.Connect(table.get_output_port(), plant.GetInputPort("exogenous"))
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.002)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    root = simulator.get_mutable_context()
-    context = plant.GetMyMutableContextFromRoot(root)
+    simulator, root, context = in_equal_steps(builder, plant, "runge_kutta5", 0.002)
     plant.set_state(context, [0.0, amplitude * frequency])
     root.SetAccuracy(1e-8)
     simulator.AdvanceTo(0.4)
