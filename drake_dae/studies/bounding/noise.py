@@ -10,7 +10,7 @@ from drake_dae.diagrams.state_feedback import ENCODER_NOISE
 from drake_dae.errors import DrakeDaeError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.spread.noise import NoiseSpread, spread_with_rounding
-from drake_dae.running.rollout.spread.waves import Rounding
+from drake_dae.running.rollout.spread.rounding import Rounding
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
@@ -70,7 +70,7 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     """Predicts the deviations of outputs and controls by the noise of encoders and force sensor.
 
     It is `noise_spread` of the scenario's loop, on the plant that rollouts have, from its start; of
-    the resolution of encoders with the waves of `Rounding`.
+    the resolution of encoders by runs of the linearized loop with other zeros (`RoundedRuns`).
 
     Args:
         scenario: The scenario, as `load_scenario` returns it.
