@@ -38,7 +38,8 @@ def feasible_control(
     it; those of speeds as far as these allow it, by w' <= APPROACH (W - w) close to W, see
     `LimitedSignals.approach`. Limits of rates, the accelerations of joints, are not kept: a robot
     that may not brake leaves its path, and with an error of its model it does not return. u is u_d
-    where that is within all limits. ubar - ubar_d is by how much the derivative e^(mu) of the error leaves (30).
+    where that is within all limits. ubar - ubar_d is by how much the derivative e^(mu) of the error
+    leaves (30).
 
     Args:
         structure: The structure of the system, with as many controls as outputs.

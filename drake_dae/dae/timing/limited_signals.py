@@ -12,7 +12,7 @@ APPROACH = 100.0
 1/s, where they are close to these."""
 
 AT_ONCE = 1e-9
-"""The time in s in which a state may reach a limit that is not close, where there are no samples."""
+"""The time in s in which a state may reach a limit that is not close, if there are no samples."""
 
 
 class LimitedSignals:
