@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
 
 
 def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
@@ -31,7 +32,12 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
 
     Returns:
         The system with E + T diag(d) in place of E; itself if that is the same.
+
+    Raises:
+        ModelError: The latency is negative.
     """
+    if latency < 0.0:
+        raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
     added = latency * _damping(system) if latency else np.zeros(system.num_states)
     if not added.any():
         return system

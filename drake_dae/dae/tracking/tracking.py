@@ -92,8 +92,6 @@ class TrackingLaw:
         latency: float = 0.0,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
-        if latency < 0.0:
-            raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
         self.damped_structure = damped(self.structure, constraint_damping, latency)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
