@@ -147,6 +147,7 @@ def test_what_has_no_spread_is_refused_in_a_sentence():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_robot_in_contact_has_the_spread_of_its_runs():
     """Beside 24 runs of 2 s.
 

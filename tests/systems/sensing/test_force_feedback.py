@@ -105,7 +105,7 @@ def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", [MOTORS, SERVOS], ids=["motors", "servos"])
+@pytest.mark.parametrize("stage", some([MOTORS, SERVOS]), ids=["motors", "servos"])
 def test_measured_force_removes_the_static_error_behind_motors(stage):
     """At rest I_a' = 0 and the model's lambda' is 0, so (81) leaves Lambda_4 (lambda - r_2) = 0."""
     model = touching("two_link", [stage])
