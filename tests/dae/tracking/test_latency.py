@@ -82,7 +82,7 @@ def test_only_damping_counts():
 
 
 def test_a_latency_is_a_time():
-    with pytest.raises(ModelError, match=r"the latency of a law must be 0 s or more, got -0\.001 s"):
+    with pytest.raises(ModelError, match=r"the latency of a law must be 0 s or more, got -0\.001"):
         TrackingLaw(joint(), poles(POLE), latency=-1e-3)
     with pytest.raises(ModelError, match="latency must be a finite number, got '1 ms'"):
         TrackingLaw(joint(), poles(POLE), latency="1 ms")
