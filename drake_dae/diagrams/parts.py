@@ -144,6 +144,7 @@ def add_feasible(
     controller: Controller,
     governed: MotionLimits,
     control_limits: ArrayLike,
+    sample_period: float,
 ) -> FeasibleControl:
     """Adds limits of the control under which errors deviate least from their prediction.
 
@@ -154,6 +155,7 @@ def add_feasible(
         controller: The controller.
         governed: The limits of joints and forces.
         control_limits: The largest |u|, shape (p,).
+        sample_period: The time in s in which the control is constant; 0 if it is continuous.
 
     Raises:
         WiringError: They do not fit.
@@ -166,7 +168,8 @@ def add_feasible(
         )
     controls = {signal.name: (-size, size) for signal, size in zip(names, sizes, strict=True)}
     try:
-        block = builder.AddSystem(FeasibleControl(structure, replace(governed, controls=controls)))
+        limits = replace(governed, controls=controls)
+        block = builder.AddSystem(FeasibleControl(structure, limits, sample_period))
     except ModelError as error:
         raise WiringError(str(error)) from None
     builder.Connect(controller.GetOutputPort("control"), block.GetInputPort("control"))

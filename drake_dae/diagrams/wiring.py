@@ -174,7 +174,8 @@ def wire_loop(
     control, control_limits = controller.GetOutputPort("control"), parts.control_limits
     feasible = None
     if parts.governed is not None and control_limits is not None:
-        feasible = add_feasible(builder, controller, parts.governed, control_limits)
+        period = parts.period(plant.time_step)
+        feasible = add_feasible(builder, controller, parts.governed, control_limits, period)
         control, control_limits = feasible.GetOutputPort("control"), None
     control, link, limits = add_drives(builder, plant, control, sampling, control_limits)
     if controller.HasOutputPort("feedback"):

@@ -14,6 +14,7 @@ from problems import (
     system_of,
 )
 from problems.found import NO, OPEN, YES, findings
+from runs import some
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.dae.structure.structure import find_structure
@@ -22,6 +23,7 @@ from drake_dae.dae.zero_dynamics.stability import Verdict
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
 def test_what_is_known_of_the_problems(problem):
     analysis = analyze(problem.system, count=12)
     assert findings(analysis) == [YES] * 5
@@ -45,6 +47,7 @@ def test_what_is_known_of_the_problems(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=2), indirect=True)
 def test_margins_belong_to_their_states(problem):
     """The state of a margin is consistent, and A or B is as near to singular there as said."""
     analysis = analyze(problem.system, count=12)
@@ -58,6 +61,7 @@ def test_margins_belong_to_their_states(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_the_gradients_of_all_chains(problem):
     """Theorem 2.1, from the chains that find_structure returns, by NumPy's rank."""
     analysis = analyze(problem.system, count=3)

@@ -10,6 +10,7 @@ from problems import (
     redundant,
 )
 from problems.found import findings
+from runs import some
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.findings import Finding
@@ -29,6 +30,7 @@ def test_text_is_aligned_and_not_too_wide(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_markdown_has_the_same_words(problem):
     analysis = analyze(problem.system, count=3)
     markdown = analysis._repr_markdown_()
@@ -41,7 +43,7 @@ def test_markdown_has_the_same_words(problem):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*PROBLEMS, "redundant"])
+@pytest.mark.parametrize("name", some([*PROBLEMS, "redundant"], of=3))
 def test_the_dictionary_is_json(name):
     twice = redundant(lambda x: [x[0], x[0]])
     system = twice if name == "redundant" else PROBLEMS[name]().system

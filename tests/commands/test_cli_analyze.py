@@ -319,6 +319,7 @@ def test_help_reports_the_exit_codes(capsys):
         dear=(
             "wall_flexible_contact",
             "wall_hydroelastic",
+            "wall_guarded",
             "flat_press",
             "hand_over",
             "tool_change",

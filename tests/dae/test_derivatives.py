@@ -2,6 +2,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import PROBLEMS, changed
+from runs import some
 
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.structure.structure import find_structure
@@ -24,6 +25,7 @@ def motion_of(system: DaeSystem) -> Derivatives:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
 def test_derivatives_are_those_along_the_constrained_motion(problem):
     """Three orders of a function of the state, and of v, against Lie derivatives by hand's v."""
     system = problem.system
@@ -74,6 +76,7 @@ def test_the_parts_with_and_without_control_are_those_of_what_unknowns_stand_for
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_the_rate_is_that_of_the_elimination(problem):
     system = problem.system
     motion, elimination = motion_of(system), find_structure(system).elimination

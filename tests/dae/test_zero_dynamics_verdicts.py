@@ -44,7 +44,7 @@ NOT_BOUNDED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NOT_BOUNDED)
+@pytest.mark.parametrize("name", some(NOT_BOUNDED))
 def test_what_is_not_seen_to_return_is_not_called_bounded(name):
     told = ZeroDynamics(beside(*NOT_BOUNDED[name])).stability()
     assert told.verdict is Verdict.UNDECIDED
@@ -64,7 +64,7 @@ def test_a_cycle_beside_something_that_grows_is_unstable(rate):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("strength", "decay"), [(0.3, None), (5.0, None), (1.0, 0.01)])
+@pytest.mark.parametrize(("strength", "decay"), some([(0.3, None), (5.0, None), (1.0, 0.01)]))
 def test_a_limit_cycle_is_shown_by_its_return(strength, decay):
     """The period against SciPy, between two crossings after 100 s; the multiplier against that of
     the divergence, exp of the integral of e (1 - a^2)."""
@@ -99,11 +99,13 @@ def test_a_limit_cycle_is_shown_by_its_return(strength, decay):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rates", "count"),
-    [
-        (lambda a, b, z: [b + z**2, 1 - b], 2),
-        (lambda a, b, z: [b, 1 - b + 0.1 * z], 2),
-        (lambda a, z: [0.2 + 0.1 * z - 1e-9 * a], 1),
-    ],
+    some(
+        [
+            (lambda a, b, z: [b + z**2, 1 - b], 2),
+            (lambda a, b, z: [b, 1 - b + 0.1 * z], 2),
+            (lambda a, z: [0.2 + 0.1 * z - 1e-9 * a], 1),
+        ]
+    ),
 )
 def test_a_drift_along_a_periodic_reference_is_not_bounded(rates, count):
     dynamics = ZeroDynamics(beside(rates, count))
@@ -167,7 +169,7 @@ AT_INFINITY = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", AT_INFINITY)
+@pytest.mark.parametrize("name", some(AT_INFINITY, of=3))
 @pytest.mark.parametrize("others", some([0, 1, 2]))
 def test_what_only_falls_is_no_equilibrium(name, others):
     """Alone, beside a state that decays, and beside an oscillation that does."""
@@ -196,7 +198,7 @@ DEGENERATE = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("name", some(DEGENERATE, of=3))
 @pytest.mark.parametrize("others", [0, pytest.param(1, marks=pytest.mark.thorough)])
 def test_an_equilibrium_without_a_slope_is_one(name, others):
     """However many searches end near it, and its linearization decides nothing."""
@@ -267,7 +269,7 @@ def test_several_equilibria_of_a_slow_state_are_several():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("region", "inside"),
-    [((-2.0, 2.0), 1), ((0.5, 1.5), 0), ((-1.6, -0.5), 0), (None, None)],
+    some([((-2.0, 2.0), 1), ((0.5, 1.5), 0), ((-1.6, -0.5), 0), (None, None)]),
 )
 def test_an_unstable_equilibrium_inside_the_region_is_a_finding(region, inside):
     """s'' = s - s^3 - s': unstable at 0, and stable at 1 and -1, from which it begins."""

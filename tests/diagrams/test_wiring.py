@@ -5,7 +5,7 @@ import pytest
 from arms import arm, fixed_step, law, touching
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import VectorLogSink
-from runs import run, run_scenario, scenario
+from runs import run, run_scenario, scenario, some
 
 from drake_dae import (
     ConstantReference,
@@ -141,7 +141,10 @@ def test_a_scenario_with_another_mass_in_the_plant():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    ["two_link_flexible", "two_link_motors", "two_link_hydraulics", "two_link_flexible_motors"],
+    some(
+        ["two_link_flexible", "two_link_motors", "two_link_hydraulics", "two_link_flexible_motors"],
+        first=1,
+    ),
 )
 def test_scenarios_of_actuation_follow_their_prediction(name):
     """They start 2 cm and 5 N off. At a fixed 1 ms RK5 leaves less than 1e-7 of it."""

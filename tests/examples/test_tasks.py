@@ -30,7 +30,14 @@ def test_tasks_are_short():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.stem)
+@pytest.mark.parametrize(
+    "task",
+    [
+        pytest.param(task, marks=[pytest.mark.thorough] * (task.stem == "quadruped"))
+        for task in TASKS
+    ],
+    ids=lambda task: task.stem,
+)
 def test_task_is_tracked_as_predicted(task, tmp_path, monkeypatch, capsys):
     """Also where the verdict has the integrator's default accuracy, 1e-6."""
     arguments = ["simulate", str(task), "--out", str(tmp_path / "run"), *BARE]

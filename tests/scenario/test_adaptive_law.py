@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from runs import run_scenario, scenario
+from runs import roll, run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.cli import main
@@ -38,7 +38,7 @@ def heavy(*settings: str, more: str = "", duration: float = 8.0):
 )
 def test_it_learns_and_tracks(settings, more, height, force):
     """Without it 57 mm and 2.2 N; a measured force lags, and Drake's contact adds 0.4 mm."""
-    record = run_scenario(heavy(*settings, more=more))[2]
+    _, record = roll(heavy(*settings, more=more))
     late = np.abs(record["tracking_error"][record.time > 6.0]).max(axis=0)
     assert late[0] < height
     assert late[1] < force
@@ -53,7 +53,7 @@ def test_it_learns_and_tracks(settings, more, height, force):
 def test_seven_joints_with_a_tool_half_as_heavy_again(settings, positions, force):
     """Without it 56 mm and 5.5 N, on the ideal wall and on Drake's."""
     tool = "plant_parameters={tool.mass: 1.1}", "law=!Adaptive {parameters: {tool.mass: 2.0}}"
-    record = run_scenario(scenario("seven_joint_wall", "duration=8.0", *tool, *settings))[2]
+    _, record = roll(scenario("seven_joint_wall", "duration=8.0", *tool, *settings))
     late = np.abs(record["tracking_error"][record.time > 6.0]).max(axis=0)
     assert late[:-1].max() < positions
     assert late[-1] < force

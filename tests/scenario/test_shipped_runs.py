@@ -3,7 +3,7 @@
 import jsonschema
 import numpy as np
 import pytest
-from runs import DEAR, IN_CONTACT, scenario_validator
+from runs import DEAR, IN_CONTACT, scenario_validator, some
 from scenario_texts import run
 
 from drake_dae import (
@@ -17,7 +17,7 @@ RIGID = ["two_link_wall", "seven_joint_wall", "seven_joint_dome", "two_arms", "f
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RIGID)
+@pytest.mark.parametrize("name", some(RIGID))
 def test_rigid_scenario_has_the_predicted_error(name):
     """In 3 s all outputs move and the start errors decay by 1e-4.
 
@@ -52,7 +52,7 @@ ACTUATED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ACTUATED)
+@pytest.mark.parametrize("name", some(ACTUATED, first=1))
 def test_actuated_scenario_has_the_predicted_error(name):
     """In 1 s, relative to the start errors of some cm and 5 N.
 

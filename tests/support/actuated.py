@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import pytest
 from arms import arm, consistent_states, numbers, touching
 from pydrake.multibody.tree import JacobianWrtVariable
 
@@ -28,6 +29,16 @@ DEGREES = {
 """Of positions and forces. A kind names its stages from the joints toward the motor; damped is
 flexible with full matrices of stiffness, inertia and damping.
 """
+
+MOSTLY_TWO_LINK = ["two_link", pytest.param("seven_joint", marks=pytest.mark.thorough)]
+"""Seven joints show the same, by larger functions."""
+
+EACH = [
+    pytest.param(name, kind, marks=[pytest.mark.thorough] * (kind != "flexible motor" and i > 0))
+    for i, name in enumerate(ARMS)
+    for kind in DEGREES
+]
+"""Each arm behind each kind; of seven joints most are thorough."""
 
 OFFSET = {"two_link": [0.35], "seven_joint": [0.03, 0.57, 0.02, -0.03, 0.05, -0.06]}
 

@@ -12,6 +12,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator, Simula
 from pydrake.systems.framework import Context, DiagramBuilder, System
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
+from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.scenario import Scenario, scenario_schema
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 
@@ -85,15 +86,25 @@ def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
     ]
 
 
-def some(cases: Iterable[Any], of: int = 2, dear: Container[Any] = ()) -> list[ParameterSet]:
-    """Cases of which all but one in so many are thorough, and the dear ones: they show the same."""
+def some(
+    cases: Iterable[Any], of: int = 2, dear: Container[Any] = (), first: int = 0
+) -> list[ParameterSet]:
+    """Cases of which all but one in so many are thorough, and the dear ones: they show the same.
+
+    A tuple is a case of several arguments. Tests of one list begin at different places in it, so
+    that together they run all of its cases.
+    """
     found = []
     for i, case in enumerate(cases):
-        given = case if isinstance(case, ParameterSet) else pytest.param(case)
-        left_out = i % of > 0 or given.values[0] in dear
+        given = case if isinstance(case, ParameterSet) else _case(case)
+        left_out = i % of != first or given.values[0] in dear
         marks = [*given.marks, *[pytest.mark.thorough] * left_out]
         found.append(pytest.param(*given.values, marks=marks, id=given.id))
     return found
+
+
+def _case(case: Any) -> ParameterSet:
+    return pytest.param(*case) if isinstance(case, tuple) else pytest.param(case)
 
 
 def in_equal_steps(
@@ -134,3 +145,14 @@ def run_scenario(chosen: Scenario) -> tuple[ClosedLoop, Context, Record]:
     """A scenario from its start to its end, without Meshcat."""
     loop, context = build_scenario(chosen)
     return loop, context, run(loop, context, chosen.duration, chosen.integrator)
+
+
+def roll(chosen: Scenario) -> tuple[ClosedLoop, Record]:
+    """A scenario from its start to its end, as a rollout, in less time.
+
+    That it is Drake's run is shown where rollouts are tested.
+    """
+    loop, context = build_scenario(chosen)
+    found = roll_scenario(chosen, loop, context)
+    assert found.failure is None
+    return loop, found.record

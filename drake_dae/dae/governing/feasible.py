@@ -23,7 +23,9 @@ WITHIN = 1e-9
 """An excess over a limit, as a share of it, that is round-off."""
 
 
-def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFunction:
+def feasible_control(
+    structure: Structure, limits: MotionLimits, sample_period: float = 0.0
+) -> TracedFunction:
     """Builds the function that limits a control so that the outputs change least.
 
     By (26), (27) z_i^(mu_i) = a_i + B_i u. With ubar_d = a + B u_d of the control (28) it is
@@ -33,14 +35,16 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
 
     and with the limits of states, the speeds of joints, where W divides each output by the length
     of its row of B diag(U). Limits of u hold always; those of v and of cones as far as they allow
-    it; those of speeds as far as these allow it, by w' <= APPROACH (W - w). Limits of rates, the
-    accelerations of joints, are not kept: a robot that may not brake leaves its path, and with
-    an error of its model it does not return. u is u_d where that is within all limits.
-    ubar - ubar_d is by how much the derivative e^(mu) of the error leaves (30).
+    it; those of speeds as far as these allow it, by w' <= APPROACH (W - w) close to W, see
+    `LimitedSignals.approach`. Limits of rates, the accelerations of joints, are not kept: a robot
+    that may not brake leaves its path, and with an error of its model it does not return. u is u_d
+    where that is within all limits. ubar - ubar_d is by how much the derivative e^(mu) of the error
+    leaves (30).
 
     Args:
         structure: The structure of the system, with as many controls as outputs.
         limits: Symmetric limits of all controls, and others; those of rates are not used.
+        sample_period: The time in s in which the control is constant; 0 if it is continuous.
 
     Returns:
         (state, control, parameters) -> control, excess, departure, is_limited: excess is u_d - u,
@@ -71,7 +75,7 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
     effect = ca.mtimes(ca.diag(ca.DM(weights)), matrix) @ ca.diag(scale)
     metric = ca.mtimes(effect.T, effect)
     metric /= ca.trace(metric) / high.size
-    rows, sides, bounds, softness = _soft(structure, limits, scale)
+    rows, sides, bounds, softness = _soft(structure, limits, sample_period, scale)
     goal = desired / scale
     nearest = nearest_within(metric, goal, rows, sides, bounds, softness)
     over = ca.vertcat(ca.fabs(goal) - 1.0, ca.mtimes(sides, ca.mtimes(rows, goal)) - bounds)
@@ -91,7 +95,7 @@ def feasible_control(structure: Structure, limits: MotionLimits) -> TracedFuncti
 
 
 def _soft(
-    structure: Structure, limits: MotionLimits, scale: ca.DM
+    structure: Structure, limits: MotionLimits, sample_period: float, scale: ca.DM
 ) -> tuple[ca.SX, ca.DM, ca.SX, FloatArray]:
     """Returns A, S, b and the softness of S A x <= b for u = U x, with rows of A of length one.
 
@@ -101,12 +105,12 @@ def _soft(
     limited = LimitedSignals(structure, replace(limits, controls={}, rates={}))
     parts = zip(limited.by_control(), limited.rates_of_states(), strict=True)
     free, by = (ca.vertsplit(ca.vertcat(*part)) for part in parts)
-    pairs = zip((limited.low, limited.high), limited.approach(), strict=True)
+    pairs = zip((limited.low, limited.high), limited.approach(sample_period), strict=True)
     low, high = (ca.vertsplit(ca.vertcat(ca.SX(bound), rate)) for bound, rate in pairs)
     softness = [SOFTNESS] * len(limited.signals) + [SOFTER] * len(limited.states)
     columns = structure.system.num_controls
     rows, bounds, soft, sides = [], [], [], []
-    nearest = -(columns**0.5) - 1.0
+    furthest = columns**0.5 + 1.0
     for i, slope in enumerate(by):
         slope = ca.sparsify(ca.mtimes(slope, ca.diag(scale)))
         if not slope.nnz():
@@ -116,7 +120,8 @@ def _soft(
         for bound, sign in ((high[i], 1.0), (low[i], -1.0)):
             if _is_finite(bound):
                 sides.append((len(rows) - 1, sign))
-                bounds.append(ca.fmax(sign * (bound - free[i]) / length, nearest))
+                bound = sign * (bound - free[i]) / length
+                bounds.append(ca.fmin(ca.fmax(bound, -furthest), furthest))
                 soft.append(softness[i])
     chosen = np.zeros((len(sides), len(rows)))
     for i, (row, sign) in enumerate(sides):
@@ -130,13 +135,14 @@ def _is_finite(bound: ca.SX) -> bool:
 
 
 def limits_reached(
-    structure: Structure, limits: MotionLimits
+    structure: Structure, limits: MotionLimits, sample_period: float = 0.0
 ) -> tuple[TracedFunction, tuple[str, ...]]:
     """Builds the function that says which limits a control exceeds.
 
     Args:
         structure: The structure of the system.
         limits: The limits.
+        sample_period: As of `feasible_control`.
 
     Returns:
         (state, control, parameters) -> excess over each limit as a share of it, positive beyond it,
@@ -147,7 +153,7 @@ def limits_reached(
     free, by = limited.by_control()
     of_states, by_states = limited.rates_of_states()
     values = ca.vertcat(free + ca.mtimes(by, control), of_states + ca.mtimes(by_states, control))
-    slowest, fastest = limited.approach()
+    slowest, fastest = limited.approach(sample_period)
     low, high = ca.vertcat(ca.SX(limited.low), slowest), ca.vertcat(ca.SX(limited.high), fastest)
     sizes = [
         *np.minimum(np.abs(limited.low), np.abs(limited.high)),

@@ -44,8 +44,9 @@ class Governing:
 
     where s' = 1 is the reference's own rate, which is not exceeded. A limit is met AHEAD of time: a
     change of s' by AHEAD s'' counts with its effect on r_ss s'^2, as far as the limits hold now.
-    Speeds v are kept below V by v' <= APPROACH (V - v), as far as the other limits allow. The
-    accelerations are those of the model: a robot whose v' is d more exceeds V by d / APPROACH.
+    Speeds v are kept below V by v' <= APPROACH (V - v) close to V, see `LimitedSignals.approach`,
+    as far as the other limits allow. The accelerations are those of the model: a robot whose v' is
+    d more exceeds V by d / APPROACH.
     Where low > high, s'' is their mean; there, and where s'' would have to be larger, a limit is
     exceeded.
 
@@ -55,6 +56,7 @@ class Governing:
         law: The law, without derivatives of exogenous signals.
         references: The references, in the order of the outputs; expressions of time.
         limits: The limits.
+        sample_period: The time in s in which s'' is constant; 0 if it is continuous.
 
     Attributes:
         function: (path, state, parameters) -> reference, path_rate, room: path is (s, s'),
@@ -70,6 +72,7 @@ class Governing:
     law: TrackingLaw
     references: Sequence[Reference]
     limits: MotionLimits
+    sample_period: float = 0.0
 
     @cached_property
     def function(self) -> TracedFunction:
@@ -146,7 +149,7 @@ class Governing:
         at_once = _interval(values, ca.mtimes(by, slope_now), *bounds, sizes)
         later = _interval(values, slopes, *bounds, sizes)
         free, by = limited.rates_of_states()
-        low, high = limited.approach()
+        low, high = limited.approach(self.sample_period)
         sizes = APPROACH * np.minimum(np.abs(limited.state_low), np.abs(limited.state_high))
         values, slopes = free + ca.mtimes(by, control), ca.mtimes(by, slope_now)
         return [_interval(values, slopes, low, high, sizes), later, at_once]

@@ -9,7 +9,10 @@ from drake_dae.dae.timing.motion_limits import MotionLimits
 
 APPROACH = 100.0
 """The largest rate at which states, such as speeds, approach their limits while a motion runs, in
-1/s."""
+1/s, where they are close to these."""
+
+AT_ONCE = 1e-9
+"""The time in s in which a state may reach a limit that is not close, if there are no samples."""
 
 
 class LimitedSignals:
@@ -35,7 +38,7 @@ class LimitedSignals:
 
     def __init__(self, structure: Structure, limits: MotionLimits) -> None:
         limits.check(structure.system)
-        self._structure = structure
+        self._structure, self._close = structure, limits.close
         system = structure.system
         inputs = system.constraint_input_signals
         forces = [signal.name for signal in inputs]
@@ -86,18 +89,35 @@ class LimitedSignals:
         free, by = motion.by_control(motion.rate)
         return ca.densify(free[self.states, :]), ca.densify(by[self.states, :])
 
-    def approach(self) -> tuple[ca.SX, ca.SX]:
-        """Returns the least and the largest rates of the limited states, or infinity, (k, 1).
+    def approach(self, sample_period: float = 0.0) -> tuple[ca.SX, ca.SX]:
+        """Returns the least and the largest rates of the limited states, (k, 1), or infinity.
 
-        States x stay between their limits if APPROACH (low - x) <= x' <= APPROACH (high - x).
+        States x stay below their limits X if x' <= 0 at X. A rate has to fall to 0 as soon as X is
+        reached, so that it is lowered before:
+
+            x' <= APPROACH (X - x)    close to X, where X - x < `MotionLimits.close` |X|,
+            x' <= (X - x) / T         elsewhere, with the sample period T.
+
+        x then passes X neither close to it nor within a sample. Along a motion that is nowhere
+        close to X, such as a time-optimal one with a share of X, continuous rates are not limited,
+        and may fall to 0 at once. APPROACH (X - x) everywhere would limit them even at rest, to
+        APPROACH X, and so such motions.
+
+        Args:
+            sample_period: The time in s in which rates are constant; 0 if they are continuous.
         """
+        fast = 1.0 / max(sample_period, AT_ONCE)
+        ranges = np.abs([self.state_low, self.state_high])
+        close = self._close * np.where(np.isfinite(ranges), ranges, 0.0).max(axis=0, initial=0.0)
         state = ca.vertsplit(self._structure.system.state[self.states])
         low, high = (
             [
-                APPROACH * (bound - x) if np.isfinite(bound) else ca.SX(bound)
-                for bound, x in zip(bounds.tolist(), state, strict=True)
+                ca.if_else(sign * (bound - x) < near, min(APPROACH, fast), fast) * (bound - x)
+                if np.isfinite(bound)
+                else ca.SX(bound)
+                for bound, x, near in zip(bounds.tolist(), state, close.tolist(), strict=True)
             ]
-            for bounds in (self.state_low, self.state_high)
+            for bounds, sign in ((self.state_low, -1.0), (self.state_high, 1.0))
         )
         return ca.vertcat(ca.SX(0, 1), *low), ca.vertcat(ca.SX(0, 1), *high)
 

@@ -85,9 +85,12 @@ class MotionLimits:
             acceleration of a joint at the name of its velocity.
         forces: Constraint force -> its lowest and highest value in N or N m.
         cones: Friction cones of contacts that must not slide.
+        close: The share of the limit of a state within which its rate is lowered while a motion
+            runs, so that the limit is not passed; a motion that leaves this share of all limits is
+            not changed. In (0, 1].
 
     Raises:
-        ModelError: A lowest value is not below its highest.
+        ModelError: A lowest value is not below its highest, or `close` is out of its range.
     """
 
     controls: Mapping[str, Range] = field(default_factory=dict)
@@ -95,8 +98,14 @@ class MotionLimits:
     rates: Mapping[str, Range] = field(default_factory=dict)
     forces: Mapping[str, Range] = field(default_factory=dict)
     cones: Sequence[FrictionCone] = ()
+    close: float = 0.01
 
     def __post_init__(self) -> None:
+        if not 0.0 < self.close <= 1.0:
+            raise ModelError(
+                "close is a share of the limits of states, above 0 and at most 1, got "
+                f"{self.close:g}"
+            )
         for kind in ("controls", "states", "rates", "forces"):
             for name, (low, high) in getattr(self, kind).items():
                 if low is not None and high is not None and not low < high:

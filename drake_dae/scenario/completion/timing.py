@@ -38,6 +38,9 @@ LATE = 0.5
 OF_CONES = 0.99
 """The fraction of the friction of cones that a motion may use; the rest is left for feedback."""
 
+LEAST_CLOSE = 1e-3
+"""The least share of the limit of a speed within which it is close to it."""
+
 MOST_CAUSES = 3
 """The largest number of limits in a note."""
 
@@ -106,9 +109,14 @@ def timed(
     if not settings.governor:
         return Completed(scenario, tuple(notes)), TimedScenario(reference)
     # Half of what the profile leaves of the speeds is for errors of the model: a joint whose
-    # acceleration is da more than the model's exceeds its limit by da / APPROACH.
+    # acceleration is da more than the model's exceeds its limit by da / APPROACH. The motion does
+    # not come close to a limit, which is by half of what it leaves of it.
     speeds = (1.0 + settings.joint_speeds) / 2.0
     governed, slowed = (
-        robot_motion_limits(model, joint_speeds=share, **contacts) for share in (1.0, speeds)
+        replace(
+            robot_motion_limits(model, joint_speeds=share, **contacts),
+            close=max((1.0 - settings.joint_speeds / share) / 2.0, LEAST_CLOSE),
+        )
+        for share in (1.0, speeds)
     )
     return Completed(scenario, tuple(notes)), TimedScenario(reference, governed, slowed)

@@ -46,6 +46,7 @@ class FeasibleControl(ParameterizedSystem):
     Args:
         structure: The structure of the law's system.
         limits: Limits of all controls, and others.
+        sample_period: The time in s in which the control is constant; 0 if it is continuous.
 
     Raises:
         ModelError: As of `feasible_control`.
@@ -54,13 +55,15 @@ class FeasibleControl(ParameterizedSystem):
     __slots__ = SHARED_DICTIONARY
     no_gradient = "its control has kinks where limits are reached"
 
-    def __init__(self, structure: Structure, limits: MotionLimits) -> None:
+    def __init__(
+        self, structure: Structure, limits: MotionLimits, sample_period: float = 0.0
+    ) -> None:
         system = structure.system
         names = {"state": system.state_signals, "control": system.control_signals}
         super().__init__(system, system.parameter_values, names)
         self.set_name("feasible_control")
-        self._structure, self._limits = structure, limits
-        self.function = feasible_control(structure, limits)
+        self._structure, self._kept = structure, (limits, sample_period)
+        self.function = feasible_control(structure, *self._kept)
         self._state = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._commanded = self.DeclareVectorInputPort("control", system.num_controls)
         self._declare_exogenous(system.exogenous.degrees(structure.drift, structure.control_matrix))
@@ -81,7 +84,7 @@ class FeasibleControl(ParameterizedSystem):
 
     @cached_property
     def _reached(self) -> tuple[TracedFunction, tuple[str, ...]]:
-        return limits_reached(self._structure, self._limits)
+        return limits_reached(self._structure, *self._kept)
 
     def beyond(
         self, states: FloatArray, controls: FloatArray, exogenous: FloatArray | None = None

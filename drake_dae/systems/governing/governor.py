@@ -90,7 +90,7 @@ class PathGovernor(ReferenceGenerator):
                 "a governor takes references without parameters, these have "
                 f"{', '.join(self.reference_parameters)}: write their numbers into the expressions"
             )
-        self.governing = Governing(law, tuple(references), limits)
+        self.governing = Governing(law, tuple(references), limits, sample_period)
         self.sample_period = sample_period
         self._steps = StepWatch(self)
         self.DeclareNumericParameter(BasicVector(law.all_parameters()))

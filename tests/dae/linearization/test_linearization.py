@@ -5,6 +5,7 @@ import pytest
 import scipy.linalg
 from arms import arm, law
 from problems import PROBLEMS, hanging_pendulum, in_other_units
+from runs import some
 from scipy.optimize import root
 
 from drake_dae.dae.linearization.linearization import linearize, linearize_loop
@@ -53,6 +54,7 @@ def on_manifold(structure: Structure, x: Array, free: Array, values: Array) -> A
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
 def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
     """Central differences of the motion in the coordinates that were chosen, moving or not."""
     structure = problem.structure

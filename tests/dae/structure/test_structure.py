@@ -99,7 +99,7 @@ def test_spread_and_count():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(30), of=3))
+@pytest.mark.parametrize("seed", some(range(30), of=6))
 def test_hidden_normal_forms_are_found(seed):
     """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
     hidden = hidden_normal_form(seed)
@@ -128,6 +128,7 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", some(range(5), of=5))
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
 def test_units_do_not_matter(problem, seed):
     """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
 
@@ -160,6 +161,7 @@ def test_units_do_not_matter(problem, seed):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_a_mass_matrix_changes_nothing(problem):
     """(1) multiplied by a positive definite E(x) has the same A, alpha, beta, a, B and degrees."""
     system, random = problem.system, np.random.default_rng(0)

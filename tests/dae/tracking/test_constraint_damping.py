@@ -13,6 +13,7 @@ import scipy.integrate
 import scipy.linalg
 from arms import arm, touching
 from numpy.testing import assert_allclose
+from runs import some
 
 from drake_dae import (
     ConstantReference,
@@ -211,14 +212,16 @@ def test_each_constraint_has_poles_of_its_own_and_bad_ones_are_refused():
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "two_link_wall",
-        pytest.param("seven_joint_wall", marks=pytest.mark.slow),
-        pytest.param("two_link_flexible", marks=pytest.mark.slow),
-        pytest.param("two_link_hydraulics", marks=pytest.mark.slow),
-        pytest.param("seven_joint_moving_plate", marks=pytest.mark.slow),
-        pytest.param("cart_wall", marks=pytest.mark.slow),
-    ],
+    some(
+        [
+            "two_link_wall",
+            pytest.param("seven_joint_wall", marks=pytest.mark.slow),
+            pytest.param("two_link_flexible", marks=pytest.mark.slow),
+            pytest.param("two_link_hydraulics", marks=pytest.mark.slow),
+            pytest.param("seven_joint_moving_plate", marks=pytest.mark.slow),
+            pytest.param("cart_wall", marks=pytest.mark.slow),
+        ]
+    ),
 )
 def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
     """The plant stays on N* to 1e-15 at each step, which c = 100 / s makes 1e-12 of what it gets.

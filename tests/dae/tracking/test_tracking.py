@@ -15,6 +15,7 @@ from problems import (
     reference_at,
     wanted_outputs,
 )
+from runs import some
 
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Parameter
@@ -31,6 +32,7 @@ def starts(problem: Problem) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.equation(6, 7, 8, 28, 30, 31, 33)
+@pytest.mark.parametrize("problem", some(PROBLEMS), indirect=True)
 def test_the_closed_loop_has_exactly_the_predicted_error(problem):
     """(30), (31) from a start with an error, by an independent integrator and elimination."""
     law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)

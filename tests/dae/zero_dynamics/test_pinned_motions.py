@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from actuated import OFFSET, actuated, at_rest, drive, rates, start_position
 from problems import (
+    PROBLEMS,
     Problem,
     closed_loop_outputs,
     double_integrator,
@@ -20,6 +21,7 @@ from problems.zero_systems import (
     free_arm,
     zero_dynamics,
 )
+from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae.tracking.gains import poles
@@ -45,6 +47,7 @@ def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, P
 
 @pytest.mark.slow
 @pytest.mark.equation(36)
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
     """By the closed forms of the problem: k and its derivatives, z = l + m (alpha + beta u)."""
     _, times, motion = following(problem)
@@ -66,6 +69,7 @@ def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
 
 @pytest.mark.slow
 @pytest.mark.equation(35)
+@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
 def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     """The law (28) without an initial error moves the same way; integrated by DOP853."""
     _, times, motion = following(problem)

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import in_other_units
+from runs import some
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -345,7 +346,7 @@ def test_without_zero_dynamics():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strength", [0.3, 1.0, 5.0])
+@pytest.mark.parametrize("strength", some([0.3, 1.0, 5.0]))
 def test_a_limit_cycle_is_bounded(strength):
     """Van der Pol: s = 0 has the eigenvalues of l^2 - e l + 1, and the cycle is about 2 wide."""
     system = oscillator(lambda s, w, z: strength * (1 - s**2) * w - s)

@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import (
-    ARMS,
     DEGREES,
+    EACH,
     actuated,
     at_rest,
     drive,
@@ -24,8 +24,7 @@ from drake_dae.robots.outputs import JointPositions
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", DEGREES)
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(("name", "kind"), EACH)
 def test_dynamics_are_those_of_a_dense_solve(name, kind):
     """x', lambda, tau and the stages' ports, from MultibodyPlant and NumPy; see `rates`.
 
@@ -60,8 +59,7 @@ def test_dynamics_are_those_of_a_dense_solve(name, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", DEGREES)
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(("name", "kind"), EACH)
 def test_degrees_are_found(name, kind):
     """r = 2; joint damping takes one from mu = (4, 2), another stage adds one."""
     structure = actuated(name, kind).structure
@@ -72,8 +70,7 @@ def test_degrees_are_found(name, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", DEGREES)
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(("name", "kind"), EACH)
 def test_rest_state_is_the_static_equilibrium(name, kind):
     """tau = H - J^T lambda at v = 0, by MultibodyPlant; x' = 0 under the control that holds it.
 

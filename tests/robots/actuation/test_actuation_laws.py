@@ -8,6 +8,7 @@ import pytest
 from actuated import (
     ARMS,
     DEGREES,
+    MOSTLY_TWO_LINK,
     actuated,
     at_rest,
     drive,
@@ -141,7 +142,7 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
 @pytest.mark.slow
 @pytest.mark.parametrize("full", [False, True], ids=["poles", "Lambda"])
 @pytest.mark.parametrize("kind", ["flexible", "motor", "hydraulic"])
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", MOSTLY_TWO_LINK)
 @pytest.mark.equation(39, 64, 65, 66, 67, 68, 69, 70, 74, 75, 76, 77, 78, 79, 80)
 def test_law_is_the_explicit_law(name, kind, full):
     """(69)-(71), (79)-(81) and their hydraulic form, at random states and references.
@@ -172,7 +173,7 @@ def test_law_is_the_explicit_law(name, kind, full):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flexible motor", "flexible hydraulic", "damped"])
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", MOSTLY_TWO_LINK)
 def test_error_obeys_the_assigned_equation(name, kind):
     """e^(mu) + Lambda_mu e^(mu - 1) + ... + Lambda_1 e = 0, where no explicit law is on paper.
 

@@ -22,6 +22,7 @@ from random_plants import (
     random_robot,
     state,
 )
+from runs import some
 
 from drake_dae.trace.functions import TracedFunction
 
@@ -29,7 +30,7 @@ SEEDS = range(20)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", some(SEEDS, of=4))
 def test_terms_are_those_of_the_plant(seed):
     robot = random_robot(seed)
     random = np.random.default_rng(100 + seed)
@@ -81,7 +82,7 @@ def test_accelerations_are_those_of_the_continuous_plant(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", some(SEEDS, of=4, first=1))
 def test_frames_are_where_the_plant_has_them(seed):
     robot = random_robot(seed)
     plant, expressions = robot.plant, robot.expressions
@@ -116,7 +117,7 @@ def test_frames_are_where_the_plant_has_them(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", some(range(8), of=3))
 def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
     """J against the plant's frame Jacobians; the rest against M v' + H - J^T lambda and phi''.
 
@@ -187,7 +188,7 @@ def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", some(range(4)))
 def test_discrete_plant_has_the_same_terms(seed):
     continuous, discrete = random_robot(seed), random_robot(seed, time_step=1e-3)
     context = random_context(discrete.plant, np.random.default_rng(500 + seed))

@@ -63,9 +63,11 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         ("two_link_wall", (PACKETS,)),
         pytest.param("two_link_wall", (SAMPLED, MANY_PIECES), marks=pytest.mark.slow),
         pytest.param("two_link_wall", EVERYTHING, marks=pytest.mark.slow),
-        pytest.param("seven_joint_moving_plate", (SAMPLED,), marks=pytest.mark.slow),
+        pytest.param(
+            "seven_joint_moving_plate", (SAMPLED,), marks=[pytest.mark.slow, pytest.mark.thorough]
+        ),
         pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),
-        pytest.param("wall_point_contact", (), marks=pytest.mark.slow),
+        pytest.param("wall_point_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
         pytest.param("wall_polish", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param(
             "wall_point_contact", ("sampling=null",), marks=[pytest.mark.slow, pytest.mark.thorough]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.trajectories import PiecewisePolynomial
-from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario
+from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
 from drake_dae import (
     ConstantReference,
@@ -256,12 +256,15 @@ def test_many_runs_are_those_of_one_each(compiled):
 @mostly_compiled
 @pytest.mark.parametrize(
     "sensor",
-    [
-        {"time_constant": 0.02},
-        {"time_constant": 0.02, "bias": 0.5, "noise_deviation": 0.1},
-        {"time_constant": 0.02, "sample_period": 0.01, "noise_deviation": 0.1},
-        {"time_constant": 0.06, "sample_period": 0.013},
-    ],
+    some(
+        [
+            {"time_constant": 0.02},
+            {"time_constant": 0.02, "bias": 0.5, "noise_deviation": 0.1},
+            {"time_constant": 0.02, "sample_period": 0.01, "noise_deviation": 0.1},
+            {"time_constant": 0.06, "sample_period": 0.013},
+        ],
+        first=1,
+    ),
 )
 def test_sensors_measure_as_in_drake(sensor, compiled):
     """The noise is that of Drake's RandomSource; steps of both end at each of its changes."""
@@ -287,7 +290,7 @@ def test_sensors_measure_as_in_drake(sensor, compiled):
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize("case", ["position", "measured", "direct"])
+@pytest.mark.parametrize("case", some(["position", "measured", "direct"]))
 def test_integrals_are_those_of_drake(case, compiled):
     """To 1e-12 of the largest value, as all that equal steps give.
 
@@ -474,23 +477,28 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
 @mostly_compiled
 @pytest.mark.parametrize(
     "settings",
-    [
-        ["sampling={period: 0.002}"],
-        ["sampling={period: 0.004, delay: 0.001}"],
-        ["sampling={period: 0.002, delay: 0.005}"],
-        ["sampling={period: 0.003, delay: 0.003}", "saturation=true"],
+    some(
         [
-            "sampling={period: 0.002}",
-            "force_feedback=!MeasuredForce {sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
-            "integral=[tool.z]",
-            "gains=!Poles {all: [-4, -5, -6]}",
+            ["sampling={period: 0.002}"],
+            ["sampling={period: 0.004, delay: 0.001}"],
+            ["sampling={period: 0.002, delay: 0.005}"],
+            ["sampling={period: 0.003, delay: 0.003}", "saturation=true"],
+            [
+                "sampling={period: 0.002}",
+                "force_feedback=!MeasuredForce "
+                "{sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
+                "integral=[tool.z]",
+                "gains=!Poles {all: [-4, -5, -6]}",
+            ],
+            ["sampling={period: 0.002}", "encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"],
+            [
+                "sampling={period: 0.002, delay: 0.001}",
+                "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3, "
+                "position_bias: 1e-4}",
+            ],
         ],
-        ["sampling={period: 0.002}", "encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"],
-        [
-            "sampling={period: 0.002, delay: 0.001}",
-            "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3, position_bias: 1e-4}",
-        ],
-    ],
+        of=3,
+    ),
 )
 def test_sampled_laws_are_those_of_drake(settings, compiled):
     """To 1e-11 of the largest value: their controls jump, and forces with them."""
@@ -521,12 +529,14 @@ OBSERVED = ["sampling={period: 0.002}", "force_feedback=!MeasuredForce {sample_p
 @mostly_compiled
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [
-        ("two_link_wall", ["constraints.0.friction=0.0", "observer.identify_friction=[wall]"]),
-        ("two_link_wall", ["saturation=true", "integral=[tool.z]", "observer.force_rate=5.0"]),
-        ("two_link_wall", ["encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
-        ("two_link_flexible", ["sampling.delay=0.001"]),
-    ],
+    some(
+        [
+            ("two_link_wall", ["constraints.0.friction=0.0", "observer.identify_friction=[wall]"]),
+            ("two_link_wall", ["saturation=true", "integral=[tool.z]", "observer.force_rate=5.0"]),
+            ("two_link_wall", ["encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
+            ("two_link_flexible", ["sampling.delay=0.001"]),
+        ]
+    ),
 )
 def test_observed_loops_are_those_of_drake(name, settings, compiled):
     """To 1e-11 of the largest value, as of sampled laws; what is observed moves."""

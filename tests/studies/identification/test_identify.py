@@ -3,10 +3,11 @@
 import re
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
-from runs import scenario
+from runs import scenario, some
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
@@ -294,8 +295,10 @@ SENSORS = {
 }
 
 
-@pytest.mark.parametrize("kind", SENSORS)
-@pytest.mark.parametrize("plant", ["ideal", "compliant"])
+SENSED = list(product(["ideal", "compliant"], SENSORS))
+
+
+@pytest.mark.parametrize(("plant", "kind"), some(SENSED))
 def test_what_sensors_do_to_a_force_is_known_exactly(kind, plant):
     """Without noise a sample one row off, or the control of the step before, shows in the bias."""
     own = ("plant=!CompliantContact {friction: 0.2}",) if plant == "compliant" else ()
@@ -323,10 +326,8 @@ def test_a_hold_may_act_just_before_the_step_of_its_instant():
     assert found["link2.mass"] == pytest.approx(6.3, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "kind", [*list(SENSORS)[:2], pytest.param("a lag", marks=pytest.mark.thorough)]
-)
-@pytest.mark.parametrize("plant", ["ideal", "compliant"])
+@pytest.mark.slow
+@pytest.mark.parametrize(("plant", "kind"), some(SENSED, of=3, first=1))
 def test_rows_between_samples_are_no_measurements(kind, plant):
     """Encoders and law sample each second row; a sensor of the force samples, lags, or both."""
     noise, z = "noise_deviation: 0.3, bias: 1.0", []

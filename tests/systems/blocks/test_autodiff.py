@@ -28,6 +28,7 @@ from pydrake.systems.primitives import (
     TrajectorySource,
 )
 from pydrake.trajectories import PiecewisePolynomial
+from runs import some
 
 from drake_dae import (
     AdaptiveController,
@@ -137,7 +138,7 @@ def check_gradient(system, inputs, state=()):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", some(PLANTS, of=3, first=1))
 def test_plants(name):
     plant, state, control = plant_of(name)
     check_gradient(plant, {"control": control}, state)
@@ -145,7 +146,7 @@ def test_plants(name):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", some(PLANTS, of=3))
 def test_controllers(name):
     plant, state, _ = plant_of(name)
     system = TrackingController(TrackingLaw(plant.dae, poles(-3.0)))

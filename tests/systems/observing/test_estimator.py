@@ -9,7 +9,7 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource
-from runs import run_scenario, scenario, some
+from runs import roll, run_scenario, scenario, some
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.stats import chi2
 
@@ -162,7 +162,7 @@ def test_encoders_alone_track_as_promised_and_innovations_are_consistent():
     95 per cent for 93 to 97 per cent of the samples. Prediction and run differ by at most 30 per
     cent in what noise makes of the force, and of the controls.
     """
-    loop, _, record = run_scenario(scenario(*NOISY, NOISE, "duration=4"))
+    loop, record = roll(scenario(*NOISY, NOISE, "duration=4"))
     late = record.time > 2.0
     error = record["tracking_error"][late]
     assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 1e-4
@@ -208,7 +208,7 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
     points = ", ".join(f"tool.{axis}: [15625.0, 1250.0, 50.0]" for axis in "yz")
     names = ("tool.z_axis.y", "tool.z_axis.z", "joint3", "joint7")
     others = ", ".join(f"{name}: [625.0, 35.4]" for name in names)
-    loop, _, record = run_scenario(
+    loop, record = roll(
         scenario(
             "wall_point_contact",
             "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
@@ -255,9 +255,9 @@ def test_the_first_break_away_of_encoders_alone_does_not_swing():
 
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(ScenarioError, match="give the loop encoders, or leave it out"):
-        run_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 100}"))
+        build_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 100}"))
     with pytest.raises(ScenarioError, match="leave the encoders' velocity_bandwidth out"):
-        run_scenario(
+        build_scenario(
             scenario(
                 *NOISY,
                 "observer={rate: 20, state_rate: 100}",
@@ -265,9 +265,9 @@ def test_what_cannot_be_estimated_is_refused():
             )
         )
     with pytest.raises(ScenarioError, match="too high for samples"):
-        run_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 2000}", "encoders={}"))
+        build_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 2000}", "encoders={}"))
     with pytest.raises(ScenarioError, match="robots with rigid joints"):
-        run_scenario(
+        build_scenario(
             scenario(
                 "wall_flexible_contact",
                 "observer={rate: 20, state_rate: 100}",

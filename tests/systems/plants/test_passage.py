@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from parallel_bars import bars, parallelogram, swung
 from problems import system_of
 from pydrake.systems.analysis import SimulatorConfig
+from runs import some
 
 from drake_dae import DaePlant, find_constraint_structure, simulate
 from drake_dae.dae.structure.passage import Passage
@@ -33,10 +34,13 @@ CONFIGURATIONS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if "1e-3" in name else ())
-        for name in CONFIGURATIONS
-    ],
+    some(
+        [
+            pytest.param(name, marks=pytest.mark.slow if "1e-3" in name else ())
+            for name in CONFIGURATIONS
+        ],
+        of=3,
+    ),
 )
 @pytest.mark.parametrize("tilt", [0.0, 0.7])
 @pytest.mark.parametrize("windows", [1, 2])

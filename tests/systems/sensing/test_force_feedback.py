@@ -288,10 +288,10 @@ def test_noise_has_its_deviation_and_its_seed():
     sensor = lambda: ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
     still = ConstantVectorSource([0.0, 0.0])
     _, first = sensed(sensor(), still, 20.0, RandomGenerator(3))
-    _, again = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 20.0, RandomGenerator(3))
-    _, other = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 20.0, RandomGenerator(4))
-    np.testing.assert_array_equal(first, again)
-    assert np.max(np.abs(first - other)) > 0.1
+    _, again = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 2.0, RandomGenerator(3))
+    _, other = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 2.0, RandomGenerator(4))
+    np.testing.assert_array_equal(first[:, :201], again)
+    assert np.max(np.abs(again - other)) > 0.1
     # 2000 samples: the deviation is known to 2 % (one sigma 1.6 %).
     np.testing.assert_allclose(np.std(first, axis=1), [0.5, 2.0], rtol=0.06)
 

@@ -154,9 +154,7 @@ def ended(path, cause, phase, reaction):
 
 
 CASES = [
-    ("a push", Search, "away"),
     ("a push", Press, "fail"),
-    ("a push over the edge", Wait, "hold"),
     ("a wall that ends", Follow, "away"),
     ("a reference that jumps", Move, "stop"),
 ]

@@ -91,10 +91,17 @@ class Screw(Phase):
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {self.turn: self.path}
 
+    @cached_property
+    def _turns(self) -> ca.Function:
+        """The turns after a time in s, by the reference."""
+        time = ca.SX.sym("t")
+        turns = self.path.expression([0], time) / (2.0 * pi) * copysign(1.0, self.turns)
+        return ca.Function("turns", [time], [turns])
+
     def _turned(self, time: float) -> float:
-        """The turns after a time in s, by the reference; an expression if the time is one."""
-        turns = self.path.expression([0], ca.SX(time)) / (2.0 * pi) * copysign(1.0, self.turns)
-        return turns if isinstance(time, ca.SX) else float(ca.DM(turns))
+        """The turns after a time in s; an expression if the time is one."""
+        turns = self._turns(time)
+        return turns if isinstance(time, ca.SX) else float(turns)
 
     @property
     def measured_control(self) -> str:

@@ -36,7 +36,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, OutputPortSelection
 from pydrake.systems.primitives import ConstantVectorSource, FirstOrderTaylorApproximation
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, some
 
 from drake_dae import (
     CoincidentPoints,
@@ -173,7 +173,7 @@ def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
 
 @pytest.mark.parametrize(
     ("shape", "dissipation"),
-    [("plane", 0.0), ("plane", 2.0), ("plane", 30.0), ("sphere", 2.0), ("cylinder", 2.0)],
+    some([("plane", 0.0), ("plane", 2.0), ("plane", 30.0), ("sphere", 2.0), ("cylinder", 2.0)]),
 )
 def test_a_step_is_that_of_a_discrete_multibody_plant(shape, dissipation):
     """Its solver stops at a relative residual of 1e-6; without contact only round-off is left."""
