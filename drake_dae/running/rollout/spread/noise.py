@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 
@@ -15,8 +14,9 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
-from drake_dae.running.rollout.events import distribution_of
+from drake_dae.running.rollout.events import moments_of
 from drake_dae.running.rollout.problems import problems_of
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunProblem, Settings
 from drake_dae.running.rollout.spread.recursion import Step, of_signals, passed, reached
 from drake_dae.running.rollout.spread.rounding import RoundedRuns, Rounding
@@ -26,13 +26,6 @@ from drake_dae.running.rollout.stepping.functions import DiagramFunctions, funct
 _OTHERWISE, _SHORTEST = 0.5, 12
 """Between times by whose slopes a deviation differs by more than 50 %, there is another time,
 unless they are at most 12 periods apart."""
-
-_MOMENTS = {
-    RandomDistribution.kUniform: (0.5, 12.0**-0.5),
-    RandomDistribution.kGaussian: (0.0, 1.0),
-    RandomDistribution.kExponential: (1.0, 1.0),
-}
-"""Mean and deviation of the numbers of a RandomSource."""
 
 SAME = 1e-6
 """Times that differ by less than this fraction of a period are the same."""
@@ -141,19 +134,10 @@ def spread_with_rounding(
     Raises:
         ModelError, InconsistentStateError: As for `noise_spread`.
     """
-    if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
-        raise ModelError(
-            f"{loop.plant.get_name()} has no spread by noise: controls or measurements come late "
-            "or are lost at random, which has no slope; run it with several seeds instead"
-        )
     begun = 0.0 if config is None else config.start_time
     request = RolloutRequest.of(loop, np.append(begun, np.ravel(times)), config, None, None)
-    program, compiled = request.program, request.program.compiled
-    if compiled.changes or compiled.has_stepped:
-        raise ModelError(
-            f"{program.name} has no spread by noise: a block changes at times that a run locates, "
-            "as at impacts and openings, or Drake steps it"
-        )
+    program = request.program
+    check_smooth(loop, program)
     problems = problems_of(program, start, parameters, request.times, None)
     if len(problems) != 1:
         raise ModelError(f"the spread by noise is that of one run, got {len(problems)} starts")
@@ -166,6 +150,25 @@ def spread_with_rounding(
         return dict(zip(program.signals, np.split(values, stops[1:], axis=1), strict=True))
 
     return NoiseSpread(np.array([time for time, _, _ in found]), signals(whole), signals(changes))
+
+
+def check_smooth(loop: ClosedLoop | Diagram, program: RolloutProgram) -> None:
+    """Checks that noise has an effect to first order.
+
+    Raises:
+        ModelError: Signals are late or lost at random; blocks change at times that a run locates;
+            or Drake steps a block.
+    """
+    if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
+        raise ModelError(
+            f"{loop.plant.get_name()} has no spread by noise: controls or measurements come late "
+            "or are lost at random, which has no slope; run it with several seeds instead"
+        )
+    if program.compiled.changes or program.compiled.has_stepped:
+        raise ModelError(
+            f"{program.name} has no spread by noise: a block changes at times that a run locates, "
+            "as at impacts and openings, or Drake steps it"
+        )
 
 
 class _Point(NamedTuple):
@@ -206,11 +209,8 @@ class _Samples:
             )
         self._functions, self._settings, self._problem = functions, settings, problem
         self._index = 0
-        self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
-        self._deviations = np.zeros(problem.noise.shape[1])
-        for source, part in functions.program.compiled.noise:
-            mean, deviation = _MOMENTS[distribution_of(source)]
-            self._quiet[:, part], self._deviations[part] = mean, deviation
+        means, self._deviations = moments_of(functions.program.compiled)
+        self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise) + means
         size = problem.state.size + problem.held.size
         self._spread = np.zeros((size, size))
         self._rounded = None
