@@ -34,6 +34,9 @@ PASSES = 40
 SETTLED = 1e-7
 """Passes end where b changes by less than this share of its largest value."""
 
+BETWEEN = (0.25, 0.5, 0.75)
+"""The shares of the time of an interval at which limits are tested between points."""
+
 LOWERINGS = 3
 """The largest number of times that limits are lowered where the motion exceeds them."""
 
@@ -248,8 +251,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
     """The fastest motion along a piece.
 
     Where the acceleration changes from one interval to the next, as where n of a limit passes
-    through zero, the smoothed motion exceeds the limit a little. If by too much, the limit is
-    lowered there.
+    through zero, the smoothed motion exceeds the limit a little, at a point or in the middle of an
+    interval. If by too much, the limit is lowered there.
 
     Raises:
         ReferenceSignalError: Nothing limits the motion, or it cannot leave a rest.
@@ -261,10 +264,8 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
         fastest, before = _settled(rows, piece, largest, factor, before)
         b, a, times = smoothed(piece.distances, fastest.b, fastest.a)
         lines = rows.lines(b)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            fast = np.where(largest > 0.0, b / largest, 0.0)
-        used = np.column_stack([lines.alpha * a[:, None] + lines.beta * b[:, None], fast])
         accepted = np.append(rows.accepted, EXCESS)
+        used = _used(lines, largest, b, a, times)
         if (used <= 1.0 + accepted).all():
             break
         over = np.max(used / (1.0 + accepted / 2.0), axis=1)
@@ -272,6 +273,34 @@ def _fastest(rows: LimitRows, piece: Piece, largest_rate: float | None) -> Profi
         factor *= np.maximum(np.maximum(wide[:-2], wide[2:]), wide[1:-1])
     limiting = np.where(fastest.active >= 0, fastest.active, which[1:])
     return ProfilePiece(piece, times, b, a, fastest.highest, limiting)
+
+
+def _used(
+    lines: LinearLimits, largest: FloatArray, b: FloatArray, a: FloatArray, times: FloatArray
+) -> FloatArray:
+    """The used share of each line, and last of the largest b, at points, shape (N + 1, k + 1).
+
+    At a point it is the largest up to its neighbours, between which a is linear in time, and lines
+    are.
+    """
+
+    def shares(
+        alpha: FloatArray, beta: FloatArray, largest: FloatArray, b: FloatArray, a: FloatArray
+    ) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fast = np.where(largest > 0.0, b / largest, 0.0)
+        return np.column_stack([alpha * a[:, None] + beta * b[:, None], fast])
+
+    at_points = shares(lines.alpha, lines.beta, largest, b, a)
+    used, width, speed = at_points.copy(), np.diff(times), np.sqrt(b[:-1])
+    for x in BETWEEN:
+        alpha, beta, most, now = (
+            (1.0 - x) * part[:-1] + x * part[1:] for part in (lines.alpha, lines.beta, largest, a)
+        )
+        fast = np.maximum(speed + x * width * (a[:-1] + now) / 2.0, 0.0)
+        between = shares(alpha, beta, most, fast**2, now)
+        used[:-1], used[1:] = np.maximum(used[:-1], between), np.maximum(used[1:], between)
+    return used
 
 
 def _settled(

@@ -11,8 +11,8 @@ from drake_dae.errors import DrakeDaeError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.spread.noise import NoiseSpread, check_smooth, spread_with_rounding
+from drake_dae.running.rollout.spread.rounding import Rounding
 from drake_dae.running.rollout.spread.runs import NoisyRuns, noisy_runs, off_proportion
-from drake_dae.running.rollout.spread.waves import Rounding
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
@@ -99,12 +99,13 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     """Predicts the deviations of outputs and controls by the noise of encoders and force sensor.
 
     It is `noise_spread` of the scenario's loop, on the plant that rollouts have, from its start; of
-    the resolution of encoders with the waves of `Rounding`. That is a prediction to first order: it
-    holds if a tenth of the noise does a tenth of what the noise does. Where friction holds the tool
-    for a while and lets it go, as at a start, a rest or a reversal, noise decides when and whereto,
-    and the loop answers small noise otherwise than large. So the loop runs with a tenth of the
-    noise and with all of it, and where answers are off proportion by 20 %, runs with other random
-    numbers, and with other zeros of encoders that round, take the place of the prediction.
+    the resolution of encoders by runs of the linearized loop (`RoundedRuns`). That is a prediction
+    to first order: it holds if a tenth of the noise does a tenth of what the noise does. Where
+    friction holds the tool for a while and lets it go, as at a start, a rest or a reversal, noise
+    decides when and whereto, and the loop answers small noise otherwise than large. So the loop
+    runs with a tenth of the noise and with all of it, and where answers are off proportion by 20 %,
+    runs with other random numbers, and with other zeros of encoders that round, take the place of
+    the prediction.
 
     Args:
         scenario: The scenario, as `load_scenario` returns it.
