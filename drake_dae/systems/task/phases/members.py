@@ -117,6 +117,9 @@ class Press(Phase):
         if not isinstance(self.force, Reference):
             positive("Press: force", self.force)
 
+    def felt(self, contact_force: float) -> float:
+        return contact_force if isinstance(self.force, Reference) else self.force
+
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.force}
 
