@@ -93,6 +93,7 @@ def contact_plant() -> dd.ContactPlant:
     return dd.ContactPlant(found.model, add_arm, dd.ContactMaterial(), structure=found.structure)
 
 
+@cache
 def observed_law() -> dd.TrackingLaw:
     dae = dd.with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
@@ -109,8 +110,24 @@ def adaptive_law() -> dd.AdaptiveLaw:
     return dd.AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
 
 
+@cache
 def links_law() -> dd.TrackingLaw:
     return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
+
+
+@cache
+def observer() -> dd.DisturbanceObserver:
+    return dd.DisturbanceObserver(observed_law(), dd.Observing(10.0), 0.01)
+
+
+@cache
+def estimator() -> dd.StateEstimator:
+    return dd.StateEstimator(observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01)
+
+
+@cache
+def cascade() -> dd.SpringCascade:
+    return dd.SpringCascade(links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01)
 
 
 def motion_limits() -> dd.MotionLimits:
@@ -261,21 +278,15 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
-    dd.DisturbanceObserver: lambda: dd.DisturbanceObserver(
-        observed_law(), dd.Observing(10.0), 0.01
-    ),
-    dd.StateEstimator: lambda: dd.StateEstimator(
-        observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01
-    ),
+    dd.DisturbanceObserver: observer,
+    dd.StateEstimator: estimator,
     dd.SensedContact: sensed,
     dd.MotionLimits: motion_limits,
     dd.PathTiming: lambda: dd.PathTiming(arm("two_link").structure, motion_limits()),
     TimeProfile: time_profile,
     dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
     dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
-    dd.SpringCascade: lambda: dd.SpringCascade(
-        links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01
-    ),
+    dd.SpringCascade: cascade,
     dd.AdaptiveLaw: adaptive_law,
     dd.AdaptiveController: lambda: dd.AdaptiveController(adaptive_law()),
     "law of SpringCascade": links_law,

@@ -29,7 +29,7 @@ from drake_dae.scenario.controllers.task_controller import (
     task_controller,
 )
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.observed import law_robot, observed_structure
+from drake_dae.scenario.observed import latency_of, law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
 from drake_dae.scenario.parts.parts import Adaptive, Tracking
 from drake_dae.scenario.plants import RobotToSimulate
@@ -78,7 +78,8 @@ def build_loop(
         raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
     opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
-    law = _law(scenario, observed_structure(scenario, *law_robot(scenario, model, structure)))
+    observed = observed_structure(scenario, *law_robot(scenario, model, structure))
+    law = _law(scenario, observed, latency_of(scenario, model))
     references: list[Reference] = []
     if motion is not None:
         references = [motion.reference]
@@ -198,8 +199,8 @@ def make_plant(
         raise ScenarioError(("start.positions", str(error))) from error
 
 
-def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
-    """The law of a scenario for a system."""
+def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLaw:
+    """The law of a scenario for a system, with a latency in s."""
     force, damping = scenario.force_feedback, scenario.constraint_damping
     keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
@@ -221,6 +222,7 @@ def _law(scenario: Scenario, structure: Structure) -> TrackingLaw:
             constraint_damping=None if damping is None else damping.design(),
             integral=scenario.integral or (),
             contact_stiffness=stiffness,
+            latency=latency,
         )
 
 

@@ -45,6 +45,14 @@ def law_robot(
         return links, find_structure(links.dae)
 
 
+def latency_of(scenario: Scenario, model: RobotModel) -> float:
+    """The mean time from a sample to the moment when its control acts, for rigid joints, in s."""
+    sampling = scenario.sampling
+    if sampling is None or model.stages:
+        return 0.0
+    return sampling.mean_delay + sampling.period / 2.0
+
+
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
     """The structure of the law's system, with a disturbance if the scenario has an observer.
 

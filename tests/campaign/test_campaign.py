@@ -51,7 +51,7 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
 
 # In drop 46 a corner dips into the floor and comes out again, nearly within one step.
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", each((*range(9), 46), range(9, 16)))
+@pytest.mark.parametrize("seed", each((*range(5), 46), range(5, 16)))
 def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
     outcome = drops.attempt(seed, tmp_path, duration=0.5)
     assert outcome.kind == RESULT, outcome
@@ -73,7 +73,13 @@ def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: in
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "seed",
-    [0, 2, 3, 4, 602, 674, *(pytest.param(i, marks=pytest.mark.thorough) for i in range(20, 40))],
+    [
+        0,
+        2,
+        3,
+        602,
+        *(pytest.param(i, marks=pytest.mark.thorough) for i in (4, 674, *range(20, 40))),
+    ],
 )
 def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int, tmp_path: Path):
     run = random_limits.random_run(random.Random(seed), tmp_path, random_limits.CHEAP)

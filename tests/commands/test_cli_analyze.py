@@ -33,7 +33,7 @@ def course(courses, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall", "two_link_flexible"])
+@pytest.mark.parametrize("name", some(["two_link_wall", "seven_joint_wall", "two_link_flexible"]))
 def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     """A loop that starts on the reference stays on it."""
     case = scenario(name, "start.errors={}", "duration=1.5")
@@ -320,6 +320,7 @@ def test_help_reports_the_exit_codes(capsys):
             "wall_flexible_contact",
             "wall_hydroelastic",
             "wall_guarded",
+            "wall_point_contact",
             "flat_press",
             "hand_over",
             "tool_change",

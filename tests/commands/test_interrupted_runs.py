@@ -218,7 +218,7 @@ sys.exit(main(["render", "nowhere"]))
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("signals_of_a_shell")
-@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("sent", some(["SIGINT", "SIGTERM"]))
 def test_a_signal_waits_while_drake_is_loaded(sent):
     """Its modules make an ImportError of a KeyboardInterrupt, and the command ended with that."""
     words = [sys.executable, "-c", LOADING.format(sent=sent)]

@@ -51,7 +51,7 @@ def test_what_is_not_seen_to_return_is_not_called_bounded(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [1e-5, 0.3])
+@pytest.mark.parametrize("rate", some([1e-5, 0.3]))
 def test_a_cycle_beside_something_that_grows_is_unstable(rate):
     """However slowly: the multiplier of the cycle is exp(rate times its period)."""
     system = beside(lambda a, b, c, z: [*van_der_pol(a, b), rate * c], 3)
@@ -170,7 +170,7 @@ AT_INFINITY = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(AT_INFINITY, of=3))
-@pytest.mark.parametrize("others", some([0, 1, 2]))
+@pytest.mark.parametrize("others", some([0, 1, 2], of=3))
 def test_what_only_falls_is_no_equilibrium(name, others):
     """Alone, beside a state that decays, and beside an oscillation that does."""
     rate = AT_INFINITY[name]
@@ -219,7 +219,7 @@ def test_an_equilibrium_without_a_slope_is_one(name, others):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [1e-9, 1e-6, 0.3, 1e6])
+@pytest.mark.parametrize("rate", some([1e-9, 1e-6, 0.3, 1e6], of=3))
 @pytest.mark.parametrize("others", [0, 1])
 def test_slow_and_fast_states_have_one_equilibrium(rate, others):
     more = [lambda *_: [], lambda a, b, z: [-b + a]][others]
@@ -239,7 +239,7 @@ DEFECTIVE = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", DEFECTIVE)
+@pytest.mark.parametrize("name", some(DEFECTIVE))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_defective_matrix_is_decided(name, sign):
     """Its eigenvalues are known to the root of round-off alone, and far from the axis."""

@@ -15,8 +15,27 @@ from browser import BUDGET, CHROMIUM, OPTIONS, low_contrast
 
 MARKED = re.MULTILINE | re.DOTALL
 
-SLOW: set[str] = set()
-"""Pages that take long: left to `make campaign` and to `make docs`."""
+SLOW = {
+    "explanations/force.md",
+    "explanations/not_robots.md",
+    "how_to/bouncing_on_contact.md",
+    "how_to/bound_errors.md",
+    "how_to/follow_an_edge.md",
+    "how_to/identify_while_it_runs.md",
+    "how_to/press_flat.md",
+    "how_to/sensor_noise.md",
+    "tutorials/a_study.md",
+    "tutorials/export.md",
+    "tutorials/paths_and_files.md",
+    "tutorials/real_contact.md",
+    "tutorials/records.md",
+    "tutorials/several_contacts.md",
+    "tutorials/springs_and_motors.md",
+    "tutorials/steer_by_hand.md",
+}
+"""Pages that take long, of what tests of its own show: left to `make campaign` and to
+`make docs`.
+"""
 
 
 def named(page: Path) -> str:

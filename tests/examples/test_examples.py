@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from runs import some
 
 pytestmark = pytest.mark.slow
 
@@ -40,13 +41,24 @@ CLAIMS = {
 }
 
 
+DEAR = (
+    "actuation_comparison",
+    "flexible_joints",
+    "dc_motors",
+    "flexible_motors",
+    "section_two",
+    "identified_plants",
+)
+"""Their claims are those of tests of actuation, of section 2 and of identification."""
+
+
 def test_every_example_has_its_claim():
     stems = {path.stem for path in EXAMPLES.glob("*.py")}
     assert {stem for stem in stems if not stem.startswith("notebook_")} == set(CLAIMS)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CLAIMS)
+@pytest.mark.parametrize("name", some(CLAIMS, of=1, dear=DEAR))
 def test_example(name, tmp_path, capsys):
     figures = load(name).main(tmp_path)
     figures = figures if isinstance(figures, tuple) else (figures,)
@@ -66,6 +78,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_an_example_runs_by_itself(tmp_path):
     subprocess.run(
         [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path], check=True, timeout=60

@@ -11,6 +11,7 @@ from arms import error_controlled
 from numpy.testing import assert_allclose
 from parallel_bars import bars, energy, parallelogram, swung
 from pydrake.multibody.tree import JacobianWrtVariable
+from runs import some
 
 from drake_dae import simulate
 
@@ -43,7 +44,7 @@ def forces_by_hand(model, q, v, acceleration):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("windows", [2, 4])
+@pytest.mark.parametrize("windows", some([2, 4]))
 def test_it_turns_for_ten_seconds_as_one_pendulum_does(windows):
     """Upright and pushed: through a dozen singular configurations, and right to 8 digits after.
 

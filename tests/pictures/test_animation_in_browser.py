@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 from browser import needs_chromium, shown
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae import build_scenario, make_animation, simulate
 from drake_dae.cli import main
@@ -41,9 +41,12 @@ def page_of(name, path, *settings):
     return path
 
 
+SIZES = [("biped", "900,700"), ("three_fingers", "420,760")]
+
+
 @needs_chromium
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "size"), [("biped", "900,700"), ("three_fingers", "420,760")])
+@pytest.mark.parametrize(("name", "size"), some(SIZES))
 def test_labels_cover_neither_each_other_nor_where_forces_act(name, size, tmp_path):
     page = page_of(name, tmp_path / "page.html", "duration=1.0")
     said = json.loads(shown(page, LABELS, "#t=0.5", size))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae.pictures.film import _HEIGHT, _TOP, _WIDTH, _Scene
 from drake_dae.pictures.scene.floor import floor_below
@@ -71,7 +71,7 @@ def test_the_camera_goes_where_nothing_hides_the_contact():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cart_wall", "three_fingers", "planar_3rrr"])
+@pytest.mark.parametrize("name", some(["cart_wall", "three_fingers", "planar_3rrr"]))
 def test_a_film_shows_the_whole_robot_at_all_times_below_its_clock(name):
     """Of all recorded states, also those that the camera was not placed by."""
     run, scene_graph = course(name, "duration=3.0")
@@ -108,7 +108,7 @@ def test_labels_do_not_cover_tools_arrows_or_each_other():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["biped", "three_fingers"])
+@pytest.mark.parametrize("name", some(["biped", "three_fingers"]))
 def test_labels_of_a_film_are_apart_as_matplotlib_draws_them(name):
     """The widths by which labels are placed are guesses; here they are measured."""
     run, scene_graph = course(name, "duration=1.0")

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from runs import some
 
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.plots import plot_paths
@@ -33,11 +34,13 @@ def seen(run):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "names"),
-    [
-        ("biped", ["front"]),  # Two feet on one floor.
-        ("cart_wall", ["wall"]),  # What wheels roll on is not drawn.
-        ("three_fingers", None),  # Each finger on its own side.
-    ],
+    some(
+        [
+            ("biped", ["front"]),  # Two feet on one floor.
+            ("cart_wall", ["wall"]),  # What wheels roll on is not drawn.
+            ("three_fingers", None),  # Each finger on its own side.
+        ]
+    ),
 )
 def test_each_surface_is_drawn_once(name, names):
     run, _ = course(name, "duration=0.5")

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae import (
     TrackingLaw,
@@ -106,7 +106,7 @@ def test_points_carry_what_force_and_moment_imply_and_leave_together(file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.6, 0.95])
+@pytest.mark.parametrize("share", some([0.95, 0.6]))
 def test_a_force_along_the_face_tips_it_as_analyze_says(share, file):
     """A push along the face takes the same share of the force of a point as it has of `tips`.
 

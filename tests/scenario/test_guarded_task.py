@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
 from drake_dae.cli import main
@@ -227,10 +227,12 @@ def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
 
 @pytest.mark.parametrize(
     ("plant", "jitter"),
-    [
-        ("!Unilateral {restitution: {wall: 0.0}}", 0.0004),
-        ("!CompliantContact {time_step: 0.0005, stiffness: 1.0e5}", 0.0005),
-    ],
+    some(
+        [
+            ("!Unilateral {restitution: {wall: 0.0}}", 0.0004),
+            ("!CompliantContact {time_step: 0.0005, stiffness: 1.0e5}", 0.0005),
+        ]
+    ),
 )
 def test_a_task_goes_on_while_controls_are_late_and_lost(file, plant, jitter):
     """Every tenth control is lost, three in a row, and half of them are late: it is done."""
@@ -268,15 +270,17 @@ SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
 
 @pytest.mark.parametrize(
     ("phase", "changes"),
-    [
-        ("Press", [PUSH, SOFT, DELAYED]),
-        *(
-            pytest.param(phase, [PUSH, SOFT, DELAYED], marks=pytest.mark.thorough)
-            for phase in ("Dwell", "Wait", "Move")
-        ),
-        pytest.param("Move", [PUSH, OPENS], marks=pytest.mark.thorough),
-        ("Move", [OPENS]),
-    ],
+    some(
+        [
+            ("Press", [PUSH, SOFT, DELAYED]),
+            *(
+                pytest.param(phase, [PUSH, SOFT, DELAYED], marks=pytest.mark.thorough)
+                for phase in ("Dwell", "Wait", "Move")
+            ),
+            pytest.param("Move", [PUSH, OPENS], marks=pytest.mark.thorough),
+            ("Move", [OPENS]),
+        ]
+    ),
 )
 def test_a_contact_that_is_lost_on_purpose_leads_to_what_was_chosen(file, phase, changes):
     """By a push of 60 N away from the wall in each phase; or by a reference that jumps to -30 N."""

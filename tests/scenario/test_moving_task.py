@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from arms import parse
+from runs import some
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
@@ -42,7 +43,7 @@ def wall(times):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [[], ["sampling={period: 0.002}"]])
+@pytest.mark.parametrize("settings", some([[], ["sampling={period: 0.002}"]]))
 def test_a_task_follows_a_wall_that_moves(settings, file):
     """The places of tool and wall by MultibodyPlant and by the sine; accuracy 1e-8 leaves 1e-7.
 

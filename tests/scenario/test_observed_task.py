@@ -227,7 +227,7 @@ def test_no_phase_ends_before_the_bias_is_found(file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rollout", [True, False])
+@pytest.mark.parametrize("rollout", some([True, False]))
 def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rollout):
     """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
     push = "plant_disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, some
 
 from drake_dae import Record, build_scenario, load_scenario, shipped_model, simulate, start_meshcat
 from drake_dae.cli import main
@@ -199,7 +199,7 @@ def test_polishing_with_friction_on_drakes_contact_keeps_the_contact_and_the_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mass", [None, 5.0])
+@pytest.mark.parametrize("mass", some([None, 5.0]))
 def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
     """The speed, without a bounce, is within 25 % of that at which the contact opens again.
 

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from runs import some
 
 from drake_dae import Record, build_scenario, load_scenario, shipped_model, simulate
 from drake_dae.cli import main
@@ -94,7 +95,7 @@ def test_a_drive_without_a_limit_is_told_since_the_control_is_then_not_limited(t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rolled", [[], ["--rollout"]])
+@pytest.mark.parametrize("rolled", some([[], ["--rollout"]], first=1))
 def test_the_command_leaves_a_picture_of_the_profile(tmp_path, capsys, rolled):
     folder = tmp_path / "run"
     settings = ["--set", "integrator.accuracy=1e-7"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, some
 
 from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
@@ -141,7 +141,7 @@ def test_another_structure_is_built():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("total", [None, 1.0])
+@pytest.mark.parametrize("total", some([None, 1.0]))
 def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
     """By Drake's Simulator, and by rollouts."""
     base = scenario_data(scenario("two_link_wall", *SHORT))

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from runs import scenario
+from runs import scenario, some
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
@@ -107,7 +107,7 @@ def command(folder, *more, keys=KEYS):
 @pytest.mark.parametrize(
     ("kills", "options"),
     [
-        pytest.param((9,), (), id="drake"),
+        pytest.param((9,), (), id="drake", marks=pytest.mark.thorough),
         pytest.param((2, 9), (), id="drake twice", marks=pytest.mark.thorough),
         pytest.param((9,), ("--rollout",), marks=pytest.mark.thorough),
     ],
@@ -162,6 +162,7 @@ def test_ctrl_c_keeps_what_has_ended(tmp_path):
 
 @pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     """As Drake's C++ may end one: it is killed in a run that lasts, against the clock, 20 s."""
     rates = [0.0, 0.0, 0.0, 0.025, 0.0, 0.0]
@@ -193,7 +194,7 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("outcome", ["crashed", "timed out"])
+@pytest.mark.parametrize("outcome", some(["crashed", "timed out"]))
 def test_a_run_whose_process_died_is_tried_again_and_no_other(outcome, first_three, tmp_path):
     file, first = tmp_path / "runs.jsonl", first_three[0]
     data = first_three[1].decode().splitlines()

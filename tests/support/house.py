@@ -8,7 +8,7 @@ import ast
 import re
 import sys
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -82,6 +82,7 @@ IMPORT_NAMES = {
 }
 
 
+@cache
 def declared_modules() -> set[str]:
     """What pyproject.toml says that the package needs or can use, as names to import."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -100,10 +101,18 @@ def modules() -> dict[str, Path]:
     return {".".join(inside.with_suffix("").parts): path for path, inside in paths.items()}
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node; a walk through their expressions takes ten times as long."""
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, name, ()):
+            yield child
+            yield from statements(child)
+
+
 def imported_modules(module: str, source: str, existing: set[str]) -> set[str]:
     """Absolute names of the modules that a module imports, wherever in its text."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in statements(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -14,6 +14,7 @@ from drake_dae.dae.elimination import eliminate
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
+from drake_dae.dae.tracking.latency import acting_late
 from drake_dae.errors import AdviceWarning, GainError, ModelError
 from drake_dae.trace.given import result_of
 
@@ -27,7 +28,9 @@ STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIF
 """The examined stiffnesses, relative to the given one."""
 
 
-def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
+def damped(
+    structure: Structure, damping: GainDesign | FeedbackGains | None, latency: float = 0.0
+) -> Structure:
     """Returns the structure of a law's model that demands, instead of y_i^(r_i) = 0,
 
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
@@ -46,15 +49,24 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
     Args:
         structure: The structure of the system.
         damping: A design such as `poles(-200.0)`, for y_i' in place of an error: r_i - 1 poles.
+            None for y_i^(r_i) = 0.
+        latency: How late the control acts, in s; see `acting_late`.
 
     Raises:
         GainError: The gains do not fit, or are not Hurwitz.
     """
-    system, layout = structure.system, DerivativeLayout(structure.constraint_degrees)
-    residual = structure.manifold.residual_expression
-    gains = damping_gains(structure, damping)
-    rates = residual[np.flatnonzero(layout.orders).tolist(), :]
-    force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
+    system = acting_late(structure.system, latency)
+    if damping is None and system is structure.system:
+        return structure
+    layout, residual = (
+        DerivativeLayout(structure.constraint_degrees),
+        structure.manifold.residual_expression,
+    )
+    force = ca.SX.zeros(len(structure.constraint_degrees))
+    if damping is not None:
+        gains = damping_gains(structure, damping)
+        rates = residual[np.flatnonzero(layout.orders).tolist(), :]
+        force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     return _along(replace(structure, derivatives=derivatives), derivatives)
 

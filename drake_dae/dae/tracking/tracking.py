@@ -54,9 +54,11 @@ class TrackingLaw:
             change fast: see `deflection`. None if it is not known.
         integral: The names of the outputs whose errors are integrated as well, positions or
             measured forces; see `IntegralAction`. They have one more pole.
+        latency: The mean time in s from the measurement of x to the moment when its control acts,
+            for a sampled law delay + period / 2: by it damping is compensated; see `acting_late`.
 
     Attributes:
-        damped_structure: The structure with the `constraint_damping`; see `damped`.
+        damped_structure: The structure with `constraint_damping` and `latency`; see `damped`.
         layout: The layout of reference vectors and chains.
         reference_signals: Names and units of R.
         function: The law as (state, reference, measured_force, parameters) -> control and
@@ -87,12 +89,11 @@ class TrackingLaw:
         constraint_damping: GainDesign | FeedbackGains | None = None,
         integral: Sequence[str] = (),
         contact_stiffness: float | None = None,
+        latency: float = 0.0,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
-        self.damped_structure = self.structure
-        if constraint_damping is not None:
-            self.damped_structure = damped(self.structure, constraint_damping)
-        self.system = system
+        self.damped_structure = damped(self.structure, constraint_damping, latency)
+        self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
             self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)

@@ -12,6 +12,13 @@ from pydrake.systems.primitives import RandomSource
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 
+_MOMENTS = {
+    RandomDistribution.kUniform: (0.5, 12.0**-0.5),
+    RandomDistribution.kGaussian: (0.0, 1.0),
+    RandomDistribution.kExponential: (1.0, 1.0),
+}
+"""Mean and deviation of the numbers of a RandomSource."""
+
 Seed = int | Mapping[str, int]
 """The seed of the noise of a run: one number, or name of a RandomSource -> number."""
 
@@ -86,7 +93,15 @@ def noise_of(
     return noise
 
 
-def distribution_of(source: System) -> RandomDistribution:
+def moments_of(compiled: CompiledDiagram) -> tuple[FloatArray, FloatArray]:
+    """Returns the means and the deviations of all random numbers of a diagram."""
+    means, deviations = np.zeros((2, compiled.sizes["noise"]))
+    for source, part in compiled.noise:
+        means[part], deviations[part] = _MOMENTS[_distribution_of(source)]
+    return means, deviations
+
+
+def _distribution_of(source: System) -> RandomDistribution:
     """Returns the distribution of a RandomSource, which Drake does not tell, by its numbers."""
     context, seed = source.CreateDefaultContext(), 0
     source.SetRandomContext(context, RandomGenerator(seed))

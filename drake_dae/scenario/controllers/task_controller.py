@@ -130,7 +130,7 @@ def task_controller(
         )
         raise ScenarioError(("observer", text))
     if task.make().plan.latches:
-        return _latched(scenario, model, period)
+        return _latched(scenario, model, law.latency, period)
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
@@ -138,7 +138,7 @@ def task_controller(
     with at("task.gains" if task.gains else "gains"):
         structure = find_structure(free_system)
         gains = (task.gains or scenario.gains).design(structure)
-        free_law = TrackingLaw(free_system, gains, structure=structure)
+        free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
     with at("task"):
         # The noise of the sum over the points.
         return TaskController(
@@ -146,7 +146,9 @@ def task_controller(
         )
 
 
-def _latched(scenario: Scenario, model: RobotModel, period: float) -> TaskController:
+def _latched(
+    scenario: Scenario, model: RobotModel, latency: float, period: float
+) -> TaskController:
     """The controller of a scenario whose task opens and closes latches."""
     task = scenario.task
     assert task is not None
@@ -165,7 +167,8 @@ def _latched(scenario: Scenario, model: RobotModel, period: float) -> TaskContro
     with at("task"):
         made = task.make()
         free = None if task.gains is None else task.gains.design()
-        pairs = laws_of_latches(made.plan, model.dae, scenario.gains.design(), free)
+        gains = scenario.gains.design()
+        pairs = laws_of_latches(made.plan, model.dae, gains, free, latency)
         return TaskController(
             made, *pairs[0], further=pairs[1:], whole=model.dae, sample_period=period
         )

@@ -94,7 +94,7 @@ class TracedTask:
         self.size = ends[-1]
         self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
         self._segment, self._entered_places = slice(ends[1], ends[5]), slice(ends[5], ends[6])
-        self._tallied = slice(ends[6], ends[7])
+        self._filter_places, self._tallied = slice(ends[0], ends[1]), slice(ends[6], ends[7])
         before, self._base, self._rate, fade, self._origin, self._entered, self._counts = (
             self._held[a:b] for a, b in pairwise(ends)
         )
@@ -102,13 +102,13 @@ class TracedTask:
         self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
         self._forces = ca.SX.sym("force", num_forces)
         self._control = ca.SX.sym("control", laws[FREE].system.num_controls)
-        self._filter_places = slice(ends[0], ends[1])
         self._filtered = self.filter.after(before, self._forces)
-        self._filter_function = ca.Function("filter", [before, self._forces], [self._filtered])
+        given = {"before": before, "forces": self._forces}
+        self._filter_function = TracedFunction("filter", given, {"after": self._filtered})
         self._is_latched = bool(task.plan.latches)
         each = [self._filtered[self.filter.of_law(law)] for law in range(len(laws))]
-        self._each, total = each[CONTACT], ca.norm_inf if self._is_latched else ca.sum1
-        self._force = self._by_law([total(part) for part in each])
+        total = ca.norm_inf if self._is_latched else ca.sum1
+        self._each, self._force = each[CONTACT], self._by_law([total(part) for part in each])
 
     def _by_law(self, values: Sequence[ca.SX]) -> ca.SX:
         """The value for the active law, one for each law."""
@@ -126,7 +126,7 @@ class TracedTask:
             held: The numbers before it, shape (size,).
             measured: All measured forces, in N and N m.
         """
-        return np.array(self._filter_function(held[self._filter_places], measured)).ravel()
+        return self._filter_function.evaluate(held[self._filter_places], measured)[0].copy()
 
     def tares(self, held: FloatArray) -> bool:
         """Whether the bias of the force is still being estimated."""

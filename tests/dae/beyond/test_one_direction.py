@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from runs import some
 from scipy.integrate import solve_ivp
 
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
@@ -80,7 +81,7 @@ MARKED = list(enumerate(CASES))
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("direction", "rates"),
-    [pytest.param(*case, marks=[pytest.mark.thorough] * (i in (1, 2))) for i, case in MARKED],
+    some([pytest.param(*case, marks=[pytest.mark.thorough] * (i in (1, 2))) for i, case in MARKED]),
 )
 def test_deviations_are_those_of_a_loop_with_noise(direction, rates):
     """100 s, in which errors are correlated for some 0.2 s: 500 of them tell 3 per cent."""

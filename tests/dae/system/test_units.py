@@ -57,7 +57,7 @@ def other_units(system: DaeSystem):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(PROBLEMS, of=4, dear=["aircraft", "rolling_disk"]))
+@pytest.mark.parametrize("name", some(PROBLEMS, of=8, dear=["aircraft", "rolling_disk"]))
 def test_twenty_four_systems_of_units_have_one_answer(name):
     system = PROBLEMS[name]().system
     expected, known = answer(system)

@@ -5,6 +5,7 @@ import pytest
 from arms import arm, law, numbers, parse
 from pydrake.multibody.optimization import Toppra
 from pydrake.trajectories import PiecewisePolynomial
+from runs import some
 from scipy.optimize import linprog
 from scipy.sparse import diags, vstack
 
@@ -118,6 +119,7 @@ def test_the_torques_of_the_motion_are_within_their_limits_and_reach_them(motion
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_time_is_that_of_a_linear_program_on_a_fine_grid(motion):
     profile, *_ = motion
     # The path by its height, where it does not turn: b = z'^2, the force by time of the reference.
@@ -157,7 +159,7 @@ def test_the_reference_follows_the_same_path_with_the_forces_there(motion):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", some([0, 1]))
 def test_without_contact_it_is_drakes_toppra(seed):
     plant = parse("seven_joint_arm")
     names = [f"joint{i}" for i in range(1, 8)]
@@ -270,7 +272,7 @@ def test_the_largest_rate_of_one_is_nowhere_faster_than_the_reference():
         assert rate.max() <= 1.0 + 1e-2
 
 
-@pytest.mark.parametrize("friction", [{"viscous_friction": 60.0}, {"friction": 0.5}])
+@pytest.mark.parametrize("friction", some([{"viscous_friction": 60.0}, {"friction": 0.5}]))
 def test_friction_makes_no_limit_exceeded(friction):
     wall = PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall", **friction)
     model = RobotModel.from_multibody(

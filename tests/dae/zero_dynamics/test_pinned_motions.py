@@ -147,7 +147,7 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+@pytest.mark.parametrize("name", some(["two_link", "seven_joint"], of=3))
 @pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
 def test_motions_of_robots_agree_with_multibody_plant(name, kind):
     """x' by differences of the states, and lambda, against MultibodyPlant with the same control."""

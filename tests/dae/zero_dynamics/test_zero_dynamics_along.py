@@ -138,7 +138,7 @@ def test_growth_by_an_exogenous_signal():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damping", [0.5, 0.02])
+@pytest.mark.parametrize("damping", some([0.5, 0.02]))
 def test_multipliers_of_a_stable_motion(damping):
     """s'' = -(1 + 0.1 sin 3t) s - d s' + 0.2 sin 3t: multipliers of size exp(-d P / 2)."""
     system = oscillator(lambda s, w, z: -(1 + 0.1 * z) * s - damping * w + 0.2 * z)

@@ -98,7 +98,10 @@ BUTTONS = """
 
 @needs_chromium
 @pytest.mark.slow
-@pytest.mark.parametrize("is_live", [True, pytest.param(False, marks=needs_zig)])
+@pytest.mark.parametrize(
+    "is_live",
+    [True, pytest.param(False, marks=[needs_zig, pytest.mark.thorough])],
+)
 def test_buttons_end_phases_and_lose_the_contact(is_live, guarded, tmp_path):
     """Of a live bench, and of a page, where the supervisor runs as WebAssembly."""
     built = guarded[0]

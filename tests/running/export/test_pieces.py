@@ -5,6 +5,7 @@ import shutil
 import casadi as ca
 import numpy as np
 import pytest
+from runs import some
 
 from drake_dae.running.export.pieces import in_pieces
 from drake_dae.trace.compiled import generate, without_branches
@@ -36,7 +37,7 @@ def library(source, folder):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-@pytest.mark.parametrize("looks_up", [False, True])
+@pytest.mark.parametrize("looks_up", some([False, True], first=1))
 @pytest.mark.parametrize("longest", [7, 100])
 def test_pieces_compute_what_the_whole_does(tmp_path, longest, looks_up):
     whole = long_function("long_one", looks_up)

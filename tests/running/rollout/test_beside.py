@@ -45,7 +45,7 @@ LOOPS = {
 }
 
 
-DEAR = ("behind springs", "encoders")
+DEAR = ("behind springs", "encoders", "drives with limits")
 """What test_combinations.py has with Drake's own contact, too, of cheaper robots."""
 
 

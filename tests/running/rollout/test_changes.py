@@ -184,7 +184,7 @@ TASKS = {
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize("name", some(TASKS, of=4))
+@pytest.mark.parametrize("name", some(TASKS, of=5))
 def test_tasks_are_those_of_drake(name, compiled):
     """To 1e-9: when each phase begins and why, and all signals; or why the run fails."""
     loop, context = TASKS[name]()
@@ -276,7 +276,7 @@ FALLING = {
 
 
 @mostly_compiled
-@pytest.mark.parametrize("name", some(first_quick(FALLING)))
+@pytest.mark.parametrize("name", some(first_quick(FALLING), dear=("a block that rocks",)))
 def test_bodies_fall_as_in_drake(name, compiled):
     """To 1e-9 at the end, of a plant without a law and without a loop."""
     make, state, duration = FALLING[name]

@@ -9,7 +9,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
-from runs import scenario
+from runs import scenario, some
 
 from drake_dae import build_scenario, rollout, start_values
 from drake_dae.diagrams.state_feedback import encoder_seed
@@ -109,7 +109,7 @@ def test_error_control_with_equal_steps_is_equal(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings", [[], pytest.param(["sampling={period: 0.05}"], marks=pytest.mark.slow)]
+    "settings", some([[], pytest.param(["sampling={period: 0.05}"], marks=pytest.mark.slow)])
 )
 def test_each_run_has_steps_of_its_own(monkeypatch, settings):
     """To 1e-9, as accurate as steps are: round-off in the estimate of an error shifts them."""
@@ -226,7 +226,7 @@ def test_angles_that_are_too_large_for_the_lanes_are_no_less_accurate(monkeypatc
     assert_same(*found, 1e-13)
 
 
-@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("first", some([0, 3]))
 def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
     """Compliant contact at 1 kHz, where one run, also the first, exceeds its tolerances.
 
@@ -264,7 +264,7 @@ def given_of(*arrays):
 
 
 @pytest.mark.parametrize("constants", [None, []])
-@pytest.mark.parametrize("options", ["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"])
+@pytest.mark.parametrize("options", some(["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"]))
 def test_operations_are_those_of_casadi(options, constants):
     """To two units in the last place; sine and cosine have a series of their own."""
     function = ca.Function("operations", [X, P], [OPERATIONS], {"cse": False})

@@ -327,7 +327,7 @@ def test_a_hold_may_act_just_before_the_step_of_its_instant():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("plant", "kind"), some(SENSED, of=3, first=1))
+@pytest.mark.parametrize(("plant", "kind"), some(SENSED, of=6, first=4))
 def test_rows_between_samples_are_no_measurements(kind, plant):
     """Encoders and law sample each second row; a sensor of the force samples, lags, or both."""
     noise, z = "noise_deviation: 0.3, bias: 1.0", []

@@ -289,6 +289,12 @@ def test_what_changes_nothing_is_named_and_stays():
     assert "Without effect on cost and limits, left as before: wall.position[1]" in result.text()
 
 
+@pytest.fixture(scope="module")
+def once():
+    """The two links, for tests that change nothing."""
+    return two_link()
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -324,8 +330,8 @@ def test_what_changes_nothing_is_named_and_stays():
         ({"config": scenario("two_link_wall").integrator}, "a gradient is that of fixed steps"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_a_sentence(given, told):
-    loop, context = two_link()
+def test_what_makes_no_sense_is_refused_in_a_sentence(given, told, once):
+    loop, context = once
     with pytest.raises(ModelError, match=told):
         found(loop, context, **given)
 

@@ -56,7 +56,7 @@ SYSTEMS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", some(SYSTEMS.values()), ids=SYSTEMS)
+@pytest.mark.parametrize("make", some(SYSTEMS.values(), of=3), ids=SYSTEMS)
 def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], LeafSystem]):
     system = make()
     last = ref(system)

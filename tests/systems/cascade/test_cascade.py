@@ -165,7 +165,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(CASES))
+@pytest.mark.parametrize("name", some(CASES, of=3))
 def test_contact_is_kept_and_tracked_behind_springs(name):
     """What was asked of it, rms from 2 s on in mm and N; the law of four derivatives loses all but
     the first. The reversals are at 1.6 and 4.7 s."""

@@ -9,6 +9,7 @@ from members import subclasses
 from problems import double_integrator
 from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
+from runs import some
 
 from drake_dae import (
     CircleReference,
@@ -153,6 +154,7 @@ def test_rule_3_each_derivative_is_that_of_the_one_before(reference):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("reference", some(MEMBERS, of=3), indirect=True)
 def test_rule_3_what_the_law_integrates_is_continuous(reference):
     """Across 2 us, values and first derivatives change by less than their slopes allow."""
     for time in [*np.linspace(0.01, 1.99, 67).tolist(), 0.3, 1.0, 1.7]:

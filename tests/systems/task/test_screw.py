@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ScrewJoint, SpatialInertia, UnitInertia
 from pydrake.systems.analysis import SimulatorConfig
+from runs import first_quick, some
 
 from drake_dae import RobotPlant, load_scenario, simulate
 from drake_dae.errors import ModelError, ScenarioError, SimulationError
@@ -103,7 +104,7 @@ def test_a_screw_head_moves_as_drakes_screw_joint(built):
     assert_allclose(found[2], -per_radian * wanted, rtol=1e-9)
 
 
-@pytest.mark.parametrize("rolls", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rolls", some(first_quick([True, False])))
 def test_a_screw_advances_by_its_pitch_at_constant_force(built, rolls):
     """At constant speed the law that knows no thread has its force exactly, and turns ahead by
     e = pitch F / (2 pi I p^2): its torque on the joint is a disturbance. Samples of 1 ms leave 3 %.

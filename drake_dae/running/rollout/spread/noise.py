@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 
@@ -15,24 +14,18 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.asked import RolloutRequest
-from drake_dae.running.rollout.events import distribution_of
+from drake_dae.running.rollout.events import moments_of
 from drake_dae.running.rollout.problems import problems_of
+from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunProblem, Settings
 from drake_dae.running.rollout.spread.recursion import Step, of_signals, passed, reached
+from drake_dae.running.rollout.spread.rounding import RoundedRuns, Rounding
 from drake_dae.running.rollout.spread.slopes import PeriodSlopes, undisturbed
-from drake_dae.running.rollout.spread.waves import RoundedPositions, Rounding
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions, functions_of
 
 _OTHERWISE, _SHORTEST = 0.5, 12
 """Between times by whose slopes a deviation differs by more than 50 %, there is another time,
 unless they are at most 12 periods apart."""
-
-_MOMENTS = {
-    RandomDistribution.kUniform: (0.5, 12.0**-0.5),
-    RandomDistribution.kGaussian: (0.0, 1.0),
-    RandomDistribution.kExponential: (1.0, 1.0),
-}
-"""Mean and deviation of the numbers of a RandomSource."""
 
 SAME = 1e-6
 """Times that differ by less than this fraction of a period are the same."""
@@ -141,19 +134,10 @@ def spread_with_rounding(
     Raises:
         ModelError, InconsistentStateError: As for `noise_spread`.
     """
-    if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
-        raise ModelError(
-            f"{loop.plant.get_name()} has no spread by noise: controls or measurements come late "
-            "or are lost at random, which has no slope; run it with several seeds instead"
-        )
     begun = 0.0 if config is None else config.start_time
     request = RolloutRequest.of(loop, np.append(begun, np.ravel(times)), config, None, None)
-    program, compiled = request.program, request.program.compiled
-    if compiled.changes or compiled.has_stepped:
-        raise ModelError(
-            f"{program.name} has no spread by noise: a block changes at times that a run locates, "
-            "as at impacts and openings, or Drake steps it"
-        )
+    program = request.program
+    check_smooth(loop, program)
     problems = problems_of(program, start, parameters, request.times, None)
     if len(problems) != 1:
         raise ModelError(f"the spread by noise is that of one run, got {len(problems)} starts")
@@ -168,20 +152,42 @@ def spread_with_rounding(
     return NoiseSpread(np.array([time for time, _, _ in found]), signals(whole), signals(changes))
 
 
+def check_smooth(loop: ClosedLoop | Diagram, program: RolloutProgram) -> None:
+    """Checks that noise has an effect to first order.
+
+    Raises:
+        ModelError: Signals are late or lost at random; blocks change at times that a run locates;
+            or Drake steps a block.
+    """
+    if isinstance(loop, ClosedLoop) and (loop.link is not None or loop.packets is not None):
+        raise ModelError(
+            f"{loop.plant.get_name()} has no spread by noise: controls or measurements come late "
+            "or are lost at random, which has no slope; run it with several seeds instead"
+        )
+    if program.compiled.changes or program.compiled.has_stepped:
+        raise ModelError(
+            f"{program.name} has no spread by noise: a block changes at times that a run locates, "
+            "as at impacts and openings, or Drake steps it"
+        )
+
+
 class _Point(NamedTuple):
     """A period of a run.
 
     Attributes:
         state, held: The states where it begins.
-        passed, middle: The rows of signals in the middle of periods before it, and in its own.
+        passed: The rows of signals where periods before it begin, if these are asked for.
+        own: Those where it begins, where it ends, and a period later.
         step: Its A, B, C and D.
+        read: The slopes of rounded positions before each of its updates.
     """
 
     state: FloatArray
     held: FloatArray
     passed: FloatArray
-    middle: FloatArray
+    own: FloatArray
     step: Step
+    read: FloatArray
 
 
 class _Samples:
@@ -203,18 +209,16 @@ class _Samples:
             )
         self._functions, self._settings, self._problem = functions, settings, problem
         self._index = 0
-        self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise)
-        self._deviations = np.zeros(problem.noise.shape[1])
-        for source, part in functions.program.compiled.noise:
-            mean, deviation = _MOMENTS[distribution_of(source)]
-            self._quiet[:, part], self._deviations[part] = mean, deviation
+        means, self._deviations = moments_of(functions.program.compiled)
+        self._begun, self._quiet = problem.times[0], np.zeros_like(problem.noise) + means
         size = problem.state.size + problem.held.size
         self._spread = np.zeros((size, size))
         self._rounded = None
         if rounding is not None:
-            self._rounded = RoundedPositions(functions.program, rounding, size)
+            self._rounded = RoundedRuns(functions.program, rounding, size)
         self._points: dict[int, _Point] = {}
-        self._points[0] = self._point(problem.state, problem.held, 0, np.zeros((0, 0)))
+        width = sum(map(len, functions.program.signals.values()))
+        self._points[0] = self._point(problem.state, problem.held, 0, np.zeros((0, width)))
 
     def at(self, time: float) -> tuple[float, FloatArray, FloatArray]:
         """The time of a period, and the deviations of all signals and of their changes there."""
@@ -231,9 +235,9 @@ class _Samples:
         """Goes on to a period; the variances of the signals and of their changes there."""
         begun, since = self._index, index - self._index
         if index not in self._points:
-            middles = begun + 0.5 + np.arange(since + 1 if self._rounded is not None else 1)
-            done = self._run(begun, np.array([begun, *middles[:-1], index]))
-            self._points[index] = self._point(done.state, done.held, index, done.rows[1:-1])
+            times = np.linspace(begun, index, since + 1 if self._rounded is not None else 2)
+            done = self._run(begun, times)
+            self._points[index] = self._point(done.state, done.held, index, done.rows[:-1])
         first, last = self._points[begun], self._points[index]
         if since > _SHORTEST and self._differ(first.step, last.step, since):
             self._go_on(begun + since // 2)
@@ -244,35 +248,45 @@ class _Samples:
         self._spread = passed(first.step, last.step, since, self._spread)
         whole, change = of_signals(last.step, self._spread)
         if self._rounded is not None:
-            rows = np.vstack([last.passed[len(last.passed) - since :], last.middle])
-            whole, change = self._rounded.after(first.step, last.step, rows, whole)
+            rows = np.vstack([last.passed[len(last.passed) - since :], last.own])
+            steps, read = (first.step, last.step), (first.read, last.read)
+            whole, change = self._rounded.after(steps, read, rows, self._moments(index))
         return whole, change
 
     def _differ(self, first: Step, last: Step, since: int) -> bool:
         """Whether signals spread otherwise by periods like the first than like the last."""
-        by_each = (
-            of_signals(last, passed(each, each, since, self._spread))[0] for each in (first, last)
-        )
-        less, more = np.sort(np.sqrt(np.maximum(list(by_each), 0.0)), axis=0)
-        return bool(np.any(more > (1.0 + _OTHERWISE) * less))
+        # Where slopes of a moment make deviations grow for longer, they are beyond all numbers.
+        with np.errstate(over="ignore", invalid="ignore"):
+            by_each = (
+                of_signals(last, passed(each, each, since, self._spread))[0]
+                for each in (first, last)
+            )
+            less, more = np.sort(np.sqrt(np.maximum(list(by_each), 0.0)), axis=0)
+        return not bool(np.all(more <= (1.0 + _OTHERWISE) * less))
 
     def _point(
         self, state: FloatArray, held: FloatArray, index: int, passed: FloatArray
     ) -> "_Point":
-        """A period, with the rows in the middle of those before it."""
-        point = _Point(state, held, passed, passed, (passed,) * 4)
-        self._points[index] = point
+        """A period, with the rows where those before it begin."""
+        none = np.zeros((0, 0))
+        self._points[index] = _Point(state, held, passed, none, (none,) * 4, none)
         period = self._problem_of(index, np.array([index, index + 1.0]))
-        a, b, c, d = PeriodSlopes(self._functions, self._settings, period, self._deviations).step()
+        positions = None if self._rounded is None else self._rounded.positions
+        slopes = PeriodSlopes(self._functions, self._settings, period, self._deviations, positions)
+        a, b, c, d = slopes.step()
         # Without these, differences of counters would count, which no noise reaches.
         reached_by_noise = reached(a, b)
         a[:, ~reached_by_noise] = c[:, ~reached_by_noise] = 0.0
         a[~reached_by_noise] = 0.0
-        middle = passed
+        own = none
         if self._rounded is not None:
-            middle = self._run(index, index + np.array([0.0, 0.5, 1.0])).rows[1:-1]
-            passed = passed.reshape(-1, middle.shape[1])
-        return _Point(state, held, passed, middle, (a, b, c, d))
+            own = self._run(index, index + np.arange(3.0)).rows
+        return _Point(state, held, passed, own, (a, b, c, d), np.array(slopes.read))
+
+    def _moments(self, index: int) -> FloatArray:
+        """When the updates of a period are due, as parts of it."""
+        events = self._problem.events[self._updates(index, index + 1.0)]
+        return (events - self._begun) / self._period - index
 
     def _problem_of(self, index: int, times: FloatArray) -> RunProblem:
         """The run from a period without noise, with rows at these times in periods."""

@@ -45,6 +45,11 @@ class PeriodSlopes:
         settings: How to step.
         problem: A run of one period, from its state, with the mean random numbers.
         deviations: The deviations of the random numbers.
+        positions: Those signals whose slopes are wanted before each update, too.
+
+    Attributes:
+        read: Their slopes before each update, by states and held values, and by random numbers of
+            deviation 1, shape (updates, positions, columns of A and B).
     """
 
     def __init__(
@@ -53,9 +58,11 @@ class PeriodSlopes:
         settings: Settings,
         problem: RunProblem,
         deviations: FloatArray,
+        positions: slice | None = None,
     ) -> None:
         self._functions, self._settings, self._problem = functions, settings, problem
-        self._deviations = deviations
+        self._deviations, self._positions = deviations, positions
+        self.read: list[FloatArray] = []
         self._time, self._state, self._held = problem.times[0], problem.state, problem.held
         size, count = problem.state.size, problem.state.size + problem.held.size
         columns = count + problem.noise.size
@@ -68,6 +75,8 @@ class PeriodSlopes:
         moments = zip(problem.events.tolist(), problem.due.tolist(), strict=True)
         for index, (moment, due) in enumerate(moments):
             self._flow(moment)
+            if self._positions is not None:
+                self.read.append(self._shown()[self._positions])
             before, of_before = self._state, self._of_state
             self._project()
             first = self._state.size + self._held.size + index * width
@@ -76,18 +85,24 @@ class PeriodSlopes:
             self._update(due, self._state, self._of_state, columns, noise, is_unrestricted=False)
         self._flow(float(problem.times[-1]))
         self._project()
+        of_inputs = np.vstack([self._of_state, self._of_held])
+        (a, b), (c, d) = (
+            np.split(each, [len(of_inputs)], axis=1) for each in (of_inputs, self._shown())
+        )
+        return a, b, c, d
+
+    def _shown(self) -> FloatArray:
+        """The slopes of the signals."""
         size, function = self._state.size, self._functions.rows
         inputs = np.concatenate([self._state, self._held])
 
         def rows(values: FloatArray) -> FloatArray:
             states, held = np.split(values, [size], axis=1)
             times = np.full(len(values), self._time)
-            return function(times, states, held, problem.parameters)[0]
+            return function(times, states, held, self._problem.parameters)[0]
 
-        of_inputs = np.vstack([self._of_state, self._of_held])
-        shown = _slopes(rows, inputs, _changes(inputs))[1] @ of_inputs
-        (a, b), (c, d) = (np.split(each, [inputs.size], axis=1) for each in (of_inputs, shown))
-        return a, b, c, d
+        slopes = _slopes(rows, inputs, _changes(inputs))[1]
+        return slopes @ np.vstack([self._of_state, self._of_held])
 
     def _update(
         self,

@@ -218,7 +218,8 @@ class UnilateralRobotPlant(ModalPorts):
         return margins
 
     def _calc_margins(self, context: Context, value: AbstractValue) -> None:
-        closed, latched = np.split(self._numbers(context) > 0.5, [len(self._contacts.names)])
+        on, count = self._numbers(context) > 0.5, len(self._contacts.names)
+        closed, latched = on[:count], on[count:]
         margins, further = np.zeros(closed.size), np.zeros(0)
         log, time = self._log(context), context.get_time()
         if not closed.all() or self._edges:
@@ -234,7 +235,7 @@ class UnilateralRobotPlant(ModalPorts):
         if closed.any():
             grip = self._evaluate(self._mode(context).grip, context)
             margins[closed] = grip[self._contacts.normals][closed]
-        as_commanded = latched == np.array(self._commanded(context), dtype=bool)
+        as_commanded = latched == self._commanded(context) if latched.size else latched
         every = np.concatenate([margins, np.where(as_commanded, 1.0, -1.0), further])
         log.note(time, every)
         value.set_value(every)

@@ -73,7 +73,11 @@ def paired_laws(
 
 @checked(ModelError)
 def laws_of_latches(
-    plan: PhasePlan, system: DaeSystem, gains: GainDesign, free_gains: GainDesign | None = None
+    plan: PhasePlan,
+    system: DaeSystem,
+    gains: GainDesign,
+    free_gains: GainDesign | None = None,
+    latency: float = 0.0,
 ) -> tuple[tuple[TrackingLaw, TrackingLaw], ...]:
     """The laws of a task with latches: for each entry of `plan.pairs` (law, free_law).
 
@@ -84,6 +88,7 @@ def laws_of_latches(
             the latch "left" are "left.fx" and so on.
         gains: The gains of the laws that lead forces.
         free_gains: The gains of the laws that lead the distances of an open latch; `gains` if None.
+        latency: That of `TrackingLaw`, in s.
 
     Raises:
         ModelError: There is no such latch, or it does not have as many forces.
@@ -93,7 +98,9 @@ def laws_of_latches(
     for number, (name, _) in enumerate(plan.pairs):
         led = latched_system(plan, system, number)
         free = open_contact(led, _forces_of(system)[name], is_latch=True)
-        pairs.append((TrackingLaw(led, gains), TrackingLaw(free, free_gains or gains)))
+        laws = ((led, gains), (free, free_gains or gains))
+        closed_law, free_law = (TrackingLaw(each, g, latency=latency) for each, g in laws)
+        pairs.append((closed_law, free_law))
     return tuple(pairs)
 
 

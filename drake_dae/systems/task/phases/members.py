@@ -124,13 +124,13 @@ class Press(Phase):
         return {contact_output: self.force}
 
     def needed(self, contact_force: float) -> Mapping[str, float]:
-        if isinstance(self.force, Reference):
-            return {"time": self.over}
-        return {"time": self.over, "force": self.force - self.tolerance}
+        pressed = (
+            {} if isinstance(self.force, Reference) else {"force": self.force - self.tolerance}
+        )
+        return {"time": self.over, **pressed}
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        off = abs(now.force - now.wanted)
-        tipped = now.eccentricity - self.eccentricity
+        off, tipped = abs(now.force - now.wanted), now.eccentricity - self.eccentricity
         margin: float = ca.fmax(ca.fmax(self.over - now.time, off - self.tolerance), tipped)
         return margin
 

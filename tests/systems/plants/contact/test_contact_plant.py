@@ -192,6 +192,7 @@ def test_shipped_wall_is_tracked_by_a_law_that_does_not_know_its_friction():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_shipped_hydroelastic_wall_is_tracked_by_such_a_law():
     """On 1e7 Pa within 0.05 N, since friction acts along the curved patch: 0.31 of the force."""
     _, _, record = run_scenario(scenario("wall_hydroelastic", "duration=3.0"))

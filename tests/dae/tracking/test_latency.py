@@ -1,0 +1,122 @@
+"""Damping under controls that act late, beside exact discretization, and in a sampled loop."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from runs import run_scenario, scenario
+from scipy.linalg import expm
+
+from drake_dae import DaeSystem, Parameter, TrackingLaw, poles
+from drake_dae.errors import ModelError
+
+INERTIA, DAMPING, PERIOD, POLE = 1e-3, 2.0, 1e-3, -10.0
+LATENCY = 1.5 * PERIOD
+"""A delay of one sample, and half of the time for which a control is held."""
+
+
+def joint():
+    """I v' + d v = u."""
+    return DaeSystem.from_functions(
+        ["q", "v"],
+        f=lambda x, p: [x[1], -p.d / p.I * x[1]],
+        h=lambda x, p: [[0.0], [1.0 / p.I]],
+        l=lambda x, p: [x[0]],
+        parameters={"I": INERTIA, "d": DAMPING},
+    )
+
+
+def sampled_error(latency, count=600):
+    """The largest difference from the wanted decay, by the exact solution between samples."""
+    law = TrackingLaw(joint(), poles(POLE), latency=latency)
+    A = np.zeros((3, 3))
+    A[0, 1], A[1, 1], A[1, 2] = 1.0, -DAMPING / INERTIA, 1.0 / INERTIA
+    step = expm(PERIOD * A)[:2]
+    state, on_the_way, errors = np.array([1.0, 0.0]), 0.0, []
+    for _ in range(count):
+        errors.append(state[0])
+        (control,) = law.control(state, [0.0, 0.0, 0.0])
+        state = step @ np.append(state, on_the_way)
+        on_the_way = control
+    times = PERIOD * np.arange(count)
+    return np.abs(errors - (1.0 - POLE * times) * np.exp(POLE * times)).max()
+
+
+def test_a_light_damped_joint_decays_as_designed_under_a_late_control():
+    """T d / I = 3: without the latency the error is 27 per cent of its start off its decay.
+
+    What is left, 0.8 per cent, is the delay of the feedback, some -POLE * LATENCY / 2.
+    """
+    assert sampled_error(0.0) > 0.25
+    assert sampled_error(LATENCY) < 0.01
+    # The latency is neither half nor twice as long.
+    assert min(sampled_error(0.5 * LATENCY), sampled_error(2.0 * LATENCY)) > 0.03
+
+
+def test_the_law_takes_the_inertia_with_the_damping():
+    """(M + T d) v' + d v = u, at a state and a reference of their own."""
+    law = TrackingLaw(joint(), poles(POLE), latency=LATENCY)
+    (control,) = law.control([0.3, 0.2], [0.1, -0.4, 2.0])
+    wanted = 2.0 - 100.0 * (0.3 - 0.1) - 20.0 * (0.2 + 0.4)
+    assert control == pytest.approx((INERTIA + LATENCY * DAMPING) * wanted + DAMPING * 0.2)
+
+
+def test_only_damping_counts():
+    """Neither Coulomb friction, whose slope at rest is that of its regularization, nor growth."""
+    q, v, dry, growth = (ca.SX.sym(name) for name in ("q", "v", "dry", "growth"))
+    friction = -dry * v / ca.sqrt(v**2 + 1e-6) + growth * v
+    system = DaeSystem(
+        state=ca.vertcat(q, v),
+        f=ca.vertcat(v, friction),
+        g=ca.SX(2, 0),
+        h=ca.DM([0.0, 1.0]),
+        k=ca.SX(0, 1),
+        l=q,
+        m=ca.SX(1, 0),
+        parameters=(Parameter("dry", 2.0, symbol=dry), Parameter("growth", 3.0, symbol=growth)),
+        dry=("dry",),
+    )
+    law = TrackingLaw(system, poles(POLE), latency=LATENCY)
+    assert law.damped_structure is law.structure
+    late = TrackingLaw(system.with_values({"growth": -3.0}), poles(POLE), latency=LATENCY)
+    assert late.damped_structure is not late.structure
+
+
+def test_a_latency_is_a_time():
+    with pytest.raises(ModelError, match=r"the latency of a law must be 0 s or more, got -0\.001"):
+        TrackingLaw(joint(), poles(POLE), latency=-1e-3)
+    with pytest.raises(ModelError, match="latency must be a finite number, got '1 ms'"):
+        TrackingLaw(joint(), poles(POLE), latency="1 ms")
+
+
+LATE = "sampling={period: 0.001, delay: 0.001}"
+DAMPED = "known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
+
+
+def off_prediction(*settings):
+    """The law, and how far a run that starts 2 cm off its path leaves its predicted error."""
+    start = "start.errors={tool.z: 0.02}"
+    loop, _, record = run_scenario(scenario("two_link_wall", start, "duration=1.5", *settings))
+    difference = record["tracking_error"] - loop.predicted_error(record)
+    return loop.controller.law, np.abs(difference[:, 0]).max()
+
+
+@pytest.mark.slow
+def test_a_sampled_scenario_knows_the_latency_of_its_law(monkeypatch):
+    """Two links of 0.1 kg m^2 with 1000 N m s: off the prediction as without damping.
+
+    A law without the latency leaves it by more than five times as much.
+    """
+    law, undamped = off_prediction(LATE)
+    assert law.latency == pytest.approx(0.0015)
+    assert law.damped_structure is law.structure
+    _, late = off_prediction(LATE, DAMPED)
+    assert late < 2.0 * undamped
+    monkeypatch.setattr("drake_dae.scenario.loop.latency_of", lambda *_: 0.0)
+    assert off_prediction(LATE, DAMPED)[1] > 5.0 * late
+
+
+def test_continuous_laws_and_those_behind_springs_have_no_latency():
+    loop, *_ = run_scenario(scenario("two_link_wall", "duration=0.01"))
+    assert loop.controller.law.latency == 0.0
+    loop, *_ = run_scenario(scenario("two_link_flexible", LATE, "duration=0.01"))
+    assert loop.controller.law.latency == 0.0
