@@ -124,10 +124,8 @@ class Press(Phase):
         return {contact_output: self.force}
 
     def needed(self, contact_force: float) -> Mapping[str, float]:
-        pressed = (
-            {} if isinstance(self.force, Reference) else {"force": self.force - self.tolerance}
-        )
-        return {"time": self.over, **pressed}
+        pressed = 0.0 if isinstance(self.force, Reference) else self.force - self.tolerance
+        return {"time": self.over, "force": pressed}
 
     def margin(self, now: Moment, contact_force: float) -> float:
         off, tipped = abs(now.force - now.wanted), now.eccentricity - self.eccentricity
