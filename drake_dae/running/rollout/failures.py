@@ -8,6 +8,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
+from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.failures import (
     cannot_go_on,
     endless_steps,
@@ -16,7 +17,7 @@ from drake_dae.systems.blocks.failures import (
     simulation_error,
     spoilt_step,
 )
-from drake_dae.systems.blocks.traced import HELD, STATE, TIME, Block
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, STATE, TIME, Block
 from drake_dae.systems.blocks.trials import PACE_STEPS
 from drake_dae.systems.plants.contract import Plant
 
@@ -36,7 +37,9 @@ def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> Simula
         return run.error
     name, state = program.name, run.state[program.plant]
     constants = run.held, problem.parameters
-    trial = _reason(program, run.trial_time, run.trial, *constants) if run.trial_time else None
+    trial = None
+    if np.isfinite(run.trial_time):
+        trial = _reason(program, run.trial_time, run.trial, *constants)
     match run.ending:
         case RunEnding.OFF_MANIFOLD:
             try:
@@ -85,7 +88,12 @@ def _reason(
                 f"the reference is not finite at t = {time:g} s", time, function.outputs[0].copy()
             )
         x = _where(call.computation.sources, arguments, call.block, state)
-        return simulation_error(function.failure(), time, x, call.block.signals)
+        error = simulation_error(function.failure(), time, x, call.block.signals)
+        given = dict(zip(call.computation.sources, arguments, strict=True))
+        if not isinstance(call.block.system, ParameterizedSystem) or PARAMETERS not in given:
+            return error
+        inputs = [given["control"]] if "control" in given else []
+        return call.block.system.explained(error, given[PARAMETERS], *inputs, held=given.get(HELD))
     return None
 
 

@@ -197,13 +197,24 @@ class ParameterizedSystem(DifferentiableSystem):
                 return alternative
         time, state = context.get_time(), state.copy()
         error = simulation_error(function.failure(), time, state, self._signals)
-        self._steps.tolerate(context, self._explained(error, parameters, *inputs))
+        self._steps.tolerate(context, self.explained(error, parameters, *inputs))
         return function.nowhere()
 
-    def _explained(
-        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    def explained(
+        self,
+        error: SimulationError,
+        parameters: FloatArray,
+        *inputs: FloatArray,
+        held: FloatArray | None = None,
     ) -> SimulationError:
-        """The error of a function without a value at these inputs, or a more precise one."""
+        """Returns the error of a function without a value, or a more precise one.
+
+        Args:
+            error: The error, with time and state.
+            parameters: Values of all parameters.
+            inputs: The other inputs of the function, such as the control.
+            held: The discrete state; that of the last evaluation if None.
+        """
         return error
 
     def parameters(self, context: Context) -> FloatArray:

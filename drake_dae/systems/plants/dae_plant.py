@@ -286,11 +286,16 @@ class DaePlant(ParameterizedSystem, Plant):
             return False
         return self._crossing.happens(state, control, self._values(context))
 
-    def _explained(
-        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    def explained(
+        self,
+        error: SimulationError,
+        parameters: FloatArray,
+        *inputs: FloatArray,
+        held: FloatArray | None = None,
     ) -> SimulationError:
-        """In a Painleve paradox, the error with its outcome."""
-        if not (self.dae.frictional_contacts and isinstance(error, SingularityError)):
+        """Returns in a Painleve paradox the error with its outcome."""
+        is_known = isinstance(error, SingularityError) and (inputs or not self._is_controlled)
+        if not (self.dae.frictional_contacts and is_known):
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
         taken = (control,) if "control" in self._force.input_names else ()

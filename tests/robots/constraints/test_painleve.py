@@ -20,6 +20,8 @@ from numpy.testing import assert_allclose
 from painleve import GRAVITY, HALF, MASS, critical, rod, sliding
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 from runs import some
 
 from drake_dae import (
@@ -32,7 +34,9 @@ from drake_dae import (
     load_scenario,
     make_closed_loop,
     poles,
+    rollout,
     simulate,
+    start_values,
 )
 from drake_dae.dae.references import stack_references
 from drake_dae.dae.states.contact_margin import ContactMargins
@@ -164,6 +168,29 @@ def test_a_run_that_reaches_the_edge_stops_there():
     assert caught.value.time == pytest.approx(when, abs=1e-5)
     assert caught.value.state[2] == pytest.approx(angle, abs=1e-5)
     assert caught.value.outcome is PainleveOutcome.INDETERMINATE
+
+
+def test_a_rollout_into_the_edge_ends_with_the_words_of_drakes_simulator():
+    """It was told that A(x) is singular. The rod turns up with 6 rad/s, without any control."""
+    plant = RobotPlant(rod(1.5, 0.7))
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    still = builder.AddSystem(ConstantVectorSource(np.zeros(3)))
+    builder.Connect(still.get_output_port(), plant.GetInputPort("control"))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), sliding(0.7, 6.0))
+    config = error_controlled(1e-8)
+    (found,) = rollout(diagram, *start_values(diagram, context), [0.0, 0.5], config=config)
+    with pytest.raises(PainleveError) as raised:
+        simulate(diagram, context, 0.5, config)
+    assert isinstance(found.failure, PainleveError)
+    assert found.failure.outcome is raised.value.outcome
+    assert found.failure.time == pytest.approx(raised.value.time, abs=1e-7)
+    words = "Painleve paradox at the contact of 'floor.force' at t = 0.0321431 s"
+    assert words in str(found.failure)
+    assert words in str(raised.value)
 
 
 @pytest.mark.slow

@@ -109,15 +109,16 @@ PRESS = Press(20.0)
         ([Approach(on_success="done"), PRESS], "2 of the task, Press: no phase leads to it"),
         (
             [Approach(), Press(20.0, guards=[PhaseGuard("force", 10.0)])],
-            "phase 2 of the task, Press: its guard ends it at a force of 10, and it needs 19 to "
-            "succeed; give more",
+            "phase 2 of the task, Press: its guard ends it at a force of 10 N, and it needs 19 N "
+            "to succeed; give more",
         ),
-        ([Dwell(2.0, guards=[PhaseGuard("time", 1.0)])], "at a time of 1, and it needs 2 to"),
+        ([Dwell(2.0, guards=[PhaseGuard("time", 1.0)])], "at a time of 1 s, and it needs 2 s to"),
         (
             [Approach(guards=[PhaseGuard("speed", 1.0), PhaseGuard("speed", 2.0)])],
             "two guards watch the speed; leave one out",
         ),
-        ([GuardedMove(0.1, force=0.2)], "force: 0.2 N is less than the contact_force of 0.5 N"),
+        ([GuardedMove(0.1, force=0.2)], "force: 0.2 N counts as no force, since it is less than"),
+        ([Approach(), Press(0.3)], "Press: force: 0.3 N counts as no force, since it is less than"),
     ],
 )
 def test_plans_that_make_no_sense_are_refused(phases, message):

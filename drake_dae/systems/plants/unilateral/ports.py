@@ -275,18 +275,28 @@ class ModalPorts(ParameterizedSystem, Plant):
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
 
-    def _explained(
-        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    def explained(
+        self,
+        error: SimulationError,
+        parameters: FloatArray,
+        *inputs: FloatArray,
+        held: FloatArray | None = None,
     ) -> SimulationError:
-        """In a Painleve paradox, the error with its outcome."""
-        if not (self.dae.frictional_contacts and isinstance(error, SingularityError) and self._now):
+        """Returns in a Painleve paradox the error with its outcome."""
+        mode = None if self._now is None else self._now.closed
+        if held is not None:
+            mode = closed_of(held[: len(self._contacts.every)])
+        if mode is None or not isinstance(error, SingularityError):
+            return error
+        if not self.dae.frictional_contacts:
             return error
         control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
         contacts = self._contacts
-        terms = contacts.terms(error.state, control, parameters)
-        places = [i for i, shut in enumerate(self._now.closed[: len(contacts.names)]) if shut]
+        known = parameters[: self.dae.parameter_symbol.numel()]  # No restitution, which is last.
+        terms = contacts.terms(error.state, control, known)
+        places = [i for i, shut in enumerate(mode[: len(contacts.names)]) if shut]
         normals = [contacts.normals[i] for i in places]
-        bilateral = contacts.bilateral_in(self._now.closed).tolist()
+        bilateral = contacts.bilateral_in(mode).tolist()
         outcome = terms.painleve_outcome(bilateral, normals)
         if outcome is None:
             return error

@@ -117,17 +117,18 @@ class Press(Phase):
         if not isinstance(self.force, Reference):
             positive("Press: force", self.force)
 
+    def felt(self, contact_force: float) -> float:
+        return contact_force if isinstance(self.force, Reference) else self.force
+
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.force}
 
     def needed(self, contact_force: float) -> Mapping[str, float]:
-        if isinstance(self.force, Reference):
-            return {"time": self.over}
-        return {"time": self.over, "force": self.force - self.tolerance}
+        pressed = 0.0 if isinstance(self.force, Reference) else self.force - self.tolerance
+        return {"time": self.over, "force": pressed}
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        off = abs(now.force - now.wanted)
-        tipped = now.eccentricity - self.eccentricity
+        off, tipped = abs(now.force - now.wanted), now.eccentricity - self.eccentricity
         margin: float = ca.fmax(ca.fmax(self.over - now.time, off - self.tolerance), tipped)
         return margin
 

@@ -157,7 +157,7 @@ class Phase(ABC):
         return 0.0
 
     def felt(self, contact_force: float) -> float:
-        """The force at which it has touched, in N, for a phase with a `speed_of_approach`.
+        """The force at which it has touched, or with which it presses, in N.
 
         Args:
             contact_force: As of `margin`.

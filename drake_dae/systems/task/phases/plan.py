@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases.guards import UNITS
 from drake_dae.systems.task.phases.members import Release
 from drake_dae.systems.task.phases.phase import (
     APPROACH,
@@ -326,21 +327,24 @@ def check_guards(phases: Sequence[Phase], contact_force: float) -> None:
     """Refuses guards that trip before their phase can succeed.
 
     Raises:
-        ModelError: A guard does, two watch the same quantity, or a move ends below `contact_force`.
+        ModelError: A guard does, two watch the same quantity, or the force of a phase is below
+            `contact_force`.
     """
     for index, phase in enumerate(phases):
         where, needed = f"phase {index + 1} of the task, {phase.name}", phase.needed(contact_force)
-        if needed.get("force", contact_force) < contact_force and not phase.begins_in_contact:
+        if phase.felt(contact_force) < contact_force:
             raise ModelError(
-                f"{where}: force: {needed['force']:g} N is less than the contact_force of "
-                f"{contact_force:g} N, which counts as no force"
+                f"{where}: force: {phase.felt(contact_force):g} N counts as no force, since it is "
+                f"less than the contact_force of {contact_force:g} N; give more, or a smaller "
+                "contact_force"
             )
         watched = [guard.of for guard in phase.guards]
         for number, guard in enumerate(phase.guards):
             if guard.of in watched[:number]:
                 raise ModelError(f"{where}: two guards watch the {guard.of}; leave one out")
             if guard.most <= needed.get(guard.of, 0.0):
+                unit = f" {UNITS[guard.of]}".rstrip()
                 raise ModelError(
-                    f"{where}: its guard ends it at a {guard.of} of {guard.most:g}, and it needs "
-                    f"{needed[guard.of]:g} to succeed; give more"
+                    f"{where}: its guard ends it at a {guard.of} of {guard.most:g}{unit}, and it "
+                    f"needs {needed[guard.of]:g}{unit} to succeed; give more"
                 )

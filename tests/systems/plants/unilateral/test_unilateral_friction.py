@@ -16,7 +16,9 @@ from drake_dae import (
     TrackingLaw,
     UnilateralRobotPlant,
     poles,
+    rollout,
     simulate,
+    start_values,
 )
 from drake_dae.dae.system.contacts import PainleveOutcome
 from drake_dae.errors import PainleveError
@@ -55,16 +57,22 @@ def test_a_run_into_the_edge_stops_there():
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
     plant.set_state(context, law.structure.manifold.project(sliding(np.deg2rad(80.0))))
+    given = *start_values(diagram, root), np.linspace(0.0, 3.5, 8)
+    (rolled,) = rollout(diagram, *given, config=error_controlled(1e-8))
     with pytest.raises(PainleveError, match="floor") as caught:
         simulate(diagram, root, 3.5, error_controlled(1e-8))
     angle = np.arctan((9.0 + np.sqrt(17.0)) / 4.0)
     when = np.arccos((np.rad2deg(angle) - 60.0) / 20.0) / (np.pi / 4.0)
-    assert caught.value.time == pytest.approx(when, abs=1e-5)
-    assert caught.value.outcome is PainleveOutcome.INDETERMINATE
+    for error in (caught.value, rolled.failure):
+        assert isinstance(error, PainleveError)
+        assert error.time == pytest.approx(when, abs=1e-5)
+        assert error.outcome is PainleveOutcome.INDETERMINATE
+        assert "Painleve paradox at the contact of floor" in str(error)
     assert plant.events(context) == ()
 
 
