@@ -36,8 +36,8 @@ OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 
 
 help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
-	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
-	@echo 'make test        lint, types and tests'
+	@echo 'make check       lint, types and the quick tests: the daily round, some four minutes'
+	@echo 'make test        lint, types and tests: a quarter of an hour on two cores'
 	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'

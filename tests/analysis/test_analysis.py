@@ -100,6 +100,7 @@ def test_zero_dynamics_that_are_undecided_are_none():
     assert re.search(r"eigenvalues 0 ± 3\.8\d+i 1/s", str(analysis))
 
 
+@pytest.mark.slow
 def test_1_a_degree_that_is_not_defined():
     fields = {
         "f": lambda x: [0, 0, 0],
@@ -223,6 +224,7 @@ def test_the_least_margin_in_a_region():
         assert margin.state[2] == pytest.approx(best, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_singularity_of_two_dimensions_less():
     """det B = (x2 - 0.3)^2 + (x2 + x3)^2 vanishes at one point of a plane."""
     system = system_of(

@@ -75,6 +75,7 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     assert 0.0 <= found["off_prediction"] < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -149,6 +150,7 @@ def test_the_point_of_a_tip_is_three_numbers(tip, tmp_path, monkeypatch, capsys)
 # What it keeps.
 
 
+@pytest.mark.slow
 def test_a_second_run_keeps_the_first_one_and_says_where(tmp_path, capsys):
     folder = tmp_path / "run"
     for duration in (0.1, 0.2, 0.3):

@@ -233,6 +233,7 @@ def test_random_numbers_are_drawn_at_their_period():
     assert compiled.sizes["noise"] == 2
 
 
+@pytest.mark.slow
 def test_a_compiled_multirate_loop_moves_as_in_the_simulator():
     """To 1e-10: both integrate to about 1e-12, by different methods."""
     builder = DiagramBuilder()

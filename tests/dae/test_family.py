@@ -210,6 +210,7 @@ def test_a_rank_of_a_within_bounds():
             find_constraint_structure(system.with_bounds({"w": (low, 5.0)}))
 
 
+@pytest.mark.slow
 def test_where_no_state_is_consistent_with_numbers_nearer_ones_are_taken():
     """x_0^2 + x_1^2 = 4 w^2 - 4 has none for w < 1; the default is 1.05."""
     system = DaeSystem.from_functions(

@@ -233,6 +233,7 @@ def test_paths_on_a_surface(shown):
     assert near < far
 
 
+@pytest.mark.slow
 def test_the_desired_path_ends_where_it_leaves_the_reach():
     """The arm is 2 m long and the wall 1.2 m away: it reaches 1.6 m up. It is asked for more."""
     loop, record, _ = recorded("two_link_wall", "duration=1")
@@ -275,6 +276,7 @@ def test_a_parameter_moves_the_surface():
     np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_parameter_turns_the_arrow():
     """Of the normal of a dome that stands elsewhere."""
     scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])

@@ -34,6 +34,7 @@ def test_a_wall_and_a_board_on_it_share_what_a_law_presses():
     np.testing.assert_allclose((wall + board)[-1], alone["constraint_force"][-1, 0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_walls_with_friction_share_their_force_and_their_friction():
     """Both of one wall with friction: the motion is that of the wall alone."""
     rough = WALL.replace("frame: tool", "frame: tool, friction: 0.3")

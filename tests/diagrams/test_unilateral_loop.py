@@ -309,6 +309,7 @@ def test_a_sampled_law_begins_in_contact_and_leaves_at_its_first_sample_that_pul
     )
 
 
+@pytest.mark.slow
 def test_a_control_that_pulls_for_a_part_of_a_step_opens_a_contact():
     """Held from 2.086 s on it pulls for 0.2 ms: steps of a sample see that as ten in each do."""
     settings = ["wall_bounce", "sampling={period: 0.001}", "integrator.start_time=2.0"]

@@ -65,6 +65,7 @@ def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
         rigid(ForceSensor(2, time_constant=0.01))
 
 
+@pytest.mark.slow
 def test_a_plant_of_another_diagram_is_refused_with_its_name():
     loop, _ = build_scenario(scenario("two_link_wall"))
     with pytest.raises(WiringError, match="'two_link_arm' belongs to another diagram already"):
@@ -90,6 +91,7 @@ def test_behind_motors_the_force_may_be_connected_directly():
     assert not loop.diagram.HasAnyDirectFeedthrough()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_measured_force", "wall_point_contact"])
 def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
     """The first sample has the values of the ports before the first step."""

@@ -17,6 +17,7 @@ from drake_dae.pictures.diagram import diagram_text
 needs_dot = pytest.mark.skipif(shutil.which("dot") is None, reason="needs Graphviz's dot")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force", "wall_point_contact"])
 def test_every_block_and_every_wire_but_those_to_logs_is_drawn(name):
     loop, _ = build_scenario(scenario(name))

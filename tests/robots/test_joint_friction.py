@@ -93,6 +93,7 @@ def test_friction_that_makes_no_sense_is_refused(joints, more, message):
         )
 
 
+@pytest.mark.slow
 def test_drakes_own_plant_refuses_it_and_says_which_takes_it():
     settings = ["known_forces=[!JointFriction {joints: [joint1], coulomb: 1}]"]
     with pytest.raises(ScenarioError, match="!CompliantContact"):

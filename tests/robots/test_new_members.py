@@ -166,6 +166,7 @@ def test_friction_enters_as_the_reaction_says():
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_law_that_knows_the_friction_cancels_it():
     """Errors as without friction; the controls are not those without it."""
     model = frictional()

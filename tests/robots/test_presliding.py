@@ -126,6 +126,7 @@ def test_a_slope_below_static_friction_holds_without_creep(plant_of):
         assert after[0] > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "moves"), [(0.98, False), (1.02, True)])
 def test_a_contact_breaks_away_at_static_friction(factor, moves):
     """A pull that rises slowly to rho F_c, less and more 2 %: bent by 1e-4 m, or 1e-2 m away.

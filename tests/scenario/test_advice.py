@@ -44,6 +44,7 @@ def chosen(found: Scenario) -> Scenario:
     return build_completed(found)[0].scenario
 
 
+@pytest.mark.slow
 def test_what_is_left_out_is_advised_and_reported():
     found = two_link("constraints.0.friction=0.0")
     completed, loop = build_completed(found)
@@ -109,6 +110,7 @@ def test_a_roughness_without_use_is_refused():
         chosen(two_link("encoders={resolution: 1.0e-5}", "largest_roughness=-1.0"))
 
 
+@pytest.mark.slow
 def test_a_noise_that_no_gains_smooth_is_named():
     with pytest.raises(ScenarioError, match="noise of the position changes"):
         chosen(two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4"))
@@ -129,6 +131,7 @@ def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():
         chosen(two_link("encoders={resolution: 1.0e-5}", "largest_errors={force: 0}"))
 
 
+@pytest.mark.slow
 def test_gains_that_cannot_be_computed_are_a_problem_before_a_run():
     found = find_feasibility(
         two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4")
@@ -174,6 +177,7 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
     assert found.observer is None
 
 
+@pytest.mark.slow
 def test_springs_get_a_cascade_with_all_of_its_numbers():
     """The loop as `spring_loop` has it, and gains of the rigid law that leave room for it."""
     springs = "actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]"

@@ -82,6 +82,7 @@ def in_phase(record, place):
     return np.flatnonzero(np.argmax(record["phase"], axis=1) == place)
 
 
+@pytest.mark.slow
 def test_points_carry_what_force_and_moment_imply_and_leave_together(file):
     """F = a + b and M_y = 0.03 (a - b), to round-off; then both distances are 10 mm."""
     record, changes = rolled(file)
@@ -207,6 +208,7 @@ def test_what_is_no_face_is_refused(file, settings, key, message):
     assert key in str(raised.value)
 
 
+@pytest.mark.slow
 def test_an_eccentricity_needs_several_points(file):
     guard = "task.phases.4.guards=[{of: eccentricity, most: 0.5}]"
     with pytest.raises(ScenarioError, match="eccentricity needs a contact of several points"):
@@ -222,6 +224,7 @@ def test_a_face_opens_with_its_distances_in_the_places_of_its_forces(file):
         open_contact(system, "upper.force")
 
 
+@pytest.mark.slow
 def test_a_measured_face_is_the_law_of_its_measured_points(file):
     """Gbar (S v - S r) = S Gbar (v - r) for a number Gbar, and so for integrals: to round-off."""
     face = scenario_model(load_scenario(file)).dae

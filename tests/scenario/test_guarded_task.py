@@ -71,6 +71,7 @@ def rolled(found):
     return result, loop.changes(result.context or context)
 
 
+@pytest.mark.slow
 def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys):
     """The guard has it at 9 N; pressing to 10 N takes 0.1 s. The record is read again."""
     guards = ["task.phases.1.guards.0={of: force, most: 9, samples: 2}", TOLERANT]
@@ -105,6 +106,7 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     assert "Press is ended by a time of 0.2 s, where its guard has 0.2 s" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_task_that_leaves_as_chosen_for_success_is_good(file, tmp_path, capsys):
     """The run ends before its time, and that is no fault."""
     phases = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 5, on_success: leave}]"
@@ -199,6 +201,7 @@ def test_the_hardest_touch_is_told_with_its_phase():
     assert "A touch by GuardedMove at 0.02 m/s is expected to stay below 47" in note
 
 
+@pytest.mark.slow
 def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
     """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
     biased = "force_feedback=!MeasuredForce {sample_period: 0.002, bias: 3}"
@@ -225,6 +228,7 @@ def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
     assert not found[0].record["constraint_force"][found[0].record.time < touch].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "jitter"),
     some(
@@ -268,6 +272,7 @@ DELAYED = "sampling={period: 0.002, delay: 0.001}"
 SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phase", "changes"),
     some(

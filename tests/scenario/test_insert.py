@@ -31,6 +31,7 @@ integrator: {integration_scheme: runge_kutta3, max_step_size: 0.001, use_error_c
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rolls", some(first_quick([True, False])))
 def test_an_insertion_beside_its_hole_pushes_as_a_spring_and_damper(rolls, tmp_path):
     """F = m (p^2 e + 2 p v) where the tool rests and the reference goes on, m = 1 / (J M^-1 J^T).

@@ -26,6 +26,7 @@ def file(tmp_path):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some(PLANTS))
 def test_a_task_goes_on_while_measurements_are_late_and_lost(name, file):
     """Every fourth sample has an old measurement, up to four in a row: the task is done."""
@@ -50,6 +51,7 @@ def test_a_touch_is_felt_when_its_packet_comes(file):
     assert record["lost_measurements"][: row + 1, 0].max() >= 4.0
 
 
+@pytest.mark.slow
 def test_a_task_ends_where_the_law_stops_the_robot(file):
     """After twenty samples without a measurement, with the reason and the record up to there."""
     lost = "sampling={period: 0.002, measurements: {loss: 0.01, burst: 20, most_lost: 20}}"

@@ -129,6 +129,7 @@ def test_analysis_of_a_task_tells_its_phases_before_it_runs(file, capsys):
 SOFT = "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
@@ -164,6 +165,7 @@ def test_a_guard_that_bears_the_touch_is_no_problem(file):
     assert found.task.touches[0].peak > 40.0
 
 
+@pytest.mark.slow
 def test_several_integrals_serve_a_task_whose_contact_opens(file):
     """The task holds them itself while the contact is open."""
     measured = "force_feedback=!MeasuredForce {sample_period: 0.002}"
@@ -277,6 +279,7 @@ def test_a_task_that_begins_in_contact_starts_on_it(file):
     assert abs(loop.plant.GetOutputPort("gap").Eval(own).item()) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_task_has_the_noise_of_its_seed(file):
     noisy = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
     found = []
@@ -310,6 +313,7 @@ def test_a_phase_takes_a_file_beside_the_scenario(file):
     assert reference.file == str(file.parent / "path.csv")
 
 
+@pytest.mark.slow
 def test_a_summary_reports_that_a_task_stops_its_run(file, tmp_path, capsys):
     words = ["--set", "task.phases.0.within=0.1", "--set", "task.phases.0.if_late=stop"]
     words += ["--set", "write={plots: false, animation: false}", "--out", str(tmp_path / "run")]

@@ -33,6 +33,7 @@ def profile_of(scenario):
     return completed, reference.profile
 
 
+@pytest.mark.slow
 def test_the_run_lasts_as_long_as_the_motion_and_is_the_same_when_it_is_run_again():
     completed, profile = profile_of(loaded("time_optimal={efforts: 0.8}"))
     # s starts with the rate 0, and may be slowed.
@@ -83,6 +84,7 @@ def test_robots_without_a_profile_are_refused_in_a_sentence(name):
     assert len(error.value.problems) == 1
 
 
+@pytest.mark.slow
 def test_a_drive_without_a_limit_is_told_since_the_control_is_then_not_limited(tmp_path):
     file = tmp_path / "free.urdf"
     text = shipped_model("two_link_arm.urdf").read_text("utf-8")

@@ -81,6 +81,7 @@ def discrete(context):
     return np.concatenate([context.get_discrete_state(i).value() for i in groups])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some(first_quick(LOOPS), dear=DEAR))
 def test_logs_and_context_are_those_of_drakes_simulator(name, short_runs):
     """75 samples, no multiple of those after which the context is set.

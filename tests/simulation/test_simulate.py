@@ -163,6 +163,7 @@ def test_drakes_settings_are_taken_where_none_are_given():
     assert simulate(diagram, context, 1.0).simulated_time == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force"])
 def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
     """It begins at its start_time again, from the state that the first one ended in."""

@@ -253,6 +253,7 @@ def test_the_data_of_a_run_are_complete_and_of_the_plant_that_a_rollout_runs():
     assert kinds["point"]["plant_parameters"] == rolled.plant_parameters == wanted
 
 
+@pytest.mark.slow
 def test_a_run_of_compliant_contact_has_its_own_parameters_alone():
     """Not those of the study's scenario, which are its default."""
     text = "plant=!CompliantContact {}", "plant_parameters={wall.position: [0.702, 0, 0]}"

@@ -189,6 +189,7 @@ def test_auto_takes_what_the_cache_has(cache):
     assert call(made("auto"), LOOK).is_machine_code
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_auto_compiles_what_was_called_so_often_that_it_pays(cache):
     function = made("auto")

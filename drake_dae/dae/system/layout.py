@@ -37,12 +37,12 @@ class DerivativeLayout:
         """The size of a chain, sum mu_i."""
         return sum(self.degrees)
 
-    @property
+    @cached_property
     def reference_size(self) -> int:
         """The size of a reference, sum (mu_i + 1), and further derivatives."""
         return sum(self.reference_degrees) + len(self.degrees)
 
-    @property
+    @cached_property
     def reference_degrees(self) -> tuple[int, ...]:
         """The number of derivatives of each r_i in a reference, mu_i without further ones."""
         more = self.more or (0,) * len(self.degrees)

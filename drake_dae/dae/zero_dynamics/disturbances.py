@@ -192,7 +192,9 @@ class DisturbanceFlow:
             return parts[:, 0], parts[:, 1:]
 
         def joined(first: FloatArray, rest: FloatArray) -> FloatArray:
-            return (np.column_stack([first, rest]) / unit).T.reshape(-1)
+            both = np.empty((1 + rest.shape[1], n))
+            both[0], both[1:] = first, rest.T
+            return (both / self.scale).reshape(-1)
 
         def rate(time: float, both: FloatArray) -> FloatArray:
             (x, along), goal, p = split(both), self.goal(time), self.parameters(time)

@@ -30,6 +30,7 @@ def test_a_slow_disturbance_leaves_a_pair_with_the_damping_ratio_of_butterworth(
     assert_allclose(-pair.real / np.abs(pair), 0.5**0.5, rtol=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [None, 30.0])
 def test_gain_and_covariance_are_where_riccatis_recursion_ends(ratio):
     """From no knowledge at all, 20,000 samples; round-off of the recursion is about 1e-10."""

@@ -76,6 +76,7 @@ def test_less_roughness_leaves_more_error():
     assert smooth.position_error * smooth.force_error > rough.position_error * rough.force_error
 
 
+@pytest.mark.slow
 def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
     """Each bound alone leaves the other error as small as the roughness allows."""
     given = situation(1e-5, 1e5, 0.03, 1)
@@ -102,6 +103,7 @@ def test_a_bound_of_an_error_is_kept_wherever_the_roughness_allows_it():
         assert found.roughness <= 1.05 * alone
 
 
+@pytest.mark.slow
 def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
     """An unknown force with good sensors, their noise with bad ones, or the allowed roughness."""
     good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)

@@ -195,6 +195,7 @@ def test_4_a_degree_that_is_lost_between_the_sampled_states():
     assert error.state[1] == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_5_outputs_that_repeat():
     """An output that repeats another, a constraint, a combination, a function of both."""
     system = PROBLEMS["gantry"]().system

@@ -250,6 +250,7 @@ def test_forces_of_a_robot_are_those_of_least_squares(compliant):
         assert_allclose(np.concatenate([on_cranks["pin1"], on_cranks["pin2"]]), found, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_motion_is_that_without_redundant_constraints():
     model = cranks()
     plain = drop_constraints(

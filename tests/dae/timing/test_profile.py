@@ -197,6 +197,7 @@ def test_a_rest_beyond_a_limit_is_refused_with_its_place_and_its_motor():
         two_link_profile(forces)
 
 
+@pytest.mark.slow
 def test_limits_of_speed_and_acceleration_of_joints_hold():
     limits = two_link_limits(
         states=dict.fromkeys(("joint1_w", "joint2_w"), (-0.8, 0.8)),
@@ -272,6 +273,7 @@ def test_the_largest_rate_of_one_is_nowhere_faster_than_the_reference():
         assert rate.max() <= 1.0 + 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", some([{"viscous_friction": 60.0}, {"friction": 0.5}]))
 def test_friction_makes_no_limit_exceeded(friction):
     wall = PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall", **friction)

@@ -132,6 +132,7 @@ def test_no_other_control_that_does_the_same_is_less(law):
         assert other @ W @ other > u @ W @ u
 
 
+@pytest.mark.slow
 def test_outputs_are_as_predicted_and_a_free_control_moves_none_of_them(law):
     """At an accuracy of 1e-9 in a step some 1e-8 are left along the way."""
     records = []
@@ -170,6 +171,7 @@ def spare(free=None) -> DaeSystem:
     return DaeSystem(x, f, *parts, control_metric=metric, free_control=chosen)
 
 
+@pytest.mark.slow
 def test_zero_dynamics_are_those_under_the_chosen_control():
     """By hand: with z = 0 the control is u_0 - B^+ B u_0, where B = (1, 2) and B^+ = (3, 2) / 7 by
     W = diag(1, 3). For u_0 = (c, 0) that is (4, -2) c / 7, of which s gets 6 c / 7."""

@@ -96,6 +96,7 @@ def test_a_singular_b_under_running_zero_dynamics():
     np.testing.assert_allclose(motion.controls[:, 0], np.cos(motion.times) / (1 - motion.times))
 
 
+@pytest.mark.slow
 def test_unstable_zero_dynamics_end_the_motion_in_growth():
     """s' = s: exp(t) is 1e8 at t = 18.4; s' = s^2 is infinite at t = 1."""
     still = derivatives(lambda t: [0], (1,))

@@ -369,6 +369,7 @@ def test_growth_is_not_bounded():
     assert ZeroDynamics(blown).stability().verdict is Verdict.UNSTABLE
 
 
+@pytest.mark.slow
 def test_where_nothing_rests_the_motion_is_examined():
     """A rotor that a torque turns on, s'' = 1 + 0.5 cos s - s': its angle grows, like time alone.
 

@@ -439,6 +439,7 @@ def reduced(crank):
     return inertia, slope, 9.81 * lift
 
 
+@pytest.mark.slow
 def test_four_bar_moves_as_its_one_degree_of_freedom():
     """I a'' + I' a'^2 / 2 + V' = 0 over more than a turn of the crank, without torques.
 

@@ -150,6 +150,7 @@ def tilting(speed=-2.0):
     return [slide, path, ConstantReference(5.0)]
 
 
+@pytest.mark.slow
 def test_a_run_that_reaches_the_edge_stops_there():
     """Under a law that knows the friction lambda stays 5 N, so b = -A lambda: beyond, two fit.
 
@@ -311,6 +312,7 @@ def test_the_worst_direction_of_a_rod_is_found_whichever_way_it_slides(angle, sl
     assert worst.critical_friction["floor.friction"] == pytest.approx(critical(angle), rel=1e-11)
 
 
+@pytest.mark.slow
 def test_the_worst_direction_in_a_plane_is_that_of_its_mobility():
     plant, model = parse("seven_joint_arm"), frictional_arm()
     structure = find_structure(model.dae)

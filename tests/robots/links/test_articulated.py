@@ -98,6 +98,7 @@ def test_joints_with_several_velocities_have_none():
     assert links.articulated_bodies(np.zeros(5)) is None
 
 
+@pytest.mark.slow
 def test_operations_grow_with_the_number_of_links_where_those_of_a_triangle_grow_faster():
     counts = []
     for size in (10, 20):

@@ -153,6 +153,7 @@ def test_links_of_drakes_own_plant_are_drawn_where_they_are_and_pushed():
     np.testing.assert_allclose(v / 1e-4, rate, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_robot_in_a_diagram_has_its_links_contact_and_sliders():
     diagram, context, robot = wired_by_hand()
     bench = bench_of(diagram, context, "arm")
@@ -202,8 +203,8 @@ def test_what_a_bench_cannot_show_is_refused(tmp_path):
     assert not (tmp_path / "no.html").exists()
 
 
-@needs_chromium
 @pytest.mark.slow
+@needs_chromium
 def test_the_page_of_a_diagram_computes_what_the_simulator_does(tmp_path):
     pytest.importorskip("ziglang")
     diagram, context, _ = wired_by_hand()

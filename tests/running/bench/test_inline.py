@@ -37,6 +37,7 @@ def test_a_notebook_shows_a_bench_that_runs_beside_it():
         urlopen(address, timeout=2)
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_a_page_that_runs_in_it(tmp_path):
     pytest.importorskip("ziglang")
     page = inline_page(pendulum(), title="pendulum")

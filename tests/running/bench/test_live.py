@@ -64,8 +64,8 @@ def serving(built, name="two_link_wall", **more):
             thread.join()
 
 
-@needs_chromium
 @pytest.mark.slow
+@needs_chromium
 def test_what_is_done_in_a_browser_happens_and_is_replayed_exactly(built, tmp_path):
     kept = []
 
@@ -123,6 +123,7 @@ def test_nobody_else_reaches_the_bench(built):
         assert gone.connect_ex(("127.0.0.1", server.server_port)) != 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "body", "said"),
     [
@@ -147,6 +148,7 @@ def test_a_port_in_use_is_told(built):
         Server(built.loop, built.context, port=70000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -155,7 +157,6 @@ def test_a_port_in_use_is_told(built):
         pytest.param("wall_point_contact", marks=pytest.mark.thorough),
     ],
 )
-@pytest.mark.slow
 def test_what_no_export_knows_runs_too(name):
     own = build_commanded(scenario(name))
     server = Server(own.loop, own.context, scenario(name).integrator)

@@ -30,8 +30,8 @@ def page(tmp_path_factory):
     return file
 
 
-@needs_chromium
 @pytest.mark.slow
+@needs_chromium
 def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
     found = in_page(
         page.read_text(),
@@ -120,8 +120,8 @@ def test_sliders_drags_and_pushes_move_the_robot_as_predicted(page, tmp_path):
     assert not found["failure"]
 
 
-@needs_chromium
 @pytest.mark.slow
+@needs_chromium
 def test_names_stay_text_a_phone_shows_all_of_it_and_a_screen_reader_names_it(page, tmp_path):
     found = in_page(
         page.read_text(),
@@ -201,6 +201,7 @@ def test_pages_share_a_bundle(tmp_path):
     assert found == [pytest.approx(0.1, abs=0.01), "object"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "reason"),
     [

@@ -55,6 +55,7 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
     return subprocess.run(run, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     ("name", "settings"),
@@ -147,6 +148,7 @@ def rows(two_link):
     return [(row[0], row[1:6]) for row in table]
 
 
+@pytest.mark.slow
 def test_the_program_finds_what_is_wrong(two_link, tmp_path):
     for path in two_link.iterdir():
         shutil.copy(path, tmp_path)
@@ -313,6 +315,7 @@ int main() {
         assert line == f"{controller.control[0]:.17g} {controller.out.status}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "reason"),
     [

@@ -37,6 +37,7 @@ def outcome(folder, name, flags: str = "-O1") -> "subprocess.CompletedProcess[st
     return subprocess.run([program], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     "name",
@@ -72,6 +73,7 @@ def two_link(tmp_path_factory):
     return loop, folder
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_test_program_finds_what_is_wrong(two_link, tmp_path):
     _, folder = two_link
@@ -91,6 +93,7 @@ def test_the_test_program_finds_what_is_wrong(two_link, tmp_path):
         outcome(tmp_path, "arm", "-O1 -ffast-math")
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_make_runs_it(two_link):
     _, folder = two_link

@@ -89,6 +89,7 @@ def wire(controller: Unit, plant: Unit) -> None:
         controller[name] = plant[name]
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_both_together_are_the_loop(exported, units):
     """To 1e-12 of the largest: the same operations as in Drake."""

@@ -47,6 +47,7 @@ def assert_same(found: np.ndarray, record: Record, name: str, places: slice = sl
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * scale, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
@@ -100,6 +101,7 @@ def plant(tmp_path_factory):
     return CIntegrated(write_integrated(part, "plant", context, "arm", folder, CONFIG)), record
 
 
+@pytest.mark.slow
 def test_a_plant_follows_the_recorded_control(plant):
     code, record = plant
     code.reset()
@@ -158,6 +160,7 @@ def test_what_has_no_value_is_told(plant):
     assert_same(code.output("state"), record, "state", 1)
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_model_with_all_optimizations(tmp_path):
     """On processors with AVX-512 gcc 12 takes wrong what is equal and followed by zeros."""
     loop, context = build_scenario(scenario("two_link_wall", *EVERYTHING))
@@ -183,6 +186,7 @@ def test_all_files_are_linked_together(tmp_path):
     compile_c(tmp_path, sources, "all.so", "-O0", "-shared", "-fPIC")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "reason"),
     [

@@ -36,6 +36,7 @@ def library(source, folder):
     return ca.external("long_one", str(folder / "code.so"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize("looks_up", some([False, True], first=1))
 @pytest.mark.parametrize("longest", [7, 100])

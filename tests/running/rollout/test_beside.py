@@ -54,6 +54,7 @@ def chosen(name, duration=0.06):
     return scenario(robot, *settings, f"duration={duration}")
 
 
+@pytest.mark.slow
 @mostly_compiled
 @pytest.mark.parametrize("name", some(first_quick(LOOPS), dear=DEAR))
 def test_the_record_is_that_of_simulate(name, compiled):
@@ -134,6 +135,7 @@ def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported():
     assert parts_of(loop).compiled is None
 
 
+@pytest.mark.slow
 def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch):
     """Its contact solver may find no step; what was recorded is kept."""
 

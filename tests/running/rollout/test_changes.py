@@ -275,6 +275,7 @@ FALLING = {
 }
 
 
+@pytest.mark.slow
 @mostly_compiled
 @pytest.mark.parametrize("name", some(first_quick(FALLING), dear=("a block that rocks",)))
 def test_bodies_fall_as_in_drake(name, compiled):

@@ -21,6 +21,7 @@ FIXED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize(
     ("settings", "seconds", "fails"),
@@ -55,6 +56,7 @@ def test_a_thread_makes_the_same_run(monkeypatch, settings, seconds, fails, comp
                 np.testing.assert_allclose(one.record[name], recorded.values, 0.0, 1e-13 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="there is no compiler for GPUs")
 @pytest.mark.parametrize(
     "settings",

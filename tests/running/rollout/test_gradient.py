@@ -95,6 +95,7 @@ def precise_outputs(program, start, parameters, times, step):
     return precise(compiled.row, times[-1], x, held, parameters)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="no numbers of more digits")
 def test_it_is_the_limit_of_differences_in_more_digits():
     """To 1e-12 of the gradient: of fourth order, steps of 1e-4 leave 1e-15 and round-off 1e-14.
@@ -196,6 +197,7 @@ def test_of_an_integral_it_is_the_time():
     np.testing.assert_allclose(found.parameters, [3.0, 0.0], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_what_has_no_gradient_is_refused():
     loop, start, parameters, config = problem("two_link_wall")
     given, weights = (loop, start, parameters, [0.0, 0.01]), {"state": np.zeros((2, 4))}

@@ -68,6 +68,7 @@ def assert_same(ours, theirs, tolerance, slack=0):
             )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "seeds"),
     [
@@ -150,6 +151,7 @@ def assert_same_failures(ours, theirs):
             assert str(one.failure)[:20] == str(other.failure)[:20]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config", [["integrator.accuracy=1e-6"], [*FIXED[:2], "integrator.max_step_size=0.01"]]
 )
@@ -226,6 +228,7 @@ def test_angles_that_are_too_large_for_the_lanes_are_no_less_accurate(monkeypatc
     assert_same(*found, 1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", some([0, 3]))
 def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
     """Compliant contact at 1 kHz, where one run, also the first, exceeds its tolerances.
@@ -263,6 +266,7 @@ def given_of(*arrays):
     return [each.ctypes.data_as(ctypes.c_void_p) for each in arrays]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constants", [None, []])
 @pytest.mark.parametrize("options", some(["-O2", "-mno-avx512f", "-march=x86-64", "-DONE_LANE"]))
 def test_operations_are_those_of_casadi(options, constants):
@@ -319,6 +323,7 @@ def test_what_lanes_do_not_know_is_refused():
         emitted(function, "odd")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [FIXED, ["integrator.max_step_size=1e-3"]])
 @pytest.mark.usefixtures("signals_of_a_shell")
 def test_an_interrupt_ends_all_runs(config):

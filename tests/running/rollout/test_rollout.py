@@ -105,6 +105,7 @@ def test_equal_fixed_steps_are_equal(name, scheme, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
+@pytest.mark.slow
 @both
 def test_a_reference_of_many_polynomials_is_the_same(compiled):
     """To 1e-12 of the largest value, in steps that are powers of 2: Drake's times are exact."""
@@ -435,6 +436,7 @@ def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
         assert_equal_records(found.record, wanted, 1e-10)
 
 
+@pytest.mark.slow
 @both
 def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
     """Fixed steps of 1e-4 s; machine code looks after 500 steps first, CasADi's after each call."""

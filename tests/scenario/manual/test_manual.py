@@ -118,6 +118,7 @@ def read(data):
     return read_scenario(data, EXAMPLES.parent)
 
 
+@pytest.mark.slow
 def test_examples_are_scenarios():
     """Each example stands in a scenario that is read, and is written so that it reads back."""
     for entry in entries():

@@ -70,6 +70,7 @@ def written(tmp_path_factory):
     return file
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_commented_file_with_units_that_names_the_robot_beside_it(written):
     text = written.read_text()
     assert "\n  file: planar.urdf\n" in text

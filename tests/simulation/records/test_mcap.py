@@ -114,6 +114,7 @@ def test_no_mcap_and_a_time_before_zero_are_refused(mcap, tmp_path):
         Record(TIME - 1.0, SIGNALS).to_mcap(tmp_path / "run.mcap")
 
 
+@pytest.mark.slow
 def test_the_command_identifies_from_mcap(mcap, tmp_path, capsys):
     bare = ("--set=write.plots=false", "--set=write.animation=false", "--set=duration=0.3")
     heavy = ("--set=plant_parameters={link2.mass: 6.6}", "--rollout", "--out", str(tmp_path))

@@ -39,6 +39,7 @@ UNKNOWN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rollout", [True, False])
 def test_the_error_of_a_double_pole_is_bounded_as_its_closed_form_says(rollout):
     scenario = load_scenario("two_link_wall", AT_REST)
@@ -85,6 +86,7 @@ def test_plants_within_the_ranges_keep_the_bound_and_others_do_not(tmp_path):
     assert load_scenario(again).error_bound == bounded.error_bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "friction"),
     some(

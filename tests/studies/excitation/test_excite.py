@@ -93,6 +93,7 @@ def within(values, truth, deviation):
     return (total > low).all() and (total < high).all()
 
 
+@pytest.mark.slow
 def test_promised_deviations_are_those_of_the_closed_form(slider):
     found = excite(load_scenario(slider), RANGES, ["mass.mass"], noise=NOISE, runs=40)
     # Controls between the rows are a spline.
@@ -121,6 +122,7 @@ def test_the_same_seed_makes_the_same_choice(slider):
     assert choices[0] == choices[1] != choices[2]
 
 
+@pytest.mark.slow
 def test_measured_values_spread_as_promised(slider):
     found = excite(load_scenario(slider), RANGES, ["mass.mass"], noise=NOISE, runs=10)
     loop, context = build_scenario(found.scenario)
@@ -156,6 +158,7 @@ def test_runs_beyond_limits_are_refused(slider, changes, kind):
 WALL = ("duration=0.5", "integrator={integration_scheme: runge_kutta3, max_step_size: 0.002}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "kind"),
     [
@@ -221,6 +224,7 @@ def test_no_run_within_limits_is_an_error(slider):
         excite(fast, ranges, ["mass.mass"], noise=NOISE, runs=3)
 
 
+@pytest.mark.slow
 def test_rows_between_samples_are_refused():
     """Rows of a run under error control are 2 ms apart, where the sensor samples each 1 ms."""
     settings = [

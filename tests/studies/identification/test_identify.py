@@ -72,6 +72,7 @@ DERIVATIVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DERIVATIVES)
 def test_derivatives_are_those_of_differences(kind):
     settings, step, tolerance, parts = DERIVATIVES[kind]
@@ -118,6 +119,7 @@ FOUND = {
 DEAR = ("exogenous", "motors", "hydraulics", "springs")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [pytest.param(k, marks=pytest.mark.thorough) if k in DEAR else k for k in FOUND]
 )
@@ -194,6 +196,7 @@ def covered(count):
     return found, np.array(values), np.array(hits)
 
 
+@pytest.mark.slow
 def test_intervals_have_the_size_of_what_noise_does():
     found, values, hits = covered(8)
     # The deviation of 8 values is between 0.4 and 1.8 of the true one but once in 1e3.
@@ -229,6 +232,7 @@ def test_what_a_record_does_not_determine_is_told_by_name():
     assert found.to_dict()["parameters"]["wall.position[1]"]["interval"] is None
 
 
+@pytest.mark.slow
 def test_errors_are_compared_with_the_stated_noise():
     settings = (*SAMPLED, "encoders={position_noise: 1e-4}")
     loop, context, record = run_of((), *settings)
@@ -242,6 +246,7 @@ def test_errors_are_compared_with_the_stated_noise():
     assert float(found[1]) == pytest.approx(2.24, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["control", "constraint_force"])
 def test_a_wrong_sign_is_told(name):
     loop, context, record = run_of((), *WALL)
@@ -298,6 +303,7 @@ SENSORS = {
 SENSED = list(product(["ideal", "compliant"], SENSORS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("plant", "kind"), some(SENSED))
 def test_what_sensors_do_to_a_force_is_known_exactly(kind, plant):
     """Without noise a sample one row off, or the control of the step before, shows in the bias."""
@@ -348,6 +354,7 @@ def test_rows_between_samples_are_no_measurements(kind, plant):
     assert np.square(z).sum() < 22.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [["plant.friction"], ["plant.dissipation"], ["link2.mass"]])
 def test_what_begins_at_its_bound_stops_nothing_else(free):
     """Friction and dissipation are zero, where noise wants them below in half of all cases."""
@@ -427,6 +434,7 @@ WRONG_RECORDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", WRONG_RECORDS)
 def test_a_record_that_does_not_fit_is_refused(kind):
     change, message = WRONG_RECORDS[kind]
@@ -475,6 +483,7 @@ BOUNCE = ("wall_bounce", "duration=4.0")
 POLISH = ("wall_polish",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "name", "value"),
     [
@@ -527,6 +536,7 @@ def test_a_record_of_contacts_that_open_says_when(kind):
         identify(loop, context, [record], ["force.delay"])
 
 
+@pytest.mark.slow
 def test_no_record_and_drakes_own_contact_are_refused():
     loop, context, record = run_of((), *WALL)
     with pytest.raises(ModelError, match="no record"):

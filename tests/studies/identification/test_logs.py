@@ -43,6 +43,7 @@ def log(run):
     return path
 
 
+@pytest.mark.slow
 def test_the_command_finds_what_the_plant_has_and_writes_its_scenario(run, tmp_path, capsys):
     out = tmp_path / "found.yaml"
     assert main(["identify", str(run), "--free", "link2.mass", "--out", str(out)]) == 0
@@ -75,6 +76,7 @@ def test_a_law_that_knows_what_was_found_follows_its_prediction(run, tmp_path):
     assert main([*again, "--set=parameters={link2.mass: [1, 2]}"]) == 1
 
 
+@pytest.mark.slow
 def test_a_log_with_names_of_its_own_is_enough(run, log, capsys):
     arguments = ["identify", str(log), "--scenario", "two_link_wall", "--json"]
     columns = ["--columns", str(run / "columns.yaml")]
@@ -161,6 +163,7 @@ def test_a_call_that_makes_no_sense_is_one_sentence(kind, run, log, capsys):
     assert re.search(message, error), error
 
 
+@pytest.mark.slow
 def test_a_run_with_sensors_of_a_bias_begins_without_it(tmp_path, capsys):
     folder = tmp_path / "run"
     sensors = [

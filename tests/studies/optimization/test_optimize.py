@@ -77,6 +77,7 @@ def pressed_mass():
     return loop, context
 
 
+@pytest.mark.slow
 def test_gains_of_least_quadratic_cost_are_those_of_the_riccati_equation():
     """Of x'' = u and the integral of x^2 + rho u^2 they are rho^(-1/2) and sqrt(2) rho^(-1/4).
 
@@ -218,6 +219,7 @@ def test_a_start_is_brought_to_the_manifold():
     assert result.cost < 0.6 * result.cost_before
 
 
+@pytest.mark.slow
 def test_limits_hold_and_are_named():
     loop, context = two_link()
     result = found(
@@ -359,6 +361,7 @@ def test_a_run_that_fails_with_the_first_values_is_an_error():
         found(loop, context, end=3.0, free={"gains.tool.z": (1.0, 1e7)})
 
 
+@pytest.mark.slow
 def test_runs_that_fail_on_the_way_are_avoided():
     """Gains beyond 2 / 5 ms make steps of 5 ms unstable; the search goes on with lower ones."""
     loop, context = two_link()

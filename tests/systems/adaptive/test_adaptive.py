@@ -221,6 +221,7 @@ def test_v_falls_at_every_accepted_step(name, force_rate, adapted, truth):
     assert energy[-1] < 0.6 * energy[0]
 
 
+@pytest.mark.slow
 def test_it_tracks_where_the_law_of_the_wrong_model_does_not():
     """With link2 10 % heavier: 57 mm and 2.2 N without, nothing but the integrator's error with."""
     record = run(AdaptiveController(adaptive("two_link", adapted=LINK2)), 10.0)
@@ -247,6 +248,7 @@ def test_where_nothing_excites_the_force_needs_its_measurement():
     assert ends[10.0] < 1e-3
 
 
+@pytest.mark.slow
 def test_what_samples_cost():
     """At 1 ms 0.05 mm and 0.02 N, twice as much at 2 ms; V rises at times, by the square of it."""
     rises = {}

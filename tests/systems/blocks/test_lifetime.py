@@ -110,6 +110,7 @@ def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():
     assert [last() for last in lasts] == [None] * 4
 
 
+@pytest.mark.slow
 def test_a_linearized_loop_is_freed():
     made = loop()
     context = made.diagram.CreateDefaultContext()

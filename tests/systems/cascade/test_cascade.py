@@ -113,6 +113,7 @@ def step(d, x, u, h):
     return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
+@pytest.mark.slow
 def test_the_blocks_compute_the_equations():
     """Of 50 samples of a sampled loop; both integrate to 1e-10, and errors grow by a hundred."""
     loop = SpringLoop(60.0, 0.8, 40.0)

@@ -90,6 +90,7 @@ def test_any_jump_stays_within_limits_and_does_not_overshoot():
     assert np.abs(rows[:, 1]).max() > 0.39  # It moves as fast as it may.
 
 
+@pytest.mark.slow
 def test_the_block_follows_its_filter_and_begins_with_the_references_as_they_are():
     own = moving()
     block = CommandedReferences([own], (2, 0), SIGNALS, LIMITS, start_time=0.5)

@@ -105,6 +105,7 @@ def test_run_that_goes_on_keeps_what_is_held():
     assert_allclose(loop.record(context)["state"][-1], record["state"][-1], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "periods", [(8e-3, 4e-3), pytest.param((4e-3, 2e-3, 1e-3), marks=pytest.mark.slow)]
 )

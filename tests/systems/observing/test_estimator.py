@@ -138,6 +138,7 @@ def test_friction_that_is_stiff_for_the_samples_is_borne():
     assert 3.0 < found[-1, 0] < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", some([None, 3.0], first=1))
 def test_noise_leaves_the_deviations_of_the_filter(ratio):
     """60 s, 6,000 samples that are correlated for some 10: 600 of them tell 4 per cent."""
@@ -286,6 +287,7 @@ SENSED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", some([0.001, 0.0015]))
 @pytest.mark.parametrize(
     "plant",

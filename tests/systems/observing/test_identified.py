@@ -90,6 +90,7 @@ def moved(amplitude: float):
     return loop.record(context)
 
 
+@pytest.mark.slow
 def test_mass_and_viscous_friction_of_a_body_are_found_with_honest_deviations():
     """To 1 %, which is less than the deviations that are stated, and these are below 15 %."""
     record = moved(0.3)
@@ -122,6 +123,7 @@ def observed_arm():
     return system, Observation.of(structure, layout), names
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_momentum_and_distance():
     """Central differences of steps of 1e-5, whose error is about 1e-9 of values of up to 10.
 
@@ -251,6 +253,7 @@ def test_the_simulator_steps_as_a_rollout_does():
         assert_allclose(record[name][-1], slow[name][-1], rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_path, capsys):
     settings = [*KILOGRAM, "duration=0.5", "write={plots: false, animation: false}"]
     words = [word for setting in settings for word in ("--set", setting)]
@@ -263,6 +266,7 @@ def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_
     assert line.endswith("this motion does not excite them")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

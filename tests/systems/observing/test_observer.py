@@ -246,6 +246,7 @@ def test_friction_stands_still_where_the_contact_is_taken_for_lost():
     assert np.abs(record["disturbance"][-1]).max() > 0.5
 
 
+@pytest.mark.slow
 def test_friction_stands_still_where_nothing_slides():
     """A reaction holds the arm still then; what is found is what the wall answers, at its own rate.
 
@@ -448,6 +449,7 @@ def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():
     assert_allclose(change, [-1.5, 0.7], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_observed_is_refused():
     system = body()
     with pytest.raises(ModelError, match=r"no state 'w'"):

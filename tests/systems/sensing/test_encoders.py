@@ -94,6 +94,7 @@ def test_velocity_is_late_by_its_lag():
     assert_allclose(lag, 1.0 / W, rtol=1e-2)  # To (W T)^2 / 12.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", [1e-5, 1e-4])
 def test_rounding_is_noise_of_its_deviation(delta):
     """delta / sqrt(12) of positions, and what the filter passes of it in velocities.

@@ -148,6 +148,7 @@ def test_a_rollout_loses_the_same_controls(name):
     assert np.ptp(record["state"]) > 0.5
 
 
+@pytest.mark.slow
 def test_moments_under_jitter_are_those_of_the_random_map():
     """x_(k+1) = x_k + e u_(k-1) + (T - e) u_k with e = 0 or j: E of x^2 by the Kronecker product.
 
@@ -229,6 +230,7 @@ def test_numbers_of_a_link_that_make_no_sense_are_refused(numbers, text):
         Sampling(T, **numbers)
 
 
+@pytest.mark.slow
 def test_jitter_on_a_discrete_plant_is_a_multiple_of_its_steps():
     """That plant takes controls at its steps alone, so that less would change nothing."""
     point = "sampling={period: 0.001, delay: 0.001, jitter: 0.0005}"

@@ -13,6 +13,7 @@ from drake_dae.errors import MachineCodeWarning, ModelError, ScenarioError, Simu
 CONTACT = "plant=!MultibodyPlant {time_step: 1.0e-3}", "constraint_damping=!Poles {all: [-50.0]}"
 
 
+@pytest.mark.slow
 def test_run_ends_when_the_recent_error_is_too_large():
     """e = e0 exp(-4 t) (1 + 4 t): with a short window it is tolerated from after on, or not."""
     still = "references={tool.z: 0.3, wall.force: 20}"
@@ -47,6 +48,7 @@ def test_recent_error_is_that_of_its_equation():
         assert (np.sqrt(recent) > largest) == (time > raised.value.time - 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_rollout_ends_where_simulate_does(compiled):
     """With fixed steps both see the same errors at the same samples, and say the same."""

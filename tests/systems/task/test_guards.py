@@ -40,6 +40,7 @@ def ended(phases, distance, end, period=0.0, accuracy=1e-7):
     return loop, context, loop.changes(context)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of", "most", "time"),
     [
@@ -78,6 +79,7 @@ def test_work_is_force_times_way():
     assert_allclose(10.0 * (heights[-1] - heights[0]), 0.4, atol=10.0 * 0.5 * 2.0 * PERIOD)
 
 
+@pytest.mark.slow
 def test_guards_of_force_and_control_trip_at_their_value():
     """At rest u = H - J' F, by MultibodyPlant; fewer newtons take more of it."""
     pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[PhaseGuard("force", 15.0)])
@@ -139,6 +141,7 @@ def test_a_phase_waits_for_its_signal(comes):
         run_on(loop, context, 0.5)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_interrupted_goes_on_as_one_that_is_not(tmp_path):
     """What it has counted stands in its context; the record read again knows phases by name."""
     guards = [PhaseGuard("work", 0.3), PhaseGuard("force", 30.0, samples=20)]
@@ -169,6 +172,7 @@ def test_a_phase_of_a_users_own_has_all_that_the_others_have():
     assert_allclose(record["controlled_output"][row, 0], 0.32, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_who_holds_keeps_contact_and_force():
     """The force has no rate in this law: it stays what it was, to the accuracy of steps."""
     pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[PhaseGuard("force", 15.0)])
@@ -180,6 +184,7 @@ def test_who_holds_keeps_contact_and_force():
     assert changes[-1].in_contact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "phases",
     [

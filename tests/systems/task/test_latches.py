@@ -59,6 +59,7 @@ def test_the_closed_latches_follow_from_the_phases():
     assert len(plan.latch_sets) == 3
 
 
+@pytest.mark.slow
 def test_an_object_passes_from_hand_to_hand_and_stays_on_its_path(run):
     """The accuracy of a step is 1e-8 m; the whole run leaves less than 1e-7 of the 0.1 m."""
     loop, context, record = run
@@ -90,6 +91,7 @@ def test_the_forces_of_the_hands_add_up_to_those_of_the_object(run):
     assert abs(forces[last, 0]) < 0.05
 
 
+@pytest.mark.slow
 def test_a_rollout_and_a_sampled_task_do_the_same(model, run):
     """Samples of 1 ms end phases up to 1 ms later, and the held control leaves 1e-5 m."""
     loop, context, record = run

@@ -12,6 +12,7 @@ from drake_dae.systems.task.phases import Moment
 RELEASE = Release(over=0.2, within=8.0, on_success="stop", on_failure="stop")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknown", some([0.0, 2.0]))
 def test_a_release_ends_against_a_force_that_the_law_does_not_know(unknown):
     """A hand pushes with F into the wall: its force is r + F, and 0.5 N ends the phase.

@@ -104,6 +104,7 @@ def test_a_screw_head_moves_as_drakes_screw_joint(built):
     assert_allclose(found[2], -per_radian * wanted, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rolls", some(first_quick([True, False])))
 def test_a_screw_advances_by_its_pitch_at_constant_force(built, rolls):
     """At constant speed the law that knows no thread has its force exactly, and turns ahead by
@@ -140,6 +141,7 @@ def test_a_cross_threaded_screw_does_not_advance(built):
     assert "cross-threaded, or the bit slips" in last.reason
 
 
+@pytest.mark.slow
 def test_a_tight_screw_ends_by_its_torque(built):
     """Thread friction of 0.05 N m s comes after 0.7 turns: d w = 0.6 N m at 12 rad/s."""
     config = SimulatorConfig(max_step_size=1e-3, use_error_control=False)
@@ -153,6 +155,7 @@ def test_a_tight_screw_ends_by_its_torque(built):
     assert -0.002 * 2 < last.distance < -0.002 * 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("viscous", "problem"), [(0.05, "the screw jams"), (0.0, "screw not tight")]
 )

@@ -160,6 +160,7 @@ def test_run_is_as_predicted(whole):
     assert_allclose(record["controlled_output"][-1, 2], 0.03, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_another_context_is_another_run(whole):
     """What a run did stands in its context alone."""
     loop, context, _ = whole
@@ -228,6 +229,7 @@ def test_a_task_that_may_not_try_again_ends():
         run_on(loop, context, 0.5)
 
 
+@pytest.mark.slow
 def test_patience_goes_on_from_phase_to_phase():
     """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
     short = [Dwell(0.015, over=0.01), Dwell(0.015, over=0.01, if_lost="hold")]
@@ -253,6 +255,7 @@ def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
     assert_allclose(loop.record(context)["distance"][-1, 1], 0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reaction", ["hold", "fail"])
 def test_guard_that_never_fires_is_reported(reaction):
     """The wall is 20 mm away, and 0.2 s are not enough."""
@@ -277,6 +280,7 @@ def test_task_may_begin_in_contact():
     assert loop.changes(context)[-1].phase == "done"
 
 
+@pytest.mark.slow
 def test_robot_rests_after_a_release_as_a_free_one():
     """It was let go at 0.5 N, and stays where it is."""
     loop = task_loop([Press(5.0, over=0.02), Release(over=0.02)])

@@ -155,6 +155,7 @@ def near_contact(plant, count: int, seed: int):
         yield start + change, random.normal(0.0, 20.0, size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["plane", "sphere", "cylinder"])
 def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
     """To 1e-9 of the largest acceleration: both are a few thousand operations of round-off."""
@@ -171,6 +172,7 @@ def test_the_rate_is_that_of_a_continuous_multibody_plant(shape):
     assert 20 < pressed < 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "dissipation"),
     some([("plane", 0.0), ("plane", 2.0), ("plane", 30.0), ("sphere", 2.0), ("cylinder", 2.0)]),
@@ -213,6 +215,7 @@ def on_arm(surface, radius: float) -> CompliantPlant:
     return CompliantPlant(model, PointMaterial(0.0, **{**MATERIAL, "radius": radius}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
     """An ellipsoid with equal axes is a sphere of 0.1 m, of ten times the radius of the ball.
@@ -233,6 +236,7 @@ def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
     assert_allclose(found[1::2], found[::2], rtol=0.0, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["sphere", "ellipsoid"])
 def test_a_ball_that_its_surface_has_no_room_for_is_refused(surface):
     center, radius = (0.7 - 0.05, 0.0, 0.6), 0.05
@@ -281,6 +285,7 @@ def run_sled(time_step, pull, duration, **material):
     return plant.state(own)
 
 
+@pytest.mark.slow
 def test_creep_at_half_the_friction_limit_tells_the_two_laws_apart():
     """step5(s) = 1/2 at s = 1/2, and s / sqrt(1 + s^2) = 1/2 at 1 / sqrt(3).
 
@@ -305,6 +310,7 @@ def test_friction_settles_with_fixed_steps_up_to_m_v_s_by_mu_f_n(steps):
     assert off < 1e-8 if steps == 1.0 else off > 0.05, off
 
 
+@pytest.mark.slow
 def test_steps_tend_to_the_continuous_motion_at_first_order():
     """Sliding at 1.5 times the limit, where both laws of friction are full from 0.1 s on."""
     exact = 0.1 * (7.5 - 5.0) / 2.1
@@ -337,6 +343,7 @@ def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley()
     assert_allclose(energy, 20.0 * 0.05, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time_step", [0.0, 1e-3])
 def test_a_moving_floor_takes_the_sled_along(time_step):
     """A floor at 0.2 m/s pulls the sled with mu N = 5 N until it is as fast, to within v_s."""
@@ -422,6 +429,7 @@ def test_gains_of_a_continuous_contact_need_a_period():
         run_scenario(found)
 
 
+@pytest.mark.slow
 def test_a_task_on_a_continuous_contact_is_sampled():
     settings = ("plant=!CompliantContact {time_step: 0}", "sampling=null", "gains={all: [-25]}")
     found = scenario("wall_polish", *settings)

@@ -42,6 +42,7 @@ def two_link(*settings: str) -> Scenario:
     return found
 
 
+@pytest.mark.slow
 def test_robot_at_rest_is_pressed_in_by_force_over_stiffness():
     """phi = -lambda / k = -0.2 mm, less what a ball of 10 um rolls by.
 

@@ -27,6 +27,7 @@ def pressing(material: str):
     return scenario("two_link_wall", *PRESSES, f"plant=!MultibodyPlant {{{material}}}")
 
 
+@pytest.mark.slow
 def test_a_peg_that_stands_flat_is_as_stiff_as_its_balls():
     """Six balls share 20 N: phi = -20 / (6 k). A ball alone goes six times as deep."""
     still = (
@@ -138,6 +139,7 @@ def stepped(plant, state, control):
     return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
 
 
+@pytest.mark.slow
 def test_a_step_of_a_peg_is_that_of_drakes_contact(plants):
     """Drake's solver stops at a relative residual of 1e-6; ours solves 24 equations as seven."""
     drakes, traced = plants

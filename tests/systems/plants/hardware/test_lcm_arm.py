@@ -104,6 +104,7 @@ def in_drake(model, structure, own_law, duration: float):
     return loop.record(context)
 
 
+@pytest.mark.slow
 def test_the_loop_is_that_of_a_simulated_plant():
     """In each sample status and command pass the bus without delay, after a first one without."""
     parts = weightless()
@@ -121,6 +122,7 @@ def test_the_loop_is_that_of_a_simulated_plant():
     assert bench.shown("driver_status")[0] == RUNNING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["iiwa", "panda"])
 def test_an_arm_under_gravity_tracks_with_its_driver(kind):
     """The driver bears the weight where the arm is, and the law where it was in its sample."""
@@ -152,6 +154,7 @@ def test_before_the_first_message_there_is_no_torque():
     assert bench.shown("driver_status")[0] == RUNNING
 
 
+@pytest.mark.slow
 def test_a_short_silence_is_held_and_a_long_one_is_a_stop():
     bench = Bench("iiwa", *weightless(), max_age=0.02, stop_time=0.05)
     bench.advance(50)

@@ -150,6 +150,7 @@ def test_over_a_hole_a_contact_opens_also_within_a_step(over_hole, step):
     assert events == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [-0.0021, -0.0019, 0.0019, 0.0021])
 def test_a_narrow_plate_is_met_within_a_step(ahead):
     """A step of 0.25 s passes both edges and the face; where the face is passed decides."""

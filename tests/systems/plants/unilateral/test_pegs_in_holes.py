@@ -54,6 +54,7 @@ def two_points(depth, chamfer, clearance):
     return standing(-clearance, -depth, angle), angle
 
 
+@pytest.mark.slow
 def test_a_peg_beside_its_hole_hits_the_chamfer_and_slides_into_the_hole():
     """From 2 mm above the face, 0.5 mm off the axis of the hole.
 
@@ -130,6 +131,7 @@ def test_forces_at_two_points_balance_what_pushes_the_peg(depth, chamfer):
     assert_allclose(value(plant, context, "hole_force"), wanted, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_rattling_peg_keeps_its_energy_without_friction():
     """It bounces between the sides of its hole with e = 1; between impacts its motion is exact."""
     plant = plant_of(planar_peg(gravity=0.0, driven=False), restitution=1.0)
@@ -181,6 +183,7 @@ def test_a_hole_that_moves_holds_its_peg_back():
     assert_allclose(value(plant, context, "hole_force").sum(), MASS * 25.0 * moved, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.8, 1.25])
 def test_a_peg_jams_where_the_classical_condition_says(ratio):
     """Whitney (1982): under F_z and M about its end a peg jams if |M| / (r F_z) > l / (2 r mu).

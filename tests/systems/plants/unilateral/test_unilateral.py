@@ -83,6 +83,7 @@ def test_a_ball_without_bounce_stays():
     assert str(event).endswith("closed: floor")
 
 
+@pytest.mark.slow
 def test_a_flat_box_lands_on_both_feet_at_once(bouncing_box):
     """As a ball does, in free fall by 0.2 m; each foot takes half of (1 + e) m v."""
     plant = bouncing_box

@@ -101,6 +101,7 @@ def integrated_by_hand(x, restitution, end):
         closed = not closed and restitution == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("restitution", "kinds"),
     [
