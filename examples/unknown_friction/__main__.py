@@ -71,6 +71,12 @@ FORCE_SENSOR = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_devia
 FINE, COARSE = ((f"encoders={{resolution: {size}}}", FORCE_SENSOR) for size in ("1.0e-5", "1.0e-4"))
 FAINT = ("encoders={position_noise: 5.0e-6, velocity_noise: 1.0e-3}", FORCE_SENSOR)
 NOISY = ("encoders={position_noise: 5.0e-5, velocity_noise: 0.01}", FORCE_SENSOR)
+DIFFERENCES = ("encoders={resolution: 1.0e-4, velocity_bandwidth: 200}", FORCE_SENSOR)
+GAINS_ALONE = (
+    *NOISY,
+    "largest_roughness=2",
+    "observer={rate: 10.7, force_rate: 1.88, friction_rate: 2.67, identify_friction: [wall]}",
+)
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,13 @@ OTHERS = (
     Condition(
         "encoders of 1e-4 rad alone", settings=COARSE, position=0.1, force=0.3, roughness=1.0
     ),
+    Condition(
+        "1e-4 rad, differences", settings=DIFFERENCES, position=0.3, force=0.3, roughness=1.0
+    ),
     Condition("5e-5 rad, 0.01 rad/s", settings=NOISY, position=0.1, force=0.4),
+    Condition(
+        "the same, gains alone", settings=GAINS_ALONE, position=0.2, force=0.6, roughness=2.0
+    ),
     Condition("friction 0.1", settings=("plant.friction=0.1",)),
     Condition("friction 0.6", settings=("plant.friction=0.6",)),
     Condition("a line with reversals", settings=TURNS),

@@ -10,6 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number, numbers, positive, vector
 from drake_dae.dae.linearization.linearization import linearize, linearize_loop
 from drake_dae.dae.linearization.models import ComplexArray, Linearization
+from drake_dae.dae.tracking.latency import acting_late
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
@@ -123,7 +124,8 @@ def sampling_error(
     the period; neglected terms are proportional to its square. For stability see `sampled_poles`.
 
     Args:
-        law: The law, without integrals, whose control takes no measured force.
+        law: The law, without integrals, whose control takes no measured force, and which does not
+            compensate damping with a latency.
         times: Times in s, shape (k,), increasing, and dense enough to resolve the control.
         states: x of a run under the continuous law, shape (k, n).
         controls: u of that run, shape (k, p).
@@ -138,6 +140,12 @@ def sampling_error(
         ModelError: The law is another one, a shape is wrong, or a number makes no sense.
     """
     _check(law)
+    if acting_late(law.system, law.latency) is not law.system:
+        raise ModelError(
+            f"{law.system.name}: the law compensates damping with its latency of {law.latency:g} "
+            "s, which this prediction does not include; use a law with latency=0, or simulate the "
+            "loop"
+        )
     period, delay = positive("period", period), _delay(delay)
     moments = vector("times", times, None)
     if moments.size < 3 or np.any(np.diff(moments) <= 0.0):

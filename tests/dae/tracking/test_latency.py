@@ -6,7 +6,7 @@ import pytest
 from runs import run_scenario, scenario
 from scipy.linalg import expm
 
-from drake_dae import DaeSystem, Parameter, TrackingLaw, poles
+from drake_dae import DaeSystem, Parameter, TrackingLaw, poles, sampling_error
 from drake_dae.errors import ModelError
 
 INERTIA, DAMPING, PERIOD, POLE = 1e-3, 2.0, 1e-3, -10.0
@@ -79,6 +79,12 @@ def test_only_damping_counts():
     assert law.damped_structure is law.structure
     late = TrackingLaw(system.with_values({"growth": -3.0}), poles(POLE), latency=LATENCY)
     assert late.damped_structure is not late.structure
+
+
+def test_the_error_by_sampling_is_predicted_without_a_latency_for_damping():
+    law, times = TrackingLaw(joint(), poles(POLE), latency=LATENCY), np.arange(3.0)
+    with pytest.raises(ModelError, match=r"compensates damping with its latency of 0\.0015 s"):
+        sampling_error(law, times, np.zeros((3, 2)), np.zeros((3, 1)), PERIOD)
 
 
 def test_a_latency_is_a_time():
