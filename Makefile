@@ -40,7 +40,7 @@ help:
 	@echo 'make test        lint, types and tests: a quarter of an hour on two cores'
 	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
-	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
+	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
 	@echo 'make unknowns    $(RUNS) plants of four arms beside the bound of their errors, into runs/unknowns/'

@@ -83,6 +83,26 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
     assert own.observer.state_rate is None
 
 
+@pytest.mark.slow
+def test_another_bandwidth_of_differences_is_told_if_it_is_much_better():
+    """The gains for the bandwidth that is told have the errors that are told, and no better one."""
+    wide, narrow = "velocity_bandwidth: 500", "velocity_bandwidth: 50"
+    (note,) = build_completed(two_link(f"encoders={{resolution: 1.0e-4, {wide}}}"))[0].notes
+    told = re.search(
+        r"velocity_bandwidth of (\S+) rad/s in place of 500 the errors of one direction are "
+        r"(\S+ mm and \S+ N)",
+        note,
+    )
+    better = f"encoders={{resolution: 1.0e-4, velocity_bandwidth: {told[1]}}}"
+    (note,) = build_completed(two_link(better))[0].notes
+    assert f"the best for one direction alone: {told[2]} rms" in note
+    assert "in place of" not in note
+    with pytest.raises(ScenarioError, match="no gains are stable") as raised:
+        chosen(two_link(f"encoders={{resolution: 1.0e-4, {narrow}}}"))
+    wider = re.search(r"or let velocity_bandwidth be (\S+) rad/s", str(raised.value))[1]
+    chosen(two_link(f"encoders={{resolution: 1.0e-4, velocity_bandwidth: {wider}}}"))
+
+
 def test_a_roughness_without_use_is_refused():
     with pytest.raises(ScenarioError, match="leave `gains` out and give encoders"):
         chosen(two_link("largest_roughness=1.0"))

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_dae.dae.beyond.advising.contact_advice import advised_gains
 from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
 from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.dae.structure.structure import Structure
@@ -12,6 +11,7 @@ from drake_dae.dae.tracking.constraint_damping import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.sensed import (
+    chosen_gains,
     largest_errors,
     largest_roughness,
     moved_points,
@@ -110,9 +110,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
         with at("gains"):
             errors = largest_errors(scenario)
-            best = advised_gains(sensed, largest_roughness(scenario, model), **errors)
+            best, hint = chosen_gains(sensed, largest_roughness(scenario, model), errors)
         contact, fast = best.gains, best.state_rate
-        known_by, outlook = "these encoders", f". {predicted(best)}"
+        known_by, outlook = "these encoders", f". {predicted(best)}{hint}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = moved_points(model)

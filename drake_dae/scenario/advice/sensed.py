@@ -1,19 +1,29 @@
 """The data on robot, contact and sensors for the choice of gains, and its prediction."""
 
+from dataclasses import replace
+from itertools import chain
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.beyond.advising.contact_advice import AdvisedGains
+from drake_dae.dae.beyond.advising.contact_advice import AdvisedGains, advised_gains
 from drake_dae.dae.beyond.advising.directions import EVERY, MODEL_ERROR, SensedContact
 from drake_dae.dae.beyond.one_direction import SensorNoise
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.errors import GainError
 from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.scenario import Scenario
 
 _SHARE = 0.003
 """The default of the largest roughness, as a fraction of the largest effort limit."""
+
+_FACTORS = (2.0**0.5, 2.0, 2.0**1.5, 4.0, 2.0**2.5, 8.0)
+"""Bandwidths of differences that are tried, over the given one or its inverse."""
+
+_MUCH = 2.0
+"""Another bandwidth is told if the product of both errors is smaller by this factor."""
 
 
 def _largest(deviation: ArrayLike) -> float:
@@ -69,6 +79,61 @@ def sensed_contact(
         ),
         estimates=may_estimate and has_rates,
     )
+
+
+def chosen_gains(
+    situation: SensedContact, roughness: float, errors: dict[str, float]
+) -> tuple[AdvisedGains, str]:
+    """The gains of `advised_gains`, and whether differences of angles should be filtered otherwise.
+
+    With a wide filter, velocities from differences are so rough that gains have to be slow; the lag
+    of a narrow one makes a stiff contact unstable. The bandwidth is the user's choice, so that a
+    better one is told.
+
+    Args:
+        situation, roughness, errors: The arguments of `advised_gains`.
+
+    Returns:
+        The gains, and a sentence, empty if no bandwidth is much better.
+
+    Raises:
+        GainError: There are none; the message ends with a bandwidth with gains, if there is one.
+    """
+    given = situation.noise.velocity_bandwidth
+    narrower, wider = ([float(f"{given * f**k:.2g}") for f in _FACTORS] for k in (-1, 1))
+
+    def found(bandwidth: float) -> AdvisedGains | None:
+        noise = replace(situation.noise, velocity_bandwidth=bandwidth)
+        try:
+            return advised_gains(replace(situation, noise=noise), roughness, **errors)
+        except GainError:
+            return None
+
+    try:
+        best = advised_gains(situation, roughness, **errors)
+    except GainError as error:
+        both = chain(*zip(narrower, wider, strict=True)) if given else ()
+        for bandwidth in both:
+            if found(bandwidth) is not None:
+                text = f"{error}; or let velocity_bandwidth be {bandwidth:g} rad/s"
+                raise GainError(text) from None
+        raise
+    better, at = best, given
+    for bandwidth in narrower if given and not errors else ():
+        if (other := found(bandwidth)) is None or _error(other) > _error(better):
+            break
+        better, at = other, bandwidth
+    if _error(best) < _MUCH * _error(better):
+        return best, ""
+    return best, (
+        f". With a velocity_bandwidth of {at:g} rad/s in place of {given:g} the errors of one "
+        f"direction are {1e3 * better.position_error:.2g} mm and {better.force_error:.2g} N"
+    )
+
+
+def _error(gains: AdvisedGains) -> float:
+    """What is least for the best gains."""
+    return gains.position_error * gains.force_error
 
 
 def predicted(best: AdvisedGains) -> str:
