@@ -11,7 +11,7 @@ from drake_dae.errors import SimulationError
 from drake_dae.systems.task.contacts.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment, Outcome, Phase
 from drake_dae.systems.task.phases.guards import eccentricity
-from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
+from drake_dae.systems.task.progress import LET_GO, ReferenceSegment, TaskProgress
 from drake_dae.systems.task.traced import EARLY, TracedTask
 
 
@@ -60,7 +60,7 @@ class PhaseDecision:
             guards = np.array([float(margin) for margin in margins])
         if holds and change.in_contact and not progress.is_felt:
             lost = task.patience - (time - progress.felt)
-        felt = excess if progress.is_felt else -excess
+        felt = excess + LET_GO * task.contact_force if progress.is_felt else -excess
         if task.plan.latches:  # A latch without force is not lost.
             lost = felt = np.inf
         nearest = np.min(guards, initial=np.inf)

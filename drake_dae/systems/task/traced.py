@@ -28,7 +28,7 @@ from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import APPROACH, DONE, FAIL, HOLD, LEAVE, NEXT, STOP
 from drake_dae.systems.task.phases.tally import GuardMemory
 from drake_dae.systems.task.planner import TaskPlanner
-from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
+from drake_dae.systems.task.progress import LET_GO, ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
@@ -318,7 +318,7 @@ class TracedTask:
 
         waits = ca.logic_and(ca.fmod(named["law"], 2), named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
-        felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
+        felt = ca.if_else(named["is_felt"] > 0.5, excess + LET_GO * task.contact_force, -excess)
         if self._is_latched:  # A latch without force is not lost.
             lost = felt = ca.SX(1)
 

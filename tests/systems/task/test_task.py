@@ -229,6 +229,17 @@ def test_a_task_that_may_not_try_again_ends():
         run_on(loop, context, 0.5)
 
 
+def test_a_force_that_stays_at_the_contact_force_is_felt_once():
+    """By round-off it was above and below all the time, and each event shortened the steps."""
+    phases = (HOLDING, Press(0.5, tolerance=0.05, over=0.1), Dwell(0.1, over=0.05))
+    loop = task_loop(phases, contact_force=0.5, patience=0.05)
+    context = started(loop, distance=0.01)
+    found = run_on(loop, context, 0.6)
+    names = [change.phase for change in loop.changes(context)]
+    assert names == ["Approach", "Press", "Dwell", "done"]
+    assert found.steps < 500
+
+
 @pytest.mark.slow
 def test_patience_goes_on_from_phase_to_phase():
     """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
