@@ -5,7 +5,6 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 
@@ -13,60 +12,67 @@ from drake_dae.errors import ModelError
 def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     """The system as a sampled law sees it: its damping by the speed at which the control acts.
 
-    A law compensates the damping -d v of its model with the measured v. A sampled control acts
+    A law compensates the damping -D v of its model with the measured v. A sampled control acts
     on average by the latency T later, delay + period / 2, when the speed is v + T v'. Hence
 
-        M v' + d (v + T v') = u,    or    (M + T d) v' + d v = u,
+        M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u,
 
-    and the inertia M + T d takes the place of M. With M alone the joint moves as if it had M + T d
-    while gains and integrals are computed for M: a light joint with T d / M = 30, as in the wrists
+    and the inertia M + T D takes the place of M. With M alone the joint moves as if it had M + T D
+    while gains and integrals are computed for M: a light joint with T D / M = 30, as in the wrists
     of some arms, has errors that decay 30 times as slowly. Drake's discrete MultibodyPlant has the
     same matrix, with its step in place of T, since its damping is implicit.
 
-    d_i is -df_i / dx_i at the nominal state, without Coulomb friction, of each state that a force
-    or a control drives, and 0 where that is negative.
+    D is -df / dv without Coulomb friction at the nominal speeds, usually rest, and at any position:
+    a contact with viscous friction damps several joints by one matrix J^T d J. v are the states
+    that a force or a control drives. Those whose own damping, at the nominal state, is 0 or
+    negative do not count.
 
     Args:
         system: The system of a law.
         latency: T in s; 0 for a law that acts at once.
 
     Returns:
-        The system with E + T diag(d) in place of E; itself if that is the same.
+        The system with E + T D in place of E; itself if that is the same.
 
     Raises:
         ModelError: The latency is negative.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
-    added = latency * _damping(system) if latency else np.zeros(system.num_states)
-    if not added.any():
+    damping = _damping(system) if latency else None
+    if damping is None:
         return system
-    inner = system.implicit
+    added, inner = latency * damping, system.implicit
 
     def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
         assert inner is not None
         balance, constraint_rate = inner(rate, constraint_input)
-        return balance + ca.SX(added) * rate, constraint_rate
+        return balance + ca.mtimes(added, rate), constraint_rate
 
     return replace(
         system,
-        mass_matrix=system.mass_matrix + ca.diag(ca.sparsify(ca.DM(added))),
+        mass_matrix=system.mass_matrix + added,
         implicit=None if inner is None else implicit,
         factorize=None,
         state_scale=system.scale,
     )
 
 
-def _damping(system: DaeSystem) -> FloatArray:
-    """d of each state, shape (n,)."""
-    n = system.num_states
+def _damping(system: DaeSystem) -> ca.SX | None:
+    """D of `acting_late`, shape (n, n); None if it is 0."""
+    n, state, symbols = system.num_states, system.state, system.parameter_symbol
     driven = ca.horzcat(system.g, system.h, system.mass_matrix - ca.SX.eye(n))
     rows = [i for i in range(n) if ca.sparsify(driven[i, :]).nnz()]
-    slopes = ca.SX(n, 1)
-    for i in rows:
-        slopes[i] = -ca.gradient(system.f[i], system.state[i])
-    values = {name: 0.0 for name in system.dry}
-    parameters = system.with_values(values).parameter_values if values else system.parameter_values
-    function = ca.Function("damping", [system.state, system.parameter_symbol], [slopes])
-    found = function(system.nominal_state, parameters).full().ravel()
-    return np.maximum(np.where(np.isfinite(found), found, 0.0), 0.0)
+    slopes = -ca.jacobian(system.f[rows, :], state[rows, :])
+    dry = [parameter.symbol for parameter in system.parameters if parameter.name in system.dry]
+    constants = ca.vertcat(state[rows, :], *dry)
+    values = ca.vertcat(ca.DM(system.nominal_state[rows]), ca.DM.zeros(len(dry)))
+    slopes = ca.sparsify(ca.substitute(slopes, constants, values))
+    function = ca.Function("damping", [state, symbols], [ca.diag(slopes)])
+    found = function(system.nominal_state, system.parameter_values).full().ravel()
+    kept = np.flatnonzero(np.isfinite(found) & (found > 0.0)).tolist()
+    if not kept:
+        return None
+    damping, places = ca.SX(n, n), [rows[i] for i in kept]
+    damping[places, places] = slopes[kept, kept]
+    return ca.sparsify(damping)

@@ -94,6 +94,65 @@ def test_a_latency_is_a_time():
         TrackingLaw(joint(), poles(POLE), latency="1 ms")
 
 
+def tool_with_drag():
+    """Two joints of inertia I with a drag d of their tool along its path, whose gradient is J."""
+    q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
+    tool = q[0] + q[1] + 0.1 * q[0] ** 2
+    along = ca.jacobian(tool, q)
+    return DaeSystem(
+        state=ca.vertcat(q, v),
+        mass_matrix=ca.diagcat(ca.SX.eye(2), INERTIA * ca.SX.eye(2)),
+        f=ca.vertcat(v, -DAMPING * ca.mtimes([along.T, along, v])),
+        g=ca.SX(4, 0),
+        h=ca.DM([[0, 0], [0, 0], [1, 0], [0, 1]]),
+        k=ca.SX(0, 1),
+        l=q,
+        m=ca.SX(2, 0),
+    )
+
+
+def test_damping_of_several_joints_at_once_is_a_matrix():
+    """D = J^T d J, with J of the present position, as of a tool that slides with viscous friction.
+
+    With the diagonal of D alone the direction that is not damped would be driven by 1 + T d / I = 4
+    times as much as its errors need.
+    """
+    law = TrackingLaw(tool_with_drag(), poles(POLE), latency=LATENCY)
+    position, speed = np.array([0.3, -0.2]), np.array([0.5, 0.4])
+    control = law.control([*position, *speed], np.zeros(6))
+    along = np.array([[1.0 + 0.2 * position[0], 1.0]])
+    damping = DAMPING * along.T @ along
+    wanted = -(POLE**2) * position + 2.0 * POLE * speed
+    inertia = INERTIA * np.eye(2) + LATENCY * damping
+    np.testing.assert_allclose(control, inertia @ wanted + damping @ speed, rtol=1e-12)
+
+
+def test_coulomb_friction_is_left_out_beside_parameters_of_any_size():
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    sizes, dry, viscous = ca.SX.sym("sizes", 3), ca.SX.sym("dry"), ca.SX.sym("viscous")
+    friction = -dry * v / ca.sqrt(v**2 + 1e-6) - viscous * v
+    system = DaeSystem(
+        state=ca.vertcat(q, v),
+        f=ca.vertcat(v, friction + sizes[0]),
+        g=ca.SX(2, 0),
+        h=ca.DM([0.0, 1.0]),
+        k=ca.SX(0, 1),
+        l=q,
+        m=ca.SX(1, 0),
+        parameters=(
+            Parameter("sizes", np.zeros(3), symbol=sizes),
+            Parameter("dry", 2.0, symbol=dry),
+            Parameter("viscous", 100.0, symbol=viscous),
+        ),
+        dry=("dry",),
+    )
+    law = TrackingLaw(system, poles(POLE), latency=LATENCY)
+    # At rest; the viscous friction is that of the run, not the default.
+    for parameters, viscous_friction in ((None, 100.0), ([0, 0, 0, 2.0, 300.0], 300.0)):
+        (control,) = law.control([0.01, 0.0], np.zeros(3), parameters=parameters)
+        assert control == pytest.approx(-(1.0 + LATENCY * viscous_friction) * POLE**2 * 0.01)
+
+
 LATE = "sampling={period: 0.001, delay: 0.001}"
 DAMPED = "known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
 
