@@ -215,6 +215,19 @@ def test_rounding_at_rest_is_a_constant_error():
     assert found.roughness("y") < 0.01 * abs(wanted)
 
 
+def test_rounding_in_the_first_period_and_twice_in_a_period():
+    """A rest in the first period: (C B + D) h / sqrt(12), as a number of Drake's filter comes."""
+    step = 1e-3
+    diagram, (_, B, C, D) = rounded(0.0, step)
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    rounding = Rounding("encoder", "position", np.array([step]), np.zeros(1))
+    times = [PERIOD, 1.2 * PERIOD, 3.0 * PERIOD]
+    found = spread_with_rounding(diagram, start, parameters, times, None, rounding)
+    wanted = abs(C @ B + D)[0, 0] * step / 12.0**0.5
+    np.testing.assert_allclose(found.deviations["y"][:2, 0], wanted, rtol=0.01)
+    assert np.isfinite(found.changes["y"]).all()
+
+
 @pytest.mark.parametrize("turn", [0.003, 0.04, 0.37, 2.9])
 def test_rounding_in_motion_has_the_spread_of_the_filtered_errors(turn):
     """Beside the same filter of the true errors, over 2,000 zeros of the encoder.

@@ -77,20 +77,20 @@ class RoundedRuns:
     ) -> tuple[FloatArray, FloatArray]:
         """The variances of all signals and of their changes after further periods.
 
-        They are means over the second half of these periods.
+        They are means over the second half of these periods and the one that follows.
 
         Args:
             steps: Steps like those of the first and of the second half of these periods.
             read: The slopes of the positions before each update, of these steps.
-            rows: The signals of the run without noise where each of them begins, where the next
-                begins, and where that ends.
+            rows: The signals of the run without noise where each of them begins, where the
+                following one begins and ends, and a period later.
             moments: When updates are due, as parts of a period.
         """
-        since = len(rows) - 2
-        nominal = rows[:, self.positions]
+        since = len(rows) - 3
+        nominal, half = rows[:, self.positions], since // 2
         squares = np.zeros((2, rows.shape[1]))
-        half, states, before = since // 2, self._states, None
-        for index in range(since + 1):
+        states, before = self._states, None
+        for index in range(since + 2):
             late = int(index >= half)
             (a, b, c, d), slopes = steps[late], read[late]
             if index == since:
@@ -100,11 +100,11 @@ class RoundedRuns:
             shown = c @ states + d @ noise
             if before is not None:
                 squares[1] += np.mean(np.square(shown - before), axis=1)
-            if late and index < since:
+            if late and index <= since:
                 squares[0] += np.mean(np.square(shown), axis=1)
                 before = shown
             states = a @ states + b @ noise
-        whole, change = squares / (since - half)
+        whole, change = squares / (since + 1 - half)
         return whole, change
 
     def _noise(self, read: FloatArray, nominal: FloatArray, states: FloatArray) -> FloatArray:
