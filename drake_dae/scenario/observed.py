@@ -46,11 +46,16 @@ def law_robot(
 
 
 def latency_of(scenario: Scenario, model: RobotModel) -> float:
-    """The mean time from a sample to the moment when its control acts, for rigid joints, in s."""
-    sampling = scenario.sampling
-    if sampling is None or model.stages:
+    """The mean time from a sample to the moment when its control acts, for rigid joints, in s.
+
+    A plant that steps by h damps with the speed at the end of each step: h / 2 later than the mean,
+    and h later than a law without sampling, which acts at each step.
+    """
+    sampling, material = scenario.sampling, scenario.plant.material
+    step = 0.0 if material is None else material.time_step
+    if model.stages:
         return 0.0
-    return sampling.mean_delay + sampling.period / 2.0
+    return step if sampling is None else sampling.mean_delay + (sampling.period + step) / 2.0
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:

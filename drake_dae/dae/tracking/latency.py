@@ -20,7 +20,7 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     and the inertia M + T D takes the place of M. With M alone the joint moves as if it had M + T D
     while gains and integrals are computed for M: a light joint with T D / M = 30, as in the wrists
     of some arms, has errors that decay 30 times as slowly. Drake's discrete MultibodyPlant has the
-    same matrix, with its step in place of T, since its damping is implicit.
+    same matrix, with its step h in place of T, since its damping is implicit: it adds h / 2 to T.
 
     D is -df / dv without Coulomb friction at the nominal speeds, usually rest, and at any position:
     a contact with viscous friction damps several joints by one matrix J^T d J. v are the states

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from runs import run_scenario, scenario
+from runs import roll, run_scenario, scenario
 from scipy.linalg import expm
 
 from drake_dae import DaeSystem, Parameter, TrackingLaw, poles, sampling_error
@@ -185,3 +185,35 @@ def test_continuous_laws_and_those_behind_springs_have_no_latency():
     assert loop.controller.law.latency == 0.0
     loop, *_ = run_scenario(scenario("two_link_flexible", LATE, "duration=0.01"))
     assert loop.controller.law.latency == 0.0
+
+
+@pytest.mark.slow
+def test_a_plant_that_steps_damps_by_the_speed_after_the_step(monkeypatch):
+    """The last joint, of 1e-3 kg m^2 or so with 100 N m s, from 10 mrad off, with poles at -10/s.
+
+    The law acts at each step without a delay. What is left, 0.3 per cent of the start, is contact.
+    """
+    settings = (
+        "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.0}",
+        "known_forces=[!JointFriction {joints: [joint7], viscous: 100}]",
+        "references={tool.y: 0, tool.z: 0.6, tool.z_axis: 0, joint3: 0, joint7: 0, wall.force: 20}",
+        "start.errors={joint7: 0.01}",
+        "gains=!Poles {all: [-10.0]}",
+        "constraint_damping=!Poles {all: [-200.0]}",
+        "duration=0.5",
+    )
+
+    def off(*sampling):
+        loop, record = roll(scenario("wall_point_contact", *settings, *sampling))
+        place = [s.name for s in loop.signals["controlled_output"]].index("joint7")
+        difference = record["tracking_error"] - loop.predicted_error(record)
+        return loop.controller.law.latency, np.abs(difference[:, place]).max()
+
+    latency, without_sampling = off("sampling=null")
+    assert latency == 0.001
+    latency, sampled = off()
+    assert latency == 0.002
+    assert without_sampling < 1e-4
+    assert sampled < 1e-4
+    monkeypatch.setattr("drake_dae.scenario.loop.latency_of", lambda *_: 0.0)
+    assert off("sampling=null")[1] > 5e-4
