@@ -8,7 +8,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import RandomSource, SymbolicVectorSystem
 
-from drake_dae import start_values
+from drake_dae import rollout, start_values
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.spread.runs import noisy_runs, off_proportion
 
@@ -85,3 +85,16 @@ def test_a_run_that_ends_early_is_refused_with_its_seed():
     """A square root of a negative number."""
     with pytest.raises(ModelError, match="a run with noise, with the seed 1, ended early: "):
         noisy_runs(*runs(2, sqrt), (0.5, 1.0), CONFIG, ("y",))
+
+
+def test_each_run_begins_at_its_own_start_with_the_seed_of_its_place():
+    """Also where not all runs are recorded at once: exact, since the numbers are the same."""
+    diagram, starts, parameters = runs(19, square)
+    starts += np.arange(19.0)[:, None]
+    found = noisy_runs(diagram, starts, parameters, (0.01, 0.05), CONFIG, ("y",))
+    times = PERIOD * np.arange(6)
+    each = rollout(diagram, starts, parameters, times=times, seeds=range(1, 20))
+    values = np.array([one.record["y"][1:] for one in each])
+    np.testing.assert_array_equal(found.means["y"], values.mean(axis=0))
+    deviation = found.spread.deviations["y"]
+    np.testing.assert_array_equal(deviation, values.std(axis=0, ddof=1))

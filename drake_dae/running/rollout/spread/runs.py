@@ -18,6 +18,9 @@ from drake_dae.running.rollout.spread.noise import NoiseSpread
 _SMALL, _PAIRS = -0.1, 2
 """The factor of a noise to which the loop answers to first order, if to any; pairs of runs."""
 
+_AT_ONCE = 8
+"""So many runs are recorded at a time: each has all signals of all samples."""
+
 
 @dataclass(frozen=True, eq=False)
 class NoisyRuns:
@@ -124,9 +127,26 @@ def _sampled(
     first, last = (max(round((time - begun) / period), 1) for time in times)
     shown = begun + period * np.arange(first, last + 1)
     rows = np.append(begun, shown)
-    runs = run_loop(loop, start, parameters, rows, config=config, seeds=seeds, scales=scales)
-    for seed, run in zip(seeds, runs, strict=True):
-        if run.failure is not None:
-            raise ModelError(f"a run with noise, with the seed {seed}, ended early: {run.failure}")
-    records = [run.record for run in runs]
-    return shown, {name: np.array([each[name][1:] for each in records]) for name in names}
+    lasting, factors = len(seeds) * float(np.ptp(rows)), np.broadcast_to(scales, len(seeds))
+    found: dict[str, list[FloatArray]] = {name: [] for name in names}
+    for begin in range(0, len(seeds), _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        runs = run_loop(
+            loop,
+            start if np.ndim(start) < 2 else np.asarray(start)[part],
+            parameters
+            if parameters is None or np.ndim(parameters) < 2
+            else np.asarray(parameters)[part],
+            rows,
+            config=config,
+            seeds=seeds[part],
+            scales=factors[part],
+            lasting=lasting,
+        )
+        for seed, run in zip(seeds[part], runs, strict=True):
+            if run.failure is not None:
+                text = f"a run with noise, with the seed {seed}, ended early: {run.failure}"
+                raise ModelError(text)
+            for name in names:
+                found[name].append(run.record[name][1:].copy())
+    return shown, {name: np.array(values) for name, values in found.items()}
