@@ -45,7 +45,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.errors import DrakeDaeError
+from drake_dae.errors import DrakeDaeError, SimulationError
 from drake_dae.pictures.scene.run_motion import ShownLoop
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.constraints.constraint import Constraint
@@ -205,6 +205,7 @@ def scenario() -> Scenario:
 
 # A value of each type that is fine where nothing else is said.
 SAMPLES: dict[Any, Callable[[], Any]] = {
+    SimulationError: lambda: SimulationError("ended", 0.0, np.zeros(4)),
     TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
     Unknown: lambda: Unknown("link1.mass", "link1.mass", 0, "kg"),
     Noise: lambda: Noise("rad", 1e-4, None, 0.1, True),

@@ -200,6 +200,7 @@ class ParameterizedSystem(DifferentiableSystem):
         self._steps.tolerate(context, self.explained(error, parameters, *inputs))
         return function.nowhere()
 
+    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,

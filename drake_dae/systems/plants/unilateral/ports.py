@@ -275,6 +275,7 @@ class ModalPorts(ParameterizedSystem, Plant):
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
 
+    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,
