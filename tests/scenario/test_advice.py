@@ -84,8 +84,8 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
 
 
 @pytest.mark.slow
-def test_another_bandwidth_of_differences_is_told_if_it_is_much_better():
-    """The gains for the bandwidth that is told have the errors that are told, and no better one."""
+def test_another_bandwidth_of_differences_is_named_if_it_is_much_better():
+    """The named bandwidth has gains with the errors of the message, and no other is better."""
     wide, narrow = "velocity_bandwidth: 500", "velocity_bandwidth: 50"
     (note,) = build_completed(two_link(f"encoders={{resolution: 1.0e-4, {wide}}}"))[0].notes
     told = re.search(

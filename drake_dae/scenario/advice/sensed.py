@@ -23,7 +23,7 @@ _FACTORS = (2.0**0.5, 2.0, 2.0**1.5, 4.0, 2.0**2.5, 8.0)
 """Bandwidths of differences that are tried, over the given one or its inverse."""
 
 _MUCH = 2.0
-"""Another bandwidth is told if the product of both errors is smaller by this factor."""
+"""The message names another bandwidth if the product of both errors is smaller by this factor."""
 
 
 def _largest(deviation: ArrayLike) -> float:
@@ -87,8 +87,8 @@ def chosen_gains(
     """The gains of `advised_gains`, and whether differences of angles should be filtered otherwise.
 
     With a wide filter, velocities from differences are so rough that gains have to be slow; the lag
-    of a narrow one makes a stiff contact unstable. The bandwidth is the user's choice, so that a
-    better one is told.
+    of a narrow one makes a stiff contact unstable. The bandwidth is the user's choice, so the
+    sentence names a better one.
 
     Args:
         situation, roughness, errors: The arguments of `advised_gains`.

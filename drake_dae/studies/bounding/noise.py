@@ -23,8 +23,8 @@ _LOOKED, _LONGEST = 12, 4.0
 ends after at most 4 s."""
 
 _OFF, _RUNS = 0.2, 64
-"""A prediction to first order is for answers to noise that are off proportion by less than 20 %;
-for others there are so many runs."""
+"""A prediction to first order is for responses to noise that differ by less than 20 % from linear
+ones; for others there are so many runs."""
 
 _OUTPUTS = "controlled_output"
 
@@ -46,8 +46,8 @@ class NoiseOutlook:
             their unit.
         unit: That unit; empty if drives have several.
         reason: Why there is no prediction; empty if there is one.
-        off: By how much the outputs' answers to noise are off proportion, as a share of them, the
-            largest of all outputs; see `off_proportion`.
+        off: How far the response of the outputs to noise is from a linear one, as a share of it,
+            the largest of all outputs; see `off_proportion`.
         shifts: Name of an output -> the rms distance of the mean of runs with noise from the run
             without; empty if the prediction is one to first order, without such runs.
     """
@@ -71,10 +71,11 @@ class NoiseOutlook:
             )
         shifted = _listed({n: (self.outputs[n][0], shift) for n, shift in self.shifts.items()})
         return (
-            "noise of the sensors is too large for a prediction to first order: ten times what a "
-            f"tenth of it does is off what it does by {100.0 * self.off:.0f} %. In {_RUNS} runs "
-            f"with noise the outputs have the standard deviations {spread}; their means are off a "
-            f"run without by {shifted}; the controls change by {rough} from sample to sample"
+            "noise of the sensors is too large for a prediction to first order: the response to "
+            f"all of it differs by {100.0 * self.off:.0f} % from ten times the response to a tenth "
+            f"of it. In {_RUNS} runs with noise the outputs have the standard deviations {spread}; "
+            f"noise moves their means by {shifted}; the controls change by {rough} from sample to "
+            "sample"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -102,10 +103,10 @@ def noise_outlook(scenario: Scenario) -> NoiseOutlook | None:
     the resolution of encoders by runs of the linearized loop (`RoundedRuns`). That is a prediction
     to first order: it holds if a tenth of the noise does a tenth of what the noise does. Where
     friction holds the tool for a while and lets it go, as at a start, a rest or a reversal, noise
-    decides when and whereto, and the loop answers small noise otherwise than large. So the loop
-    runs with a tenth of the noise and with all of it, and where answers are off proportion by 20 %,
-    runs with other random numbers, and with other zeros of encoders that round, take the place of
-    the prediction.
+    decides when and in which direction, and the response to small noise is another than that to
+    large noise. So the loop runs with a tenth of the noise and with all of it. Where the responses
+    differ by more than 20 %, runs with other random numbers, and with other zeros of encoders that
+    round, take the place of the prediction.
 
     Args:
         scenario: The scenario, as `load_scenario` returns it.

@@ -17,8 +17,8 @@ DONE, HELD = "done", "held"
 """Names in a record for the time after the last phase, and after a task that ended otherwise."""
 
 LET_GO = 1e-3
-"""A contact ceases to be felt this share below `contact_force`, so that a force that stays there
-but for round-off does not begin and cease to be felt all the time."""
+"""A contact ceases to be felt this share below `contact_force`, so that a force that stays there,
+apart from round-off, does not begin and cease to be felt all the time."""
 
 
 @dataclass(frozen=True, eq=False)

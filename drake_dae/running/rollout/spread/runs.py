@@ -16,7 +16,7 @@ from drake_dae.running.rollout.rollout import run_loop
 from drake_dae.running.rollout.spread.noise import NoiseSpread
 
 _SMALL, _PAIRS = -0.1, 2
-"""The factor of a noise to which the loop answers to first order, if to any; pairs of runs."""
+"""The factor of a noise to which the response is linear, if it is to any; pairs of runs."""
 
 _AT_ONCE = 8
 """So many runs are recorded at a time: each has all signals of all samples."""
@@ -43,11 +43,11 @@ def off_proportion(
     config: SimulatorConfig,
     name: str,
 ) -> tuple[FloatArray, FloatArray]:
-    """By how much the answer of a signal to the noise is off one to first order.
+    """How far the response of a signal to noise is from a linear one.
 
     With y(s) the signal of a run whose random numbers are s times as far from their means, and e(s)
-    = (y(s) - y(0)) / s, an answer to first order has e(1) = e(-0.1). The same numbers are in both
-    runs, so that their scatter does not count.
+    = (y(s) - y(0)) / s, a linear response has e(1) = e(-0.1). Both runs have the same random
+    numbers, so that their scatter does not count.
 
     Args:
         loop: The loop.
