@@ -105,12 +105,6 @@ def springy() -> dd.RobotModel:
 
 
 @cache
-def adaptive_law() -> dd.AdaptiveLaw:
-    found = arm("two_link")
-    return dd.AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
-
-
-@cache
 def links_law() -> dd.TrackingLaw:
     return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
 
@@ -288,8 +282,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
     dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
     dd.SpringCascade: cascade,
-    dd.AdaptiveLaw: adaptive_law,
-    dd.AdaptiveController: lambda: dd.AdaptiveController(adaptive_law()),
     "law of SpringCascade": links_law,
     "model of SpringCascade": springy,
     "model of link_side": springy,
