@@ -189,7 +189,6 @@ from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
-from .systems.plants.latched.latched_plant import LatchedPlant as LatchedPlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
