@@ -24,13 +24,10 @@ def make_generator(
     """The reference block of a law: `CommandedReferences` if the settings have `commands`.
 
     Raises:
-        WiringError: The settings have both `governed` and `commands`.
         ReferenceSignalError: The references do not fit the law.
     """
     if parts.commands is None:
         return ReferenceGenerator(references, law.layout.reference_degrees)
-    if parts.governed is not None:
-        raise WiringError("references that are governed cannot be commanded: leave one out")
     degrees, signals = law.layout.reference_degrees, law.system.output_signals
     return CommandedReferences(references, degrees, signals, parts.commands, parts.start_time)
 

@@ -14,7 +14,6 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
@@ -67,7 +66,6 @@ def build_completed(
         structure,
         scene_graph,
         meshcat,
-        motion=prepared.motion,
         commands=commands,
     )
     told = sticking_before(scenario, model, structure), misfit(scenario, model)
@@ -81,7 +79,6 @@ class _Prepared:
     completed: Completed
     model: RobotModel
     structure: Structure
-    motion: TimedScenario | None
 
 
 def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
@@ -94,10 +91,9 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
     slowed = paced(chosen.scenario, model, structure)
-    in_time, motion = timed(slowed.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
-    if (bound := in_time.scenario.error_bound) is not None:
+    notes = (*completed.notes, *chosen.notes, *slowed.notes)
+    if (bound := slowed.scenario.error_bound) is not None:
         with at("error_bound"):
             outputs_named(bound.outputs, model.dae.output_signals)
         notes = (*notes, str(bound))
-    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)
+    return _Prepared(Completed(slowed.scenario, notes), model, structure)
