@@ -122,7 +122,6 @@ from .running.bench.page import write_page as write_page
 from .running.bench.run import Commands as Commands
 from .running.bench.run import replay as replay
 from .running.export.export import export_code as export_code
-from .running.export.fmu.fmu import export_fmu as export_fmu
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.gradient.gradient import RolloutGradient as RolloutGradient
@@ -143,7 +142,6 @@ from .scenario.shipped import shipped_model as shipped_model
 from .simulation.error_bound import ErrorBound as ErrorBound
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
-from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
 from .studies.bounding.bound import bound_errors as bound_errors
 from .studies.bounding.bounded import BoundedErrors as BoundedErrors
@@ -190,7 +188,6 @@ from .systems.plants.contact_events import ContactChange as ContactChange
 from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
-from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
 from .systems.plants.latched.latched_plant import LatchedPlant as LatchedPlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant

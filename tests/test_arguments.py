@@ -8,7 +8,6 @@ tests of that name fail and say so.
 import contextlib
 import datetime
 import inspect
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
@@ -28,7 +27,6 @@ from latches import add_crane, carts, hand_over, latched_crane
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
@@ -67,7 +65,6 @@ from drake_dae.studies.optimization.variables import Variable as Variable_
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
-from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
 
@@ -342,7 +339,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulatorConfig: fixed_step,
     Stage: lambda: dd.DcMotors(0.1, 1e-3, 0.5),
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
-    DrakeLcmInterface: lambda: DrakeLcm("memq://"),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
@@ -589,8 +585,6 @@ class Call(NamedTuple):
 
 def public() -> Iterator[tuple[str, Any]]:
     for name in dd.__all__:
-        if name == "LcmArm" and sys.version_info >= CRASHES:
-            continue
         member = getattr(dd, name)
         if callable(member) and not (
             inspect.isclass(member) and issubclass(member, (Exception, Warning, Enum))

@@ -104,13 +104,11 @@ def _noise(texts: list[str]) -> dict[str, float]:
 
 
 def _load(path: Path, columns: dict[str, str] | None) -> Record:
-    """Reads the record of a run, or a log in CSV or MCAP."""
+    """Reads the record of a run, or a log in CSV."""
     if path.suffix == ".csv":
         return Record.from_csv(path, columns)
-    if path.suffix == ".mcap":
-        return Record.from_mcap(path, columns)
     if columns is not None:
-        raise ModelError(f"--columns names those of a .csv or .mcap, and '{path}' is none")
+        raise ModelError(f"--columns names those of a .csv, and '{path}' is none")
     return load_run(path)
 
 

@@ -166,16 +166,15 @@ def _add_export(commands: Any, scenario: CommandParser) -> None:
     export = commands.add_parser(
         "export",
         parents=[scenario],
-        help="write controller, plant and loop as C99, FMUs or WebAssembly",
+        help="write controller, plant and loop as C99 or WebAssembly",
         description="c: writes the law, the plant and the projection of a scenario as plain C99 "
         "without dependencies, with sizes, names and units; and of a sampled law the whole "
         "controller as one step, with a class of C++ over it. `make` in the folder compiles "
-        "programs that compare them with Python and with a run of Drake's Simulator. fmu: writes "
-        "controller and plant as FMUs (FMI 3.0, co-simulation), with sources and a binary for this "
-        "machine. wasm: writes controller, plant and loop in fixed steps as one WebAssembly "
-        "module, and a module of JavaScript that loads it in a page; it needs drake_dae[compiler].",
+        "programs that compare them with Python and with a run of Drake's Simulator. wasm: "
+        "writes controller, plant and loop in fixed steps as one WebAssembly module, and a module "
+        "of JavaScript that loads it in a page; it needs drake_dae[compiler].",
     )
-    export.add_argument("--format", choices=("c", "fmu", "wasm"), default="c", help="(default: c)")
+    export.add_argument("--format", choices=("c", "wasm"), default="c", help="(default: c)")
     export.path("--out", "folder for the files (default: <scenario>_<format>, _c99 for c)")
     export.json("print the names of the files as JSON")
 

@@ -153,7 +153,7 @@ def add_identify(commands: Any) -> None:
         "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
         "closes or is struck are left out.",
     )
-    identify.path("records", "a run's folder, .npz, .csv or .mcap", metavar="RECORD", nargs="+")
+    identify.path("records", "a run's folder, .npz or .csv", metavar="RECORD", nargs="+")
     identify.repeatable(
         "--free",
         "NAMES",
@@ -167,8 +167,7 @@ def add_identify(commands: Any) -> None:
     identify.settings("change the scenario that --scenario names")
     identify.path(
         "--columns",
-        'of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
-        '"/topic.field: control.joint1_motor"',
+        'of a .csv: a YAML file with lines "column: control.joint1_motor"',
         metavar="FILE",
     )
     identify.path("--out", "a scenario with these values", metavar="FILE")
