@@ -30,7 +30,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns estimated friction peers house equations pictures docs gallery sheet benches referee clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns estimated friction peers house equations pictures docs gallery sheet referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -42,7 +42,6 @@ help:
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
-	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
 	@echo 'make unknowns    $(RUNS) plants of four arms beside the bound of their errors, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
@@ -91,10 +90,6 @@ campaign: $(VENV)/installed-dev
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
 robots: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/real_robots.py $(ARGS)
-
-# To be looked at; needs Chromium.
-benches: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/benches.py --out runs/benches $(ARGS)
 
 # Plants of four vendors' arms: the bound of their errors for the declared ranges, then the runs.
 unknowns: $(VENV)/installed-dev

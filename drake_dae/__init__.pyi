@@ -115,12 +115,7 @@ from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
-from .running.bench.inline import LiveBench as LiveBench
-from .running.bench.inline import inline_page as inline_page
-from .running.bench.live import live as live
 from .running.bench.page import write_page as write_page
-from .running.bench.run import Commands as Commands
-from .running.bench.run import replay as replay
 from .running.export.export import export_code as export_code
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
@@ -163,7 +158,6 @@ from .symbolic import from_symbolic as from_symbolic
 from .systems.adaptive.controller import AdaptiveController as AdaptiveController
 from .systems.adaptive.law import AdaptiveLaw as AdaptiveLaw
 from .systems.cascade.cascade import SpringCascade as SpringCascade
-from .systems.control.command_filter import CommandLimits as CommandLimits
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController

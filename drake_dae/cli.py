@@ -37,7 +37,6 @@ _MODULES = {
     "cache": "keys",
     "explain": "keys",
     "page": "play",
-    "live": "play",
     "render": "plot",
     "diagram": "plot",
     "bound": "sweep",

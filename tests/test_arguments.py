@@ -261,11 +261,9 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.FeedbackGains: lambda: law("two_link").gains,
     dd.ForceSensor: lambda: dd.ForceSensor(1, 0.1),
     dd.Sampling: lambda: dd.Sampling(0.01),
-    dd.CommandLimits: dd.CommandLimits,
     dd.CommandedReferences: lambda: dd.CommandedReferences(
-        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")], dd.CommandLimits()
+        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")]
     ),
-    dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
     dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
     Runner: lambda: Runner(scenario_data(scenario())),
@@ -717,9 +715,7 @@ EVERY = tuple(labels())
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "Record.save": "it writes to the given path",
-    "live": "it serves a page until Ctrl-C",
     "write_page": "it writes to the given path",
-    "Commands.save": "it writes to the given path",
     "export_code": "it writes to the given path",
     "sweep": "it writes to the given path",
     "Study.save": "it writes to the given path",

@@ -12,7 +12,6 @@ from drake_dae.commands.options_of_studies import (
     add_excite,
     add_identify,
     add_sweep,
-    whole_option,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
 
@@ -56,7 +55,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_new(commands)
     _add_export(commands, scenario)
     _add_page(commands, scenario)
-    _add_live(commands, scenario)
     _add_gallery(commands)
     _add_pictures(commands, scenario)
     cache = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
@@ -197,27 +195,6 @@ def _add_page(commands: Any, scenario: CommandParser) -> None:
     )
     page.flag("--open", "open the page in a browser")
     page.json("print the files with their sizes as JSON")
-
-
-def _add_live(commands: Any, scenario: CommandParser) -> None:
-    live = commands.add_parser(
-        "live",
-        parents=[scenario],
-        help="run a scenario in real time, and change it in a browser meanwhile",
-        description="The bench of `page`, run here by Drake's Simulator, for every scenario, also "
-        "with Drake's own contact, contacts that open, and tasks. Only this machine reaches it. "
-        "Its button save writes the record, the scenario and what was commanded.",
-    )
-    live.add_argument(
-        "--port", type=whole_option, default=0, help="(default: any port that is free)"
-    )
-    live.flag("--no-browser", "print the address alone")
-    live.path(
-        "--replay",
-        "run what was commanded in a bench again, commands.json, and write its record",
-        metavar="FILE",
-    )
-    live.path("--out", "folder for what is saved (default: live/<scenario>-<time>)")
 
 
 def _add_gallery(commands: Any) -> None:

@@ -9,7 +9,6 @@ from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
 from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import WiringError
-from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
@@ -49,8 +48,8 @@ class LoopSettings:
         signals: Name -> reference of a signal for which a controller waits, such as phases of a
             task; the signal is set where the reference is above 1/2. For any other signal the loop
             has an input port signal_<name>.
-        commands: The limits with which references and exogenous signals follow a person's commands
-            during the run; see `CommandedReferences`. None for no commands.
+        commanded: Whether a person changes references and exogenous signals during the run; see
+            `CommandedReferences`.
         start_time: The start time of a run, in s: the stability of the zero dynamics is judged with
             the references at this time.
     """
@@ -66,7 +65,7 @@ class LoopSettings:
     slowed: MotionLimits | None = None
     tolerances: Tolerances | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
-    commands: CommandLimits | None = None
+    commanded: bool = False
     start_time: float = 0.0
 
     def period(self, step: float) -> float:

@@ -23,7 +23,6 @@ from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.control.command_filter import CommandLimits
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -52,7 +51,7 @@ def complete_with_law(scenario: Scenario) -> Completed:
 
 
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
+    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
     """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
@@ -68,7 +67,7 @@ def build_completed(
         scene_graph,
         meshcat,
         motion=prepared.motion,
-        commands=commands,
+        commanded=commanded,
     )
     told = sticking_before(scenario, model, structure), misfit(scenario, model)
     return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop

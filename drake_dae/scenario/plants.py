@@ -42,7 +42,6 @@ class RobotToSimulate:
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
-        pushed: Whether the links of Drake's own plant can be pushed while it runs.
     """
 
     model: RobotModel
@@ -52,7 +51,6 @@ class RobotToSimulate:
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
-    pushed: bool = False
     latches: Sequence[str] = ()
     latch_sets: Collection[Collection[str]] = ()
 
@@ -243,7 +241,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 structure=robot.structure,
                 parameters=robot.parameters,
                 disturbances=robot.disturbances,
-                pushed=robot.pushed,
             )
 
 

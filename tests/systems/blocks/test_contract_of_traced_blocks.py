@@ -16,7 +16,6 @@ from drake_dae import (
     AdaptiveController,
     AdaptiveLaw,
     CommandedReferences,
-    CommandLimits,
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
@@ -75,7 +74,7 @@ def references():
 def commanded():
     of = law("two_link")
     own, signals = references().references, of.system.output_signals
-    return CommandedReferences(own, of.degrees, signals, CommandLimits(), 0.4)
+    return CommandedReferences(own, of.degrees, signals)
 
 
 def references_with_parameters():
