@@ -125,9 +125,6 @@ from .running.export.export import export_code as export_code
 from .running.export.fmu.fmu import export_fmu as export_fmu
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
-from .running.rollout.gradient.gradient import RolloutGradient as RolloutGradient
-from .running.rollout.gradient.gradient import rollout_gradient as rollout_gradient
-from .running.rollout.gradient.gradient import rollout_tangent as rollout_tangent
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
 from .running.rollout.spread.noise import NoiseSpread as NoiseSpread
@@ -152,10 +149,6 @@ from .studies.excitation.excite import excite as excite
 from .studies.excitation.promised import Promised as Promised
 from .studies.identification.identified import Identified as Identified
 from .studies.identification.identify import identify as identify
-from .studies.optimization.expressions import RunSymbols as RunSymbols
-from .studies.optimization.optimize import optimize as optimize
-from .studies.optimization.optimum import LimitState as LimitState
-from .studies.optimization.optimum import Optimum as Optimum
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations

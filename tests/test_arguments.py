@@ -63,7 +63,6 @@ from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.bounding.bounded import FailedRun
 from drake_dae.studies.identification.identified import Identified, Noise
 from drake_dae.studies.identification.unknowns import Unknown
-from drake_dae.studies.optimization.variables import Variable as Variable_
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
@@ -225,12 +224,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
         scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
     ),
     Rollout: rolled,
-    Variable_: lambda: Variable_("link1.mass"),
-    dd.LimitState: lambda: dd.LimitState("torque", 0.0, 1, 2),
-    dd.Optimum: lambda: dd.Optimum(
-        context_of(None), rolled(), (), np.zeros(0), {}, 1.0, 0.5, (), 1, 2, True, "Solve_Succeeded"
-    ),
-    dd.RunSymbols: lambda: dd.RunSymbols([0.0, 0.1], {"x": [dd.Signal("x")]}, ["link1.mass"]),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,

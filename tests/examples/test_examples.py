@@ -36,8 +36,6 @@ CLAIMS = {
     "quadruple_tank": (1e-12, 1e-12),
     "own_diagram": (1e-9,),
     "identified_plants": (0.01, 0.05, 0.12),
-    "least_torque": (0.9, 1.001e-3),
-    "even_wear": (1.0 / 3.0, 0.05, 1e-6),
 }
 
 
