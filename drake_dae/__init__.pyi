@@ -144,11 +144,6 @@ from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
 from .studies.bounding.bound import bound_errors as bound_errors
 from .studies.bounding.bounded import BoundedErrors as BoundedErrors
-from .studies.excitation.excitation import Excitation as Excitation
-from .studies.excitation.excite import excite as excite
-from .studies.excitation.promised import Promised as Promised
-from .studies.identification.identified import Identified as Identified
-from .studies.identification.identify import identify as identify
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations

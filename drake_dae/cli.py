@@ -41,7 +41,6 @@ _MODULES = {
     "render": "plot",
     "diagram": "plot",
     "bound": "sweep",
-    "excite": "identify",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""

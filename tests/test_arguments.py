@@ -61,8 +61,6 @@ from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.bounding.bounded import FailedRun
-from drake_dae.studies.identification.identified import Identified, Noise
-from drake_dae.studies.identification.unknowns import Unknown
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
@@ -206,23 +204,6 @@ def scenario() -> Scenario:
 SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulationError: lambda: SimulationError("ended", 0.0, np.zeros(4)),
     TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
-    Unknown: lambda: Unknown("link1.mass", "link1.mass", 0, "kg"),
-    Noise: lambda: Noise("rad", 1e-4, None, 0.1, True),
-    Identified: lambda: Identified(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),),
-        *np.ones((2, 1)),
-        np.eye(1),
-        np.ones(1),
-        (),
-        {},
-        [],
-    ),
-    dd.Promised: lambda: dd.Promised(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),), np.ones(1), np.eye(1), (), np.ones(1)
-    ),
-    dd.Excitation: lambda: dd.Excitation(
-        scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
-    ),
     Rollout: rolled,
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,

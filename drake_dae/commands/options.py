@@ -9,8 +9,6 @@ import drake_dae
 from drake_dae.commands.options_of_studies import (
     CommandParser,
     add_bound,
-    add_excite,
-    add_identify,
     add_sweep,
     whole_option,
 )
@@ -51,8 +49,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_analyze(commands, scenario)
     add_sweep(commands, scenario)
     add_bound(commands, scenario)
-    add_identify(commands)
-    add_excite(commands, scenario)
     _add_new(commands)
     _add_export(commands, scenario)
     _add_page(commands, scenario)

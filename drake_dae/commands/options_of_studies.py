@@ -1,4 +1,4 @@
-"""The kinds of options of commands, and the options of studies and identification."""
+"""The kinds of options of commands, and the options of studies."""
 
 import argparse
 import re
@@ -141,80 +141,6 @@ def add_bound(commands: Any, scenario: CommandParser) -> None:
     bound.flag("--rollout", "run without Drake's Simulator, as for `sweep`")
     bound.path("--out", "a scenario with its gains and the bound", metavar="FILE")
     bound.json("print the bound and its causes as JSON")
-
-
-def add_identify(commands: Any) -> None:
-    """Adds the command `identify`."""
-    identify = commands.add_parser(
-        "identify",
-        help="find masses, friction, stiffness, places and biases from records",
-        description="Finds parameters of the plant of a scenario from records of it, with 95 % "
-        "intervals, what the records do not determine, and what is left of each measurement. The "
-        "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
-        "closes or is struck are left out.",
-    )
-    identify.path("records", "a run's folder, .npz, .csv or .mcap", metavar="RECORD", nargs="+")
-    identify.repeatable(
-        "--free",
-        "NAMES",
-        "parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
-        "position.bias, force.delay and position.delay of sensors; may be repeated",
-        required=True,
-    )
-    identify.add_argument(
-        "--scenario", help="that of the plant (default: the one in the first record)"
-    )
-    identify.settings("change the scenario that --scenario names")
-    identify.path(
-        "--columns",
-        'of a .csv or .mcap: a YAML file with lines "column: control.joint1_motor", or '
-        '"/topic.field: control.joint1_motor"',
-        metavar="FILE",
-    )
-    identify.path("--out", "a scenario with these values", metavar="FILE")
-    identify.json("print the values as JSON")
-
-
-def add_excite(commands: Any, scenario: CommandParser) -> None:
-    """Adds the command `excite`."""
-    excite = commands.add_parser(
-        "excite",
-        parents=[scenario],
-        help="find the motion and the force that determine parameters best",
-        description="Looks for values of some keys of a scenario with which its record determines "
-        "parameters of the plant best, within all limits, and prints the 95 % intervals that "
-        "`identify` will find from it, before and after. Ctrl-C gives the best so far.",
-    )
-    excite.repeatable(
-        "--free",
-        "NAMES",
-        "parameters of the plant, as tool.mass,link3.mass; may be repeated",
-        required=True,
-    )
-    excite.repeatable(
-        "--vary",
-        "KEY=LOW..HIGH",
-        'what may be chosen, as "references.wall.force.amplitudes.0=0..15"; may be repeated',
-        required=True,
-    )
-    excite.repeatable(
-        "--noise",
-        "KIND=DEVIATION",
-        "of sensors, where the scenario states none: position=1e-5,force=0.3 (rad or m; N)",
-    )
-    excite.add_argument(
-        "--criterion",
-        choices=("D", "A"),
-        default="D",
-        help="D: the volume of the ellipsoid of the relative errors; A: the sum of their squares "
-        "(default: D)",
-    )
-    excite.add_argument(
-        "--runs", type=whole_option, default=100, help="how many runs are made (default: 100)"
-    )
-    excite.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
-    excite.path("--out", "a scenario with the choice", metavar="FILE")
-    excite.json("print the choice and the intervals as JSON")
 
 
 def path_option(text: str) -> Path:

@@ -101,8 +101,7 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none for rigid joints.
         force_feedback: Whether the law uses its model's force or a measured one.
         parameters: Parameter name -> its value for law and plant, in place of that of the robot's
-            file, a constraint or a stage; one number for all entries, or a list. `drake-dae
-            identify` writes it.
+            file, a constraint or a stage; one number for all entries, or a list.
         plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
             number for all entries, or a list. A surface can be tilted if it has the key `rpy`.
         plant_payloads: Additional masses on the plant, unknown to the law's model.
