@@ -127,8 +127,6 @@ from .running.export.steps.controller import export_controller as export_control
 from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
-from .running.rollout.spread.noise import NoiseSpread as NoiseSpread
-from .running.rollout.spread.noise import noise_spread as noise_spread
 from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario
@@ -137,13 +135,10 @@ from .scenario.new.new_scenario import new_scenario as new_scenario
 from .scenario.plants import Unilateral as Unilateral
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
-from .simulation.error_bound import ErrorBound as ErrorBound
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
 from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
-from .studies.bounding.bound import bound_errors as bound_errors
-from .studies.bounding.bounded import BoundedErrors as BoundedErrors
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations

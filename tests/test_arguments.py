@@ -57,12 +57,10 @@ from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.bounding.bounded import FailedRun
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 from drake_dae.systems.task.phases import Phase
@@ -244,13 +242,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     ),
     dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
-    dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
-    Runner: lambda: Runner(scenario_data(scenario())),
-    FailedRun: lambda: FailedRun({"link1.mass": 1.0}, "no start"),
-    dd.BoundedErrors: lambda: dd.BoundedErrors(
-        *((dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, None),
-        *(scenario(), Runner(scenario_data(scenario()))),
-    ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: observer,

@@ -101,48 +101,6 @@ def add_sweep(commands: Any, scenario: CommandParser) -> None:
     study.path("--out", "folder for the results (default: runs/<scenario>-sweep)")
 
 
-def add_bound(commands: Any, scenario: CommandParser) -> None:
-    """Adds the command `bound`."""
-    bound = commands.add_parser(
-        "bound",
-        parents=[scenario],
-        help="bound the errors of a scenario for ranges of what is not known",
-        description="Bounds the errors of all outputs for ranges of unknown numbers of plant, "
-        "sensors and disturbances, and prints the share of each number. It simulates the middle "
-        "of all ranges, each end of each range, and random corners of the ranges. The file of "
-        "--out has the bound as its key error_bound: `simulate` and `sweep` report for each of "
-        "its runs whether it held.",
-        epilog="exit code: 0, or 2 if a run failed so that there is no bound, or 1 for an error",
-    )
-    bound.repeatable(
-        "--vary",
-        "KEY=LOW..HIGH",
-        'what is not known, as for `sweep --random`: "plant.friction=0.05..0.8", '
-        '"plant_payloads.0.mass=0.01..0.5", "plant_parameters.wall.position=[[0.69..0.71, 0, 0]]"; '
-        "may be repeated",
-        required=True,
-    )
-    bound.add_argument(
-        "--after",
-        type=float,
-        default=0.0,
-        metavar="SECONDS",
-        help="bound the errors from this time on (default: 0)",
-    )
-    bound.add_argument(
-        "--corners",
-        type=whole_option,
-        default=128,
-        help="how many random corners of the ranges are simulated (default: 128)",
-    )
-    bound.add_argument(
-        "--seed", type=whole_option, default=0, help="of the corners and of noise (default: 0)"
-    )
-    bound.flag("--rollout", "run without Drake's Simulator, as for `sweep`")
-    bound.path("--out", "a scenario with its gains and the bound", metavar="FILE")
-    bound.json("print the bound and its causes as JSON")
-
-
 def path_option(text: str) -> Path:
     """A path of the command line; "", as from an unset variable of the shell, is refused."""
     if not text:

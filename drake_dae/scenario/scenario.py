@@ -28,7 +28,6 @@ from drake_dae.scenario.parts.families import (
     Damping,
     DisturbanceForce,
     Encoders,
-    ErrorBound,
     Force,
     ForceOutput,
     Gains,
@@ -147,8 +146,6 @@ class Scenario:
             left out.
         saturation: Whether controls are limited to the effort limits of the robot's file.
         tolerances: The tolerated errors; a run that exceeds them ends with the reason.
-        error_bound: A bound of the errors, as the command `drake-dae bound` writes it; the summary
-            of a run reports whether it held.
         may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
             with the reason.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
@@ -195,7 +192,6 @@ class Scenario:
     encoders: Encoders | None = None
     saturation: bool = False
     tolerances: Tolerances | None = None
-    error_bound: ErrorBound | None = None
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     time_optimal: Timing | None = None

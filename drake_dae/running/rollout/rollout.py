@@ -134,7 +134,6 @@ def run_loop(
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
-    scales: ArrayLike = 1.0,
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] | None = None,
     on_device: bool = False,
@@ -142,7 +141,6 @@ def run_loop(
     """Runs as `rollout`; the runs may be some of many, and may be stopped.
 
     Args:
-        scales: As for `problems_of`.
         lasting: The total duration of all runs in s, if these are some of many. It alone then
             decides on machine code, whatever the cache contains: so the numbers do not depend on
             when they are computed. None if these are all.
@@ -153,7 +151,7 @@ def run_loop(
     if on_device:
         find_device()
     request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
-    problems = problems_of(request.program, starts, parameters, request.times, seeds, scales)
+    problems = problems_of(request.program, starts, parameters, request.times, seeds)
     rollouts: dict[int, Rollout] = {}
     for program, indices in _kinds(request.program, problems):
         some = problems.chosen(indices)
