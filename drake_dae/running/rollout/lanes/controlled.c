@@ -164,7 +164,7 @@ static mask bounded(Stepping *p, mask alive, real *end) {
     double time = p->time[lane], limit = p->limit[lane];
     double stop = time + p->size[lane];
     if (stop >= limit - 1e-12 * fabs(limit)) stop = limit;
-    *end[lane] = stop;
+    (*end)[lane] = stop;
     p->size[lane] = stop - time;
     if (!(stop - time > 1e-12 * fabs(time)) || p->trials[lane]++ >= TRIALS) alive[lane] = 0;
   }
