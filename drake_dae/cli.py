@@ -39,8 +39,6 @@ _MODULES = {
     "page": "play",
     "render": "plot",
     "diagram": "plot",
-    "bound": "sweep",
-    "excite": "identify",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""

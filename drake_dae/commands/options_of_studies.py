@@ -1,4 +1,4 @@
-"""The kinds of options of commands, and the options of studies and identification."""
+"""The kinds of options of commands, and the options of studies."""
 
 import argparse
 import re
@@ -101,121 +101,8 @@ def add_sweep(commands: Any, scenario: CommandParser) -> None:
     study.path("--out", "folder for the results (default: runs/<scenario>-sweep)")
 
 
-def add_bound(commands: Any, scenario: CommandParser) -> None:
-    """Adds the command `bound`."""
-    bound = commands.add_parser(
-        "bound",
-        parents=[scenario],
-        help="bound the errors of a scenario for ranges of what is not known",
-        description="Bounds the errors of all outputs for ranges of unknown numbers of plant, "
-        "sensors and disturbances, and prints the share of each number. It simulates the middle "
-        "of all ranges, each end of each range, and random corners of the ranges. The file of "
-        "--out has the bound as its key error_bound: `simulate` and `sweep` report for each of "
-        "its runs whether it held.",
-        epilog="exit code: 0, or 2 if a run failed so that there is no bound, or 1 for an error",
-    )
-    bound.repeatable(
-        "--vary",
-        "KEY=LOW..HIGH",
-        'what is not known, as for `sweep --random`: "plant.friction=0.05..0.8", '
-        '"plant_payloads.0.mass=0.01..0.5", "plant_parameters.wall.position=[[0.69..0.71, 0, 0]]"; '
-        "may be repeated",
-        required=True,
-    )
-    bound.add_argument(
-        "--after",
-        type=float,
-        default=0.0,
-        metavar="SECONDS",
-        help="bound the errors from this time on (default: 0)",
-    )
-    bound.add_argument(
-        "--corners",
-        type=whole_option,
-        default=128,
-        help="how many random corners of the ranges are simulated (default: 128)",
-    )
-    bound.add_argument(
-        "--seed", type=whole_option, default=0, help="of the corners and of noise (default: 0)"
-    )
-    bound.flag("--rollout", "run without Drake's Simulator, as for `sweep`")
-    bound.path("--out", "a scenario with its gains and the bound", metavar="FILE")
-    bound.json("print the bound and its causes as JSON")
-
-
-def add_identify(commands: Any) -> None:
-    """Adds the command `identify`."""
-    identify = commands.add_parser(
-        "identify",
-        help="find masses, friction, stiffness, places and biases from records",
-        description="Finds parameters of the plant of a scenario from records of it, with 95 % "
-        "intervals, what the records do not determine, and what is left of each measurement. The "
-        "plant alone is driven by the recorded controls. Steps in which an ideal contact opens, "
-        "closes or is struck are left out.",
-    )
     identify.path("records", "a run's folder, .npz or .csv", metavar="RECORD", nargs="+")
-    identify.repeatable(
-        "--free",
-        "NAMES",
-        "parameters of the plant, as tool.mass,wall.position[0],plant.friction; force.bias, "
-        "position.bias, force.delay and position.delay of sensors; may be repeated",
-        required=True,
-    )
-    identify.add_argument(
-        "--scenario", help="that of the plant (default: the one in the first record)"
-    )
-    identify.settings("change the scenario that --scenario names")
-    identify.path(
-        "--columns",
         'of a .csv: a YAML file with lines "column: control.joint1_motor"',
-        metavar="FILE",
-    )
-    identify.path("--out", "a scenario with these values", metavar="FILE")
-    identify.json("print the values as JSON")
-
-
-def add_excite(commands: Any, scenario: CommandParser) -> None:
-    """Adds the command `excite`."""
-    excite = commands.add_parser(
-        "excite",
-        parents=[scenario],
-        help="find the motion and the force that determine parameters best",
-        description="Looks for values of some keys of a scenario with which its record determines "
-        "parameters of the plant best, within all limits, and prints the 95 % intervals that "
-        "`identify` will find from it, before and after. Ctrl-C gives the best so far.",
-    )
-    excite.repeatable(
-        "--free",
-        "NAMES",
-        "parameters of the plant, as tool.mass,link3.mass; may be repeated",
-        required=True,
-    )
-    excite.repeatable(
-        "--vary",
-        "KEY=LOW..HIGH",
-        'what may be chosen, as "references.wall.force.amplitudes.0=0..15"; may be repeated',
-        required=True,
-    )
-    excite.repeatable(
-        "--noise",
-        "KIND=DEVIATION",
-        "of sensors, where the scenario states none: position=1e-5,force=0.3 (rad or m; N)",
-    )
-    excite.add_argument(
-        "--criterion",
-        choices=("D", "A"),
-        default="D",
-        help="D: the volume of the ellipsoid of the relative errors; A: the sum of their squares "
-        "(default: D)",
-    )
-    excite.add_argument(
-        "--runs", type=whole_option, default=100, help="how many runs are made (default: 100)"
-    )
-    excite.add_argument("--seed", type=whole_option, default=0, help="of the search (default: 0)")
-    excite.path("--out", "a scenario with the choice", metavar="FILE")
-    excite.json("print the choice and the intervals as JSON")
-
-
 def path_option(text: str) -> Path:
     """A path of the command line; "", as from an unset variable of the shell, is refused."""
     if not text:

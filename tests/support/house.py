@@ -73,7 +73,6 @@ LONG = {
 
 # Distributions whose modules bear another name.
 IMPORT_NAMES = {
-    "cupy-cuda12x": "cupy",
     "drake": "pydrake",
     "pycollada": "collada",
     "pyyaml": "yaml",
