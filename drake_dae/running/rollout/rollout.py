@@ -24,7 +24,7 @@ from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
 from drake_dae.running.rollout.lanes.device import find_device, run_on_device
 from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems, problems_of
-from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.program import MAKING, RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
@@ -152,19 +152,23 @@ def run_loop(
     """
     if on_device:
         find_device()
-    request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
-    problems = problems_of(request.program, starts, parameters, request.times, seeds, scales)
+    with MAKING:
+        request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
+        problems = problems_of(request.program, starts, parameters, request.times, seeds, scales)
+        kinds = _kinds(request.program, problems)
     rollouts: dict[int, Rollout] = {}
-    for program, indices in _kinds(request.program, problems):
+    for program, indices in kinds:
         some = problems.chosen(indices)
-        code = request.machine_code(program, len(problems))
+        with MAKING:
+            code = request.machine_code(program, len(problems))
         if on_device:
             batch = run_on_device(program, some, request.settings)
             runs = batch.ended(_continued(program, code), 1)
         else:
             lanes = None
             if code is not None and look is None and len(some) >= SEVERAL:
-                lanes = request.lanes(program, len(problems))
+                with MAKING:
+                    lanes = request.lanes(program, len(problems))
             runs = _runs(program, some, request.settings, code, lanes)
         for index, run in zip(indices.tolist(), runs, strict=True):
             rollouts[index] = _rollout(request.program, problems, index, run)
