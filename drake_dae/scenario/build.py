@@ -7,7 +7,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -18,7 +17,7 @@ from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
-from drake_dae.scenario.forms.keys import at, violated
+from drake_dae.scenario.forms.keys import violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
@@ -96,8 +95,4 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
     slowed = paced(chosen.scenario, model, structure)
     in_time, motion = timed(slowed.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
-    if (bound := in_time.scenario.error_bound) is not None:
-        with at("error_bound"):
-            outputs_named(bound.outputs, model.dae.output_signals)
-        notes = (*notes, str(bound))
     return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)

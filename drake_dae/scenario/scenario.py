@@ -28,7 +28,6 @@ from drake_dae.scenario.parts.families import (
     Damping,
     DisturbanceForce,
     Encoders,
-    ErrorBound,
     Force,
     ForceOutput,
     Gains,
@@ -101,8 +100,7 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none for rigid joints.
         force_feedback: Whether the law uses its model's force or a measured one.
         parameters: Parameter name -> its value for law and plant, in place of that of the robot's
-            file, a constraint or a stage; one number for all entries, or a list. `drake-dae
-            identify` writes it.
+            file, a constraint or a stage; one number for all entries, or a list.
         plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
             number for all entries, or a list. A surface can be tilted if it has the key `rpy`.
         plant_payloads: Additional masses on the plant, unknown to the law's model.
@@ -118,9 +116,9 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The law: the tracking law (28) of the whole robot, a cascade for springs in the joints,
-            or an adaptive law that estimates masses of a robot with rigid joints. By default the
-            tracking law; with springs in Drake's own contact and without `gains` the cascade.
+        law: The tracking law (28) of the whole robot, or a cascade for springs in the joints. By
+            default the tracking law; with springs in Drake's own contact and without `gains` the
+            cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints. With Drake's own contact gains are computed, see `advised`, together with
             `integral`, `constraint_damping`, `observer` and measured force if these are left out;
@@ -148,8 +146,6 @@ class Scenario:
             left out.
         saturation: Whether controls are limited to the effort limits of the robot's file.
         tolerances: The tolerated errors; a run that exceeds them ends with the reason.
-        error_bound: A bound of the errors, as the command `drake-dae bound` writes it; the summary
-            of a run reports whether it held.
         may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
             with the reason.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
@@ -196,7 +192,6 @@ class Scenario:
     encoders: Encoders | None = None
     saturation: bool = False
     tolerances: Tolerances | None = None
-    error_bound: ErrorBound | None = None
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     time_optimal: Timing | None = None
@@ -212,8 +207,6 @@ class Scenario:
     compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
-        if isinstance(self.law, parts.Adaptive) and self.gains is None:
-            object.__setattr__(self, "gains", self.law.gains)
         if self.is_advised:
             return
         if self.gains is None:

@@ -12,7 +12,6 @@ from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.followed import followed_lines
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.error_bound import bound_words, exceeds
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.remarks import (
@@ -92,14 +91,11 @@ def report_run(
         notes=limit_remarks(record, limits),
     )
     verdict = judge(record, predicted, accuracy)
-    bounded = None if scenario.error_bound is None else scenario.error_bound.check(record)
     added = None
     if loop.generator is not None:
         goal, state = loop.generator.reference, record["state"][0]
         added = loop.controller.error_bound(goal, record.time, state)
     lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
-    if bounded is not None:
-        lines += ["", *bound_words(bounded), ""]
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
     lines += departure_remarks(record, loop.feasible)
@@ -109,8 +105,7 @@ def report_run(
     lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]
     is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
     data = {
-        "missed": job.outcome is JobOutcome.BAD or is_unexplained or exceeds(bounded),
-        "error_bound": None if bounded is None else list(map(asdict, bounded)),
+        "missed": job.outcome is JobOutcome.BAD or is_unexplained,
         "job": job.to_dict(),
         "phases": [asdict(change) for change in changes],
         **asdict(near),
@@ -128,7 +123,7 @@ def _contact_remarks(scenario: Scenario, loop: ClosedLoop, record: Record) -> li
     """Remarks on the surfaces of a robot and on its plant."""
     if loop.plant.model is None:
         return []
-    material = None if loop.plant.latches else scenario.plant.material
+    material = scenario.plant.material
     return [
         *surface_remarks(loop.plant.model, record),
         *loop.plant.remarks,

@@ -20,7 +20,6 @@ from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts import time_optimal, written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
-from drake_dae.simulation import error_bound
 from drake_dae.systems.control import sampling
 from drake_dae.systems.plants.contact import contact_material, disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
@@ -100,7 +99,7 @@ Load = Annotated[
 ]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]
+Law = Annotated[parts.Tracking | parts.SpringCascadeForm, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 _Pegs = Annotated[
     tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)
@@ -117,7 +116,6 @@ _PACKETS: dict[Any, Any] = {sampling.Packets: Annotated[sampling.Packets, Form()
 Sampling = Annotated[sampling.Sampling, Form(_PACKETS)]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
-ErrorBound = Annotated[error_bound.ErrorBound, Form()]
 Observer = Annotated[parts.Observer, Form()]
 LargestErrors = Annotated[parts.LargestErrors, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]

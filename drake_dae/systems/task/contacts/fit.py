@@ -24,12 +24,6 @@ def check_plant_of_task(
         WiringError: The plant does not fit; the message has the reason.
     """
     check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
-    if plant.latches != plan.latches:
-        has, needs = (", ".join(names) or "none" for names in (plant.latches, plan.latches))
-        raise WiringError(
-            f"the task opens and closes the latches {needs}, and the plant has {has}: make it "
-            "with the same latches, in this order"
-        )
     if plant.time_step and not sample_period:
         raise WiringError(
             f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
