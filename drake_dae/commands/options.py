@@ -1,6 +1,9 @@
 """The command line: commands, options and their help texts."""
 
 import argparse
+import shlex
+import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,16 @@ from drake_dae.commands.options_of_studies import (
     add_sweep,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO
+
+
+def program() -> str:
+    """The words before a command that is printed for the user, so that it works as printed."""
+    script = Path(sys.argv[0])
+    if script.name != "drake-dae":
+        return shlex.join([sys.executable, "-m", "drake_dae"])
+    found = shutil.which(script.name)
+    is_on_path = found is not None and script.exists() and Path(found).samefile(script)
+    return script.name if is_on_path else shlex.quote(str(script.absolute()))
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
