@@ -25,7 +25,6 @@ from .dae.references import CircleReference as CircleReference
 from .dae.references import ConstantReference as ConstantReference
 from .dae.references import CsvReference as CsvReference
 from .dae.references import ExpressionReference as ExpressionReference
-from .dae.references import GCodeReference as GCodeReference
 from .dae.references import LineReference as LineReference
 from .dae.references import PathLimits as PathLimits
 from .dae.references import PointToPointReference as PointToPointReference
@@ -34,7 +33,6 @@ from .dae.references import Reference as Reference
 from .dae.references import ReferenceRows as ReferenceRows
 from .dae.references import SinusoidReference as SinusoidReference
 from .dae.references import SpiralReference as SpiralReference
-from .dae.references import TextReference as TextReference
 from .dae.references import WaypointsReference as WaypointsReference
 from .dae.references import references_by_name as references_by_name
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure

@@ -434,11 +434,6 @@ PLACES: dict[str, Callable[[], Any]] = {
         Path(__file__).parent / "systems" / "control" / "steps.csv"
     ),
     "columns of CsvReference": lambda: ["x"],
-    "origin of TextReference": lambda: [0.0, 0.0],
-    "file of GCodeReference": lambda: str(
-        Path(__file__).parent / "systems" / "control" / "program.nc"
-    ),
-    "origin of GCodeReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
     "degrees of references_by_name": lambda: [1],
     "q": lambda: ca.SX.sym("q"),

@@ -101,8 +101,6 @@ def add_sweep(commands: Any, scenario: CommandParser) -> None:
     study.path("--out", "folder for the results (default: runs/<scenario>-sweep)")
 
 
-    identify.path("records", "a run's folder, .npz or .csv", metavar="RECORD", nargs="+")
-        'of a .csv: a YAML file with lines "column: control.joint1_motor"',
 def path_option(text: str) -> Path:
     """A path of the command line; "", as from an unset variable of the shell, is refused."""
     if not text:

@@ -89,9 +89,7 @@ Reference = Annotated[
     | Annotated[references.SpiralReference, Form(tag="!Spiral")]
     | Annotated[references.PolylineReference, Form(tag="!Polyline")]
     | Annotated[references.WaypointsReference, Form(tag="!Waypoints")]
-    | Annotated[references.CsvReference, Form(tag="!Csv")]
-    | Annotated[references.GCodeReference, Form(tag="!GCode")]
-    | Annotated[references.TextReference, Form(tag="!Text")],
+    | Annotated[references.CsvReference, Form(tag="!Csv")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[
