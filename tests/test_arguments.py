@@ -8,7 +8,6 @@ tests of that name fail and say so.
 import contextlib
 import datetime
 import inspect
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
@@ -28,7 +27,6 @@ from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
@@ -56,17 +54,11 @@ from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.bounding.bounded import FailedRun
-from drake_dae.studies.identification.identified import Identified, Noise
-from drake_dae.studies.identification.unknowns import Unknown
-from drake_dae.studies.optimization.variables import Variable as Variable_
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
-from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
 
@@ -190,30 +182,7 @@ def scenario() -> Scenario:
 SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulationError: lambda: SimulationError("ended", 0.0, np.zeros(4)),
     TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
-    Unknown: lambda: Unknown("link1.mass", "link1.mass", 0, "kg"),
-    Noise: lambda: Noise("rad", 1e-4, None, 0.1, True),
-    Identified: lambda: Identified(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),),
-        *np.ones((2, 1)),
-        np.eye(1),
-        np.ones(1),
-        (),
-        {},
-        [],
-    ),
-    dd.Promised: lambda: dd.Promised(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),), np.ones(1), np.eye(1), (), np.ones(1)
-    ),
-    dd.Excitation: lambda: dd.Excitation(
-        scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
-    ),
     Rollout: rolled,
-    Variable_: lambda: Variable_("link1.mass"),
-    dd.LimitState: lambda: dd.LimitState("torque", 0.0, 1, 2),
-    dd.Optimum: lambda: dd.Optimum(
-        context_of(None), rolled(), (), np.zeros(0), {}, 1.0, 0.5, (), 1, 2, True, "Solve_Succeeded"
-    ),
-    dd.RunSymbols: lambda: dd.RunSymbols([0.0, 0.1], {"x": [dd.Signal("x")]}, ["link1.mass"]),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,
@@ -246,19 +215,10 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.FeedbackGains: lambda: law("two_link").gains,
     dd.ForceSensor: lambda: dd.ForceSensor(1, 0.1),
     dd.Sampling: lambda: dd.Sampling(0.01),
-    dd.CommandLimits: dd.CommandLimits,
     dd.CommandedReferences: lambda: dd.CommandedReferences(
-        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")], dd.CommandLimits()
+        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")]
     ),
-    dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
-    dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
-    Runner: lambda: Runner(scenario_data(scenario())),
-    FailedRun: lambda: FailedRun({"link1.mass": 1.0}, "no start"),
-    dd.BoundedErrors: lambda: dd.BoundedErrors(
-        *((dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, None),
-        *(scenario(), Runner(scenario_data(scenario()))),
-    ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: observer,
@@ -314,7 +274,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulatorConfig: fixed_step,
     Stage: lambda: dd.DcMotors(0.1, 1e-3, 0.5),
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
-    DrakeLcmInterface: lambda: DrakeLcm("memq://"),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
@@ -456,11 +415,6 @@ PLACES: dict[str, Callable[[], Any]] = {
         Path(__file__).parent / "systems" / "control" / "steps.csv"
     ),
     "columns of CsvReference": lambda: ["x"],
-    "origin of TextReference": lambda: [0.0, 0.0],
-    "file of GCodeReference": lambda: str(
-        Path(__file__).parent / "systems" / "control" / "program.nc"
-    ),
-    "origin of GCodeReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
     "degrees of references_by_name": lambda: [1],
     "q": lambda: ca.SX.sym("q"),
@@ -557,8 +511,6 @@ class Call(NamedTuple):
 
 def public() -> Iterator[tuple[str, Any]]:
     for name in dd.__all__:
-        if name == "LcmArm" and sys.version_info >= CRASHES:
-            continue
         member = getattr(dd, name)
         if callable(member) and not (
             inspect.isclass(member) and issubclass(member, (Exception, Warning, Enum))
@@ -691,9 +643,7 @@ EVERY = tuple(labels())
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "Record.save": "it writes to the given path",
-    "live": "it serves a page until Ctrl-C",
     "write_page": "it writes to the given path",
-    "Commands.save": "it writes to the given path",
     "export_code": "it writes to the given path",
     "sweep": "it writes to the given path",
     "Study.save": "it writes to the given path",

@@ -90,11 +90,12 @@ class LimitsAlong:
     rate: float | None
     reason: str = ""
 
-    def __str__(self) -> str:
+    @property
+    def remedy(self) -> str:
+        """What to do, as a phrase."""
         if self.rate is None:
-            return f"{self.excess}; {self.reason}"
-        slower = 1.0 / self.rate
-        return f"{self.excess}; all references must be {slower:.4g} times slower to keep the limits"
+            return self.reason
+        return f"all references must be {1.0 / self.rate:.4g} times slower to keep the limits"
 
 
 def limits_along(

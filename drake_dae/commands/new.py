@@ -4,18 +4,18 @@ import argparse
 import json
 import logging
 import re
+import shlex
 import warnings
 from pathlib import Path
-from textwrap import fill
 
 from drake_dae.arrays import number_in
+from drake_dae.commands.options import program
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.new.new_scenario import new_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.summary import WIDTH
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -25,20 +25,12 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _analyze(options: argparse.Namespace) -> int:
     """Prints the report on the scenario that the options name."""
-    # Rollouts load SciPy's integrators, which `new` does not need.
-    from drake_dae.studies.bounding.noise import noise_outlook
-
     path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
-    report = find_feasibility(scenario)
-    noise = None if report.problems else noise_outlook(scenario)
+    report = find_feasibility(load_scenario(path, options.settings))
     if options.json:
-        spread = {} if noise is None else {"noise": noise.to_dict()}
-        print(json.dumps({"scenario": path.stem, **report.to_dict(), **spread}, indent=2))
+        print(json.dumps({"scenario": path.stem, **report.to_dict()}, indent=2))
     else:
         print(f"{path.stem}\n\n{report}")
-        if noise is not None:
-            print(f"\n{fill(str(noise), WIDTH)}")
     return 2 if report.problems else 0
 
 
@@ -56,7 +48,7 @@ def _new(options: argparse.Namespace) -> int:
         tip, point = _tip(options.tip)
         _, text = new_scenario(options.robot, options.surface, tip, point, out.parent)
     out.write_text(text, encoding="utf-8")
-    print(f"written: {out}\nnow run: drake-dae simulate {out}")
+    print(f"written: {out}\nnow run: {program()} simulate {shlex.quote(str(out))}")
     return 0
 
 

@@ -18,6 +18,7 @@ from typing import Any, TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
+from drake_dae.commands.options import program
 from drake_dae.commands.play import show
 from drake_dae.commands.run.files import RunFiles
 from drake_dae.commands.run.folder import (
@@ -251,8 +252,8 @@ def _print_report(report: RunReport, files: RunFiles) -> list[str]:
         _print(f"{verdict}\n\n{report.text}\n{where}", sys.stdout)
         if ANIMATION in written:
             named = shlex.quote(str(folder))
-            drawn = "" if PLOTS[0] in written else f"; plots: drake-dae plot {named} --all"
-            _print(f"watch it: drake-dae play {named}{drawn}", sys.stdout)
+            drawn = "" if PLOTS[0] in written else f"; plots: {program()} plot {named} --all"
+            _print(f"watch it: {program()} play {named}{drawn}", sys.stdout)
     with suppress(OSError):
         _print("".join(f"error: {line}\n" for line in files.problems), sys.stderr)
     return written

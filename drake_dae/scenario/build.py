@@ -7,7 +7,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -17,12 +16,11 @@ from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
-from drake_dae.scenario.forms.keys import at, violated
+from drake_dae.scenario.forms.keys import violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.control.command_filter import CommandLimits
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -51,7 +49,7 @@ def complete_with_law(scenario: Scenario) -> Completed:
 
 
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
+    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
     """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
@@ -66,7 +64,7 @@ def build_completed(
         structure,
         scene_graph,
         meshcat,
-        commands=commands,
+        commanded=commanded,
     )
     told = sticking_before(scenario, model, structure), misfit(scenario, model)
     return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop
@@ -92,8 +90,4 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
     chosen = advised(completed.scenario, model, structure)
     slowed = paced(chosen.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *slowed.notes)
-    if (bound := slowed.scenario.error_bound) is not None:
-        with at("error_bound"):
-            outputs_named(bound.outputs, model.dae.output_signals)
-        notes = (*notes, str(bound))
     return _Prepared(Completed(slowed.scenario, notes), model, structure)

@@ -34,7 +34,6 @@ from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.cascade.cascade import SpringCascade
-from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 
@@ -46,7 +45,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
-    commands: CommandLimits | None = None,
+    commanded: bool = False,
 ) -> ClosedLoop:
     """Builds the closed loop of a scenario's robot.
 
@@ -57,8 +56,8 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
-        commands: The limits with which references follow a person's commands; signals for which a
-            task waits are then inputs of the diagram. None for no commands.
+        commanded: Whether a person changes references during the run; signals for which a task
+            waits are then inputs of the diagram.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -90,8 +89,7 @@ def build_loop(
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    pushed = commands is not None
-    plant = plant or make_plant(scenario, model, structure, feedback, opens, pushed)
+    plant = plant or make_plant(scenario, model, structure, feedback, opens)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -105,8 +103,8 @@ def build_loop(
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
         tolerances=scenario.tolerances,
-        signals={} if task is None or commands is not None else task.signals,
-        commands=commands,
+        signals={} if task is None or commanded else task.signals,
+        commanded=commanded,
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)
@@ -148,7 +146,6 @@ def make_plant(
     structure: Structure,
     feedback: bool = False,
     opens: Sequence[str] = (),
-    pushed: bool = False,
 ) -> Plant:
     """Makes the plant of a scenario.
 
@@ -158,7 +155,6 @@ def make_plant(
         structure: The structure of the model's system.
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
-        pushed: Whether the links of Drake's own plant can be pushed while it runs.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -172,7 +168,6 @@ def make_plant(
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,
         scenario.plant_disturbances,
-        pushed,
     )
     try:
         return scenario.plant.plant(robot)

@@ -11,10 +11,10 @@ from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynam
 from drake_dae.analysis.limits import SignalLimits, limits_along
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
-from drake_dae.diagrams.limits import limits_of_run, robot_limits
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.feasibility.limits import limits_of_run, robot_limits
 from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.control.references import ReferenceGenerator
 

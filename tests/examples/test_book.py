@@ -19,7 +19,6 @@ SLOW = {
     "explanations/force.md",
     "explanations/not_robots.md",
     "how_to/bouncing_on_contact.md",
-    "how_to/bound_errors.md",
     "how_to/follow_an_edge.md",
     "how_to/identify_while_it_runs.md",
     "how_to/press_flat.md",
@@ -195,7 +194,7 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
 
 
 QUESTIONS = {
-    "fmu for dymola": "export_c_fmu",
+    "controller for embedded": "export_c",
     "unknown tool weight force error": "wrong_payload",
     "yaml autocomplete vscode": "editor_completion",
 }

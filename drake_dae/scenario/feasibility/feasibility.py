@@ -14,7 +14,6 @@ from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.diagrams.limits import robot_limits
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
 from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
@@ -23,6 +22,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.controllers.task_controller import check_task
+from drake_dae.scenario.feasibility.limits import robot_limits
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws

@@ -123,7 +123,11 @@ class Feasibility:
             *self.wrong_sides,
             *(() if self.task is None else self.task.problems),
             *([self.gains] if self.gains else []),
-            *([] if self.slowing is None else [f"most of all {self.slowing}"]),
+            *(
+                []
+                if self.slowing is None
+                else [f"most of all {self.slowing.excess}; {self.slowing.remedy}"]
+            ),
         )
 
     def __repr__(self) -> str:

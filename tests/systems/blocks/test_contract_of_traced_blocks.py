@@ -14,7 +14,6 @@ from runs import some
 
 from drake_dae import (
     CommandedReferences,
-    CommandLimits,
     CompliantPlant,
     DaePlant,
     DisturbanceObserver,
@@ -70,7 +69,7 @@ def references():
 def commanded():
     of = law("two_link")
     own, signals = references().references, of.system.output_signals
-    return CommandedReferences(own, of.degrees, signals, CommandLimits(), 0.4)
+    return CommandedReferences(own, of.degrees, signals)
 
 
 def references_with_parameters():

@@ -15,7 +15,6 @@ from drake_dae import (
     ConstantReference,
     CsvReference,
     ExpressionReference,
-    GCodeReference,
     LineReference,
     PathLimits,
     PointToPointReference,
@@ -26,7 +25,6 @@ from drake_dae import (
     SinusoidReference,
     SpiralReference,
     SystemReference,
-    TextReference,
     TrajectoryReference,
     WaypointsReference,
 )
@@ -71,11 +69,9 @@ MEMBERS = {
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
     "polyline of many pieces": PolylineReference(EDGES, LIMITS, 0.01),
     "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
-    "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
     "file": CsvReference(
         str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2
     ),
-    "program": GCodeReference(str(Path(__file__).parent / "program.nc"), LIMITS, tolerance=0.05),
     "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),

@@ -95,7 +95,5 @@ def limits_of_run(loop: ClosedLoop, record: Record, cones: Sequence[FrictionCone
     times = record.time[:: record.time.size // MOST_TIMES + 1]
     motion = ZeroDynamics(dae, structure=structure).motion(reference, times, record["state"][0])
     along = limits_along(structure, limits, reference, motion)
-    cause = (
-        "the references alone keep all limits" if along is None else f"by the references {along}"
-    )
-    return [f"most of all {worst} ({cause})"]
+    remedy = "the references alone keep all limits" if along is None else along.remedy
+    return [f"most of all {worst}; {remedy}"]
