@@ -60,7 +60,6 @@ from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
-from .pictures.diagram import save_diagram as save_diagram
 from .pictures.film import save_film as save_film
 from .pictures.runs import plot_runs as plot_runs
 from .pictures.scene.view import start_meshcat as start_meshcat

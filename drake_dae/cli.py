@@ -38,7 +38,6 @@ _MODULES = {
     "explain": "keys",
     "page": "play",
     "render": "plot",
-    "diagram": "plot",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""

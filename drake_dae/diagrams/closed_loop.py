@@ -18,7 +18,6 @@ from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState, PacketsWithNoise
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.pictures.diagram import diagram_svg
 from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller
@@ -76,10 +75,6 @@ class ClosedLoop:
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
-
-    def _repr_html_(self) -> str | None:
-        """The blocks and wires, in a notebook."""
-        return diagram_svg(self.diagram)
 
     @property
     def reference(self) -> ReferenceGenerator:
