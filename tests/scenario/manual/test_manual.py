@@ -49,7 +49,6 @@ PURE = {
     ("!Csv", "tolerance"),
     ("!DcMotors", "gear_ratio"),
     ("!SpringCascade", "damping"),
-    ("!Impedance", "damping_ratio"),
     ("!MeasuredForce", "gain"),
     ("Sampling", "loss"),
     ("Packets", "late"),
