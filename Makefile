@@ -80,7 +80,6 @@ campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/support/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
 	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_limits.py --count 1000 --seed $(SEED)
 
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
 robots: $(VENV)/installed-dev

@@ -44,10 +44,6 @@ from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter
 from .dae.system.signals import Signal as Signal
 from .dae.system.system import DaeSystem as DaeSystem
-from .dae.timing.motion_limits import FrictionCone as FrictionCone
-from .dae.timing.motion_limits import MotionLimits as MotionLimits
-from .dae.timing.profile import PathTiming as PathTiming
-from .dae.timing.profile import TimeOptimalReference as TimeOptimalReference
 from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
@@ -72,6 +68,7 @@ from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
 from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSurface
 from .robots.constraints.couplers import JointCoupler as JointCoupler
+from .robots.constraints.friction import FrictionCone as FrictionCone
 from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
@@ -95,7 +92,6 @@ from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
-from .robots.motion_limits import robot_motion_limits as robot_motion_limits
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions

@@ -95,11 +95,6 @@ def _add_simulate(commands: Any, scenario: CommandParser) -> None:
     )
     run.path("--out", "folder for the results (default: runs/<scenario>-<time>)")
     run.flag("--meshcat", "show the robot while it runs, in a browser")
-    run.flag(
-        "--time-optimal",
-        "follow the references as paths, in the shortest time that the limits of drives and joints "
-        "allow; as the scenario's key `time_optimal`",
-    )
     run.flag("--open", "open the animation in a browser at the end")
     run.flag(
         "--rollout",

@@ -13,7 +13,6 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
@@ -68,7 +67,7 @@ def _plot_all(options: argparse.Namespace) -> int:
         problems += files.problems
         if files.problems:  # Pictures there may be of an earlier time.
             continue
-        written = [name for name in (*PLOTS, PROFILE) if (folder / name).exists()]
+        written = [name for name in PLOTS if (folder / name).exists()]
         print(f"written to {folder}/: {', '.join(written)}")
     for line in problems:
         print(f"error: {line}", file=sys.stderr)
