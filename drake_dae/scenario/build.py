@@ -16,8 +16,6 @@ from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
-from drake_dae.scenario.feasibility.holes import misfit
-from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -70,8 +68,8 @@ def build_completed(
         motion=prepared.motion,
         commands=commands,
     )
-    told = sticking_before(scenario, model, structure), misfit(scenario, model)
-    return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop
+    told = filter(None, [sticking_before(scenario, model, structure)])
+    return Completed(scenario, (*prepared.completed.notes, *told)), loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +87,12 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
         check_task(scenario)
     completed, model = completed_model(scenario, scene_graph, drawn=drawn)
     try:
-        structure = scenario_structure(model, scenario.task)
+        structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    slowed = paced(chosen.scenario, model, structure)
-    in_time, motion = timed(slowed.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
+    in_time, motion = timed(chosen.scenario, model, structure)
+    notes = (*completed.notes, *chosen.notes, *in_time.notes)
     if (bound := in_time.scenario.error_bound) is not None:
         with at("error_bound"):
             outputs_named(bound.outputs, model.dae.output_signals)

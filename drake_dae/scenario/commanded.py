@@ -20,7 +20,6 @@ from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.systems.control.command_filter import CommandLimits
-from drake_dae.systems.task.phases.by_hand import ended_by_hand
 
 PUSH = "push."
 """The prefix of the names of wrenches on links."""
@@ -152,24 +151,7 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
 
 
-def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
-    """Makes a task's phases end also by hand, except those that make or break contact."""
-    task = scenario.task
-    if task is None:
-        return scenario
-    contacts = task.make().contacts
-    phases = [
-        phase
-        if phase.signal or contacts[index] != contacts[index + 1]
-        else ended_by_hand(phase, index)
-        for index, phase in enumerate(task.phases)
-    ]
-    signals = {**{phase.signal: 0.0 for phase in phases if phase.signal}, **task.signals}
-    return replace(scenario, task=replace(task, phases=phases, signals=signals))
-
-
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
-    "phases that are ended by hand": _with_phases_ended_by_hand,
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,

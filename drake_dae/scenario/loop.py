@@ -180,7 +180,6 @@ def make_plant(
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
     check_disturbances(scenario.plant_disturbances, model.links)
-    plan = None if scenario.task is None else scenario.task.make().plan
     robot = RobotToSimulate(
         model,
         structure,
@@ -190,8 +189,6 @@ def make_plant(
         scenario.plant_parameters,
         scenario.plant_disturbances,
         pushed,
-        () if plan is None else plan.latches,
-        () if plan is None else plan.latch_sets,
     )
     try:
         return scenario.plant.plant(robot)

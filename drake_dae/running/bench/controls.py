@@ -17,7 +17,6 @@ from drake_dae.systems.control.command_filter import SPEED
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.phases.by_hand import BY_HAND
 
 MAX_SURFACE_SPEED = 0.05
 """The largest speed, in m/s, of a surface whose motion is not in the law's model."""
@@ -90,9 +89,8 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
         *_compliant_surfaces(plant, inputs, values, 0.2 * size),
     ]
     sliders += [
-        Control("signal", name, "", 0.0, 1.0, 0.0, (index,))
+        Control("signal", port.get_name().removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (index,))
         for port, index in inputs.ports.items()
-        if not (name := port.get_name().removeprefix(SIGNAL)).startswith(BY_HAND)
     ]
     sliders += sliders_of_plant(plant, controller, inputs, values)
     sliders += slider_of_pole(controller, inputs, values)

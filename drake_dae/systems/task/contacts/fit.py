@@ -5,18 +5,16 @@ from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import check_same_sizes
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.contacts.open_contact import OpeningContact
-from drake_dae.systems.task.phases.plan import PhasePlan
 
 
 def check_plant_of_task(
-    plan: PhasePlan, system: DaeSystem, contact: OpeningContact, sample_period: float, plant: Plant
+    system: DaeSystem, contact: OpeningContact, sample_period: float, plant: Plant
 ) -> None:
     """Refuses a plant that does not fit a task.
 
     Args:
-        plan: The order of the phases.
-        system: The system of the laws' model with all constraints.
-        contact: The contact that opens and closes, or the first latch.
+        system: The system of the law in contact.
+        contact: The contact that opens and closes.
         sample_period: The sample period of the task, in s; 0 for none.
         plant: The plant.
 
@@ -24,12 +22,6 @@ def check_plant_of_task(
         WiringError: The plant does not fit; the message has the reason.
     """
     check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
-    if plant.latches != plan.latches:
-        has, needs = (", ".join(names) or "none" for names in (plant.latches, plan.latches))
-        raise WiringError(
-            f"the task opens and closes the latches {needs}, and the plant has {has}: make it "
-            "with the same latches, in this order"
-        )
     if plant.time_step and not sample_period:
         raise WiringError(
             f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
