@@ -162,8 +162,6 @@ from .studies.variations import grid_variations as grid_variations
 from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
-from .systems.adaptive.controller import AdaptiveController as AdaptiveController
-from .systems.adaptive.law import AdaptiveLaw as AdaptiveLaw
 from .systems.cascade.cascade import SpringCascade as SpringCascade
 from .systems.control.command_filter import CommandLimits as CommandLimits
 from .systems.control.commanded import CommandedReferences as CommandedReferences
@@ -191,7 +189,6 @@ from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
-from .systems.plants.latched.latched_plant import LatchedPlant as LatchedPlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant

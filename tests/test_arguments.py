@@ -24,7 +24,7 @@ from actuated import actuated
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from latches import add_crane, carts, hand_over, latched_crane
+from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
@@ -102,12 +102,6 @@ def observed_law() -> dd.TrackingLaw:
 @cache
 def springy() -> dd.RobotModel:
     return actuated("two_link", "flexible").model
-
-
-@cache
-def adaptive_law() -> dd.AdaptiveLaw:
-    found = arm("two_link")
-    return dd.AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
 
 
 @cache
@@ -247,7 +241,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.ContactMaterial: dd.ContactMaterial,
     dd.PointMaterial: dd.PointMaterial,
     dd.ContactPlant: contact_plant,
-    dd.LatchedPlant: latched_crane,
     dd.Controller: lambda: loop().controller,
     dd.LoopSettings: dd.LoopSettings,
     dd.Plant: lambda: loop().plant,
@@ -288,8 +281,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
     dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
     dd.SpringCascade: cascade,
-    dd.AdaptiveLaw: adaptive_law,
-    dd.AdaptiveController: lambda: dd.AdaptiveController(adaptive_law()),
     "law of SpringCascade": links_law,
     "model of SpringCascade": springy,
     "model of link_side": springy,
@@ -409,10 +400,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
-    "model of LatchedPlant": lambda: latched_crane().model,
-    "add_robot of LatchedPlant": lambda: add_crane,
-    "latches of LatchedPlant": lambda: ["hook"],
-    "structure of LatchedPlant": lambda: latched_crane().structure,
     "plan of laws_of_latches": lambda: hand_over().plan,
     "system of laws_of_latches": lambda: carts().dae,
     "system of open_contact": lambda: arm("two_link").model.dae,

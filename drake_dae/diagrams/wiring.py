@@ -184,8 +184,6 @@ def wire_loop(
         builder.Connect(control, plant.GetInputPort("control"))
         if goal is not None and controller.HasInputPort("reference"):
             builder.Connect(goal, controller.GetInputPort("reference"))
-    if plant.latches:
-        builder.Connect(controller.GetOutputPort("latch"), plant.GetInputPort("latch"))
     if controller.HasInputPort("acting_control"):
         builder.Connect(control, controller.GetInputPort("acting_control"))
 

@@ -20,7 +20,7 @@ _COLORS = {
     "observing": "#e3d9f2",
     "sensing": "#d9f0d9",
 }
-_COLORS |= dict.fromkeys(("task", "cascade", "adaptive", "governing"), _COLORS["control"])
+_COLORS |= dict.fromkeys(("task", "cascade", "governing"), _COLORS["control"])
 """Folder of a block's class in `drake_dae/systems` -> color; other blocks are grey."""
 
 

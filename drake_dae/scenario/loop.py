@@ -23,7 +23,6 @@ from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_lo
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion.timing import TimedScenario
-from drake_dae.scenario.controllers.adaptive import adaptive_controller, check_adaptive
 from drake_dae.scenario.controllers.task_controller import (
     opening_contact,
     task_controller,
@@ -31,7 +30,7 @@ from drake_dae.scenario.controllers.task_controller import (
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import latency_of, law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
-from drake_dae.scenario.parts.parts import Adaptive, Tracking
+from drake_dae.scenario.parts.parts import Tracking
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -68,7 +67,6 @@ def build_loop(
         ScenarioError: Something does not fit; the message names its key.
     """
     # The law, and its exogenous signals.
-    check_adaptive(scenario)
     if model.stages and model.friction.signals:
         text = (
             f"'{model.friction.owner}' has presliding, and the law behind springs and motors "
@@ -127,7 +125,7 @@ def build_loop(
 
     # The connections.
     with at("law" if task is None else "task"):
-        controller = _controller(scenario, model, structure, law, plant)
+        controller = _controller(scenario, model, law, plant)
         if controller is not None:
             generator = None if task is not None else make_generator(references, law, settings)
             return wire_loop(
@@ -142,15 +140,13 @@ def build_loop(
 
 
 def _controller(
-    scenario: Scenario, model: RobotModel, structure: Structure, law: TrackingLaw, plant: Plant
+    scenario: Scenario, model: RobotModel, law: TrackingLaw, plant: Plant
 ) -> Controller | None:
-    """The controller of a task, an adaptive law or a cascade; None for the tracking law."""
+    """The controller of a task or a cascade; None for the tracking law."""
     sampling = scenario.sampling
     period = plant.time_step if sampling is None else sampling.period
     if scenario.task is not None:
         return task_controller(scenario, model, law, period)
-    if isinstance(scenario.law, Adaptive):
-        return adaptive_controller(scenario.law, model, structure, period)
     if scenario.spring_loop is None:
         return None
     assert sampling is not None  # law_robot.

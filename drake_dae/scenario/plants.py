@@ -1,7 +1,7 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any, ClassVar, cast
@@ -23,7 +23,6 @@ from drake_dae.systems.plants.contact.contact_material import ContactMaterial, P
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.latched.latched_plant import LatchedPlant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
 from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
@@ -37,8 +36,6 @@ class RobotToSimulate:
         model, structure: The robot, and the structure of its system.
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
-        latches: The latches that a task opens and closes.
-        latch_sets: Those that it closes together.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -53,8 +50,6 @@ class RobotToSimulate:
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
     pushed: bool = False
-    latches: Sequence[str] = ()
-    latch_sets: Collection[Collection[str]] = ()
 
 
 class ScenarioPlant(ABC):
@@ -127,10 +122,6 @@ class IdealConstraints(ScenarioPlant):
         return bool(self.pegs)
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        if robot.latches and not self.pegs:
-            return UnilateralRobotPlant(
-                robot.model, {}, latches=robot.latches, latch_sets=robot.latch_sets
-            )
         if robot.opens:
             return Unilateral(dict.fromkeys(robot.opens, 0.0), pegs=self.pegs).plant(robot)
         if self.pegs:
@@ -204,9 +195,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
     a) off the surface. A smaller radius reduces this deviation from ideal contact; a stiffer
     contact does not. A tool that stays normal to its surface does not roll.
-
-    In a task with latches it is a `LatchedPlant`: welds and balls of Drake that commands open and
-    close, without contact.
     """
 
     carries: ClassVar[bool] = True
@@ -223,19 +211,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters"):
-            if robot.latches:
-                if robot.parameters or robot.disturbances:
-                    raise ModelError(
-                        "Drake's plant with latches takes no plant_parameters and no "
-                        "plant_disturbances; leave them out"
-                    )
-                return LatchedPlant(
-                    robot.model,
-                    robot.add_robot,
-                    robot.latches,
-                    structure=robot.structure,
-                    time_step=self.time_step,
-                )
             return ContactPlant(
                 robot.model,
                 robot.add_robot,

@@ -118,9 +118,9 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The law: the tracking law (28) of the whole robot, a cascade for springs in the joints,
-            or an adaptive law that estimates masses of a robot with rigid joints. By default the
-            tracking law; with springs in Drake's own contact and without `gains` the cascade.
+        law: The tracking law (28) of the whole robot, or a cascade for springs in the joints. By
+            default the tracking law; with springs in Drake's own contact and without `gains` the
+            cascade.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints. With Drake's own contact gains are computed, see `advised`, together with
             `integral`, `constraint_damping`, `observer` and measured force if these are left out;
@@ -212,8 +212,6 @@ class Scenario:
     compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
-        if isinstance(self.law, parts.Adaptive) and self.gains is None:
-            object.__setattr__(self, "gains", self.law.gains)
         if self.is_advised:
             return
         if self.gains is None:

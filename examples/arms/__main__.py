@@ -224,20 +224,6 @@ def flat_press(arm: Arm) -> list[str]:
     ]
 
 
-def hand_over(arm: Arm) -> list[str]:
-    """Arms of six joints have no elbow that is free: the place of the box is all that remains."""
-    box = [f"object_{name}" for name in ("x", "y", "z", "qx", "qy", "qz")]
-    swing = "!Sinusoids {offset: 0.0, amplitudes: [0.08], frequencies: [1.5]}"
-    still = ", ".join(("right.y", "right.z", "right.rx", "right.ry", "right.rz", *arm.joints))
-    return [
-        f"parameters={{object.mass: {arm.box}}}",
-        f"outputs=[{_joints([*box, *arm.joints])}]",
-        f"task.phases.0.references={{object_x: 0.6, object_y: {swing}, "
-        f"object_z: {arm.start['object_z']}, 'object_qx, object_qy, object_qz': 0.0, "
-        f"right.x: 0.04, '{still}': 0.0}}",
-    ]
-
-
 def _surfaces(count: int) -> list[str]:
     """The settings that lay the surfaces of a scenario on the table."""
     return [
@@ -265,7 +251,6 @@ RUNS = {
         (edge_follow, ("ur5", "panda")),
         (polish_unknown_part, ("ur5", "panda")),
         (flat_press, ("ur5", "panda")),
-        (hand_over, ("two_ur5", "two_panda")),
     )
     for arm in arms
 }

@@ -322,8 +322,6 @@ def test_help_reports_the_exit_codes(capsys):
             "wall_guarded",
             "wall_point_contact",
             "flat_press",
-            "hand_over",
-            "tool_change",
             "edge_follow",
             "polish_unknown_part",
         ),

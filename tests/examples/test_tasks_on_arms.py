@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from found_places import found_off
-from numpy.testing import assert_allclose
 from programs import loaded
 from pydrake.math import RollPitchYaw
 
@@ -172,15 +171,3 @@ def test_each_arm_presses_flat_on_a_table_that_is_tilted_by_a_degree(arm, settin
     forces = record["constraint_force"][slides]
     assert 1e-4 < off[slides].max() < 5e-3
     assert (1.0 - 3.0 * forces.min(1) / forces.sum(1)).max() < 0.6
-
-
-@pytest.mark.parametrize(("pair", "mass"), [("two_ur5", 4.0), ("two_panda", 2.0)])
-def test_a_box_goes_from_one_arm_of_a_pair_to_the_other(pair, mass, example):
-    """Then the right hand carries it alone, and the left one is 10 cm away."""
-    loop, found, changes = rolled(example, f"hand_over-{pair}")
-    assert found.failure is None
-    assert [c.phase for c in changes] == ["bring", "grasp", "squeeze", "pass", "retreat", "done"]
-    record, names = found.record, [s.name for s in loop.plant.dae.force_signals]
-    forces = dict(zip(names, record["constraint_force"][-1], strict=True))
-    assert_allclose(forces["right.fz"], -mass * 9.81, rtol=1e-6)
-    assert_allclose([forces[f"left.{name}"] for name in ("fx", "fy", "fz")], 0.0, atol=1e-9)

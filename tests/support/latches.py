@@ -53,29 +53,3 @@ def controller_of(task, model, **settings):
     """The controller of a task with latches."""
     first, *further = dd.laws_of_latches(task.plan, model.dae, dd.poles(-8.0))
     return dd.TaskController(task, *first, further=further, whole=model.dae, **settings)
-
-
-def add_crane(plant, scene_graph=None):
-    """A load of 2 kg that moves along x, y and z, in a plant."""
-    links, parent = "", "world"
-    for axis, vector in {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}.items():
-        name, mass = ("load", 2) if axis == "z" else (axis, 0.1)
-        links += f"""<link name="{name}"><inertial><mass value="{mass}"/>
-        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-        <joint name="load_{axis}" type="prismatic"><parent link="{parent}"/><child link="{name}"/>
-        <axis xyz="{vector}"/><limit effort="0" lower="-9" upper="9" velocity="9"/></joint>"""
-        parent = name
-    Parser(plant).AddModelsFromString(
-        f'<robot name="crane"><link name="world"/>{links}</robot>', "urdf"
-    )
-
-
-def latched_crane():
-    """Drake's plant of the crane, whose hook is fixed to the world."""
-    plant = MultibodyPlant(0.0)
-    add_crane(plant)
-    plant.Finalize()
-    hook = dd.CoincidentPoints("world", (0, 0, 0), "load", (0, 0, 0), name="hook")
-    model = dd.RobotModel.from_multibody(plant, [hook], [])
-    structure = dd.find_constraint_structure(model.dae)
-    return dd.LatchedPlant(model, add_crane, ["hook"], structure=structure)

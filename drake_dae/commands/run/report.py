@@ -128,7 +128,7 @@ def _contact_remarks(scenario: Scenario, loop: ClosedLoop, record: Record) -> li
     """Remarks on the surfaces of a robot and on its plant."""
     if loop.plant.model is None:
         return []
-    material = None if loop.plant.latches else scenario.plant.material
+    material = scenario.plant.material
     return [
         *surface_remarks(loop.plant.model, record),
         *loop.plant.remarks,

@@ -100,7 +100,7 @@ Load = Annotated[
 ]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascadeForm | parts.Adaptive, Choice()]
+Law = Annotated[parts.Tracking | parts.SpringCascadeForm, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 _Pegs = Annotated[
     tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)

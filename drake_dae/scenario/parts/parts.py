@@ -1,6 +1,5 @@
 """Parts of a scenario without a class in the library: force feedback, gains, start."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -85,49 +84,6 @@ class Tracking:
 
     contact_stiffness: float | None = None
     is_cascade: ClassVar = False
-
-    def loop(self) -> SpringLoop | None:
-        """None, since there is no loop around springs."""
-        return None
-
-
-@dataclass(frozen=True)
-class Adaptive:
-    """A law that estimates parameters which enter linearly, such as masses, while it tracks.
-
-    It is an `AdaptiveLaw`, for rigid joints and contacts that stay closed. The keys `gains`,
-    `integral`, `observer` and `constraint_damping` must be left out. With `sampling` the estimates
-    are sampled as well.
-
-    Attributes:
-        parameters: Name of a parameter, as in `plant_parameters` -> its adaptation gain, an entry
-            of Gamma, in the unit of the parameter squared per J. The initial estimate is the law's
-            value.
-        rate: The rate in 1/s at which errors of positions decay.
-        damping: The rate in 1/s at which the deviation e' + rate e from this decay decays.
-        force_rate: The rate in 1/s at which the error of a measured force decays, with
-            `force_feedback`; 0 without.
-    """
-
-    parameters: Mapping[str, float]
-    rate: float = 4.0
-    damping: float = 8.0
-    force_rate: float = 0.0
-    is_cascade: ClassVar = False
-
-    def __post_init__(self) -> None:
-        if not self.parameters:
-            raise ModelError("parameters: name at least one, such as {link2.mass: 2.0}")
-        for name, value in (*self.parameters.items(), ("rate", self.rate)):
-            positive(name, value)
-        positive("damping", self.damping)
-        if self.force_rate:
-            positive("force_rate", self.force_rate)
-
-    @property
-    def gains(self) -> "Poles":
-        """The poles of the errors of positions when the parameters are known."""
-        return Poles(all=[-self.rate])
 
     def loop(self) -> SpringLoop | None:
         """None, since there is no loop around springs."""

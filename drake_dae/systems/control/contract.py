@@ -188,13 +188,6 @@ class Controller(System):
         return ()
 
 
-def output_errors(law: TrackingLaw, values: Mapping[str, FloatArray]) -> Derived:
-    """`desired_output` r and `tracking_error` z - r (29), from "reference" and z of a record."""
-    desired, signals = values["reference"][..., law.layout.lowest], law.system.output_signals
-    error = values["controlled_output"] - desired
-    return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
-
-
 def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
     """Refuses a law for a system of another size than the plant's.
 

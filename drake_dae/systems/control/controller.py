@@ -28,7 +28,7 @@ from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
-from drake_dae.systems.control.contract import Controller, Derived, output_errors
+from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.traced_law import traced_law
@@ -234,7 +234,10 @@ class TrackingController(ParameterizedSystem, Controller):
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
     ) -> Derived:
         """`desired_output` r and `tracking_error` z - r (29), from "reference" and z."""
-        return output_errors(self.law, values)
+        law = self.law
+        desired, signals = values["reference"][..., law.layout.lowest], law.system.output_signals
+        error = values["controlled_output"] - desired
+        return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray

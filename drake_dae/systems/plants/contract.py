@@ -68,9 +68,7 @@ class Plant(System):
         output port `mode`, whose entries are 1 for closed and 0 for open; `normals` are the indices
         of their forces in `constraint_force`. While one is open its force is zero, and the integral
         of its error in a law is not updated. `events` are their events in a run. A plant without
-        such contacts has empty lists. `latches` are the last of `contacts`: bilateral constraints
-        that open and close by the input port `latch`, which has an entry for each of them, above
-        1/2 to be closed.
+        such contacts has empty lists.
     11. Projection. `projects` says whether the state is projected onto N* after each step; a record
         then has the state before the projection.
     12. Feedback. A plant that can compute its control itself has an input port `feedback`, which
@@ -96,7 +94,6 @@ class Plant(System):
     exogenous_places: list[int] = NOWHERE
     contacts: tuple[str, ...] = ()
     normals: tuple[int, ...] = ()
-    latches: tuple[str, ...] = ()
     projects: bool = False
     is_ideal: bool = True
     pushes: System | None = None

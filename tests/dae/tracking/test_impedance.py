@@ -106,11 +106,6 @@ def test_what_makes_no_sense_is_refused(settings, words):
             ["gains=!Impedance {stiffness: {tool.z: 9}}", "integral=[tool.z]"],
             "gains or integral: stiffness: the error of 'tool.z' is integrated",
         ),
-        (
-            "hand_over",
-            ["task.gains=!Impedance {stiffness: {object_x: 9}}"],
-            "task.gains: an !Impedance is not for a task with latches",
-        ),
     ],
 )
 def test_a_scenario_refuses_it_where_no_force_would_be_felt(name, settings, words):

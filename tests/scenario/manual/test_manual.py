@@ -54,7 +54,6 @@ PURE = {
     ("!DcMotors", "gear_ratio"),
     ("!SpringCascade", "damping"),
     ("!Impedance", "damping_ratio"),
-    ("!Adaptive", "parameters"),  # In the unit of each, squared, per J.
     ("!MeasuredForce", "gain"),
     ("Sampling", "loss"),
     ("Packets", "late"),

@@ -31,8 +31,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from runs import some
 
 from drake_dae import (
-    AdaptiveController,
-    AdaptiveLaw,
     ConstantReference,
     DaePlant,
     DaeSystem,
@@ -168,18 +166,6 @@ def test_a_controller_with_measured_force():
     check_gradient(TrackingController(feedback), inputs)
 
 
-def test_an_adaptive_controller():
-    found = arm("two_link")
-    masses = {"link1.mass": 3.0, "link2.mass": 2.0}
-    adaptive = AdaptiveLaw(found.model, masses, 4.0, 8.0, 5.0, found.structure)
-    inputs = {
-        "estimated_state": consistent_states("two_link", 1)[0],
-        "reference": np.array([0.2, 0.1, -0.3, 17.0]),
-        "measured_force": np.array([12.0]),
-    }
-    check_gradient(AdaptiveController(adaptive), inputs, [11.0, 6.5, 0.2])
-
-
 def test_a_force_sensor():
     sensor = ForceSensor(2, 0.05, bias=[1.0, -2.0], noise_deviation=0.3, drift=[0.2, 0.1])
     check_gradient(sensor, {"force": [3.0, 4.0], "noise": [0.1, 0.2]}, [1.0, 2.0])
@@ -191,9 +177,6 @@ def test_a_force_sensor():
         lambda: plant_of("two_link hydraulic")[0],
         lambda: plant_of("pendulum_tension")[0],
         lambda: TrackingController(law("seven_joint")),
-        lambda: AdaptiveController(
-            AdaptiveLaw(arm("two_link").model, {"link2.mass": 2.0}, 4.0, 8.0, 5.0)
-        ),
         lambda: ReferenceGenerator([ConstantReference([1.0, 2.0])], [2, 0]),
         lambda: ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
     ],

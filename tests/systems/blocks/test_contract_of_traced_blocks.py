@@ -13,8 +13,6 @@ from pydrake.systems.analysis import Simulator
 from runs import some
 
 from drake_dae import (
-    AdaptiveController,
-    AdaptiveLaw,
     CommandedReferences,
     CommandLimits,
     CompliantPlant,
@@ -138,13 +136,6 @@ def observer_behind_springs():
     return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
 
 
-def adaptive(force_rate, period):
-    found = arm("two_link")
-    masses = {"link1.mass": 3.0, "link2.mass": 2.0}
-    own = AdaptiveLaw(found.model, masses, 4.0, 8.0, force_rate, structure=found.structure)
-    return AdaptiveController(own, period)
-
-
 def torque_loop(kind):
     model = actuated("two_link", kind).model
     links = link_side(model).dae
@@ -210,9 +201,6 @@ BLOCKS = {
     "SpringView": lambda: SpringView(actuated("two_link", "flexible").model),
     "TorqueLoop": lambda: torque_loop("flexible"),
     "TorqueLoop before motors": lambda: torque_loop("flexible motor"),
-    "AdaptiveController": lambda: adaptive(0.0, 0.0),
-    "AdaptiveController of a measured force": lambda: adaptive(5.0, 0.0),
-    "AdaptiveController with samples": lambda: adaptive(5.0, 0.01),
     "UnilateralRobotPlant": lambda: opening(None),
     "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),

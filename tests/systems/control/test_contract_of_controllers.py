@@ -8,8 +8,6 @@ from members import RestingController
 from polishing import laws, polisher, task_loop
 
 from drake_dae import (
-    AdaptiveController,
-    AdaptiveLaw,
     Approach,
     ConstantReference,
     Encoders,
@@ -56,23 +54,13 @@ def cascade():
     return SpringCascade(own, model, SpringLoop(60.0, motor_rate=60.0), SAMPLE)
 
 
-def adaptive():
-    found = arm("two_link")
-    own = AdaptiveLaw(found.model, {"link2.mass": 2.0}, 4.0, 8.0, structure=found.structure)
-    return AdaptiveController(own)
-
-
 MEMBERS = {
     "law": lambda: TrackingController(law("two_link")),
     "with integral": integrating,
     "task": task,
     "resting": lambda: RestingController(law("two_link")),
     "cascade": cascade,
-    "adaptive": adaptive,
 }
-
-
-FIXED = RestingController, AdaptiveController
 
 
 def robot(controller):
@@ -136,7 +124,7 @@ def test_rule_3_laws(controller):
     np.testing.assert_array_equal(
         controller.parameters_along(context, [0.0, 1.0]), [values, values]
     )
-    if controller.takes_over or isinstance(controller, FIXED):
+    if controller.takes_over or isinstance(controller, RestingController):
         with pytest.raises(ModelError, match="fixed"):
             controller.set_gains(context, poles(-9.0))
     else:

@@ -20,7 +20,6 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     DaePlant,
-    LatchedPlant,
     LcmArm,
     PointMaterial,
     RobotPlant,
@@ -90,10 +89,7 @@ if sys.version_info >= CRASHES:
 
 
 def test_no_member_is_left_out():
-    """Bases of one member alone, as what shows the modes of a plant, are none.
-
-    A LatchedPlant needs commands for its latches, and has tests of its own.
-    """
+    """Bases of one member alone, as what shows the modes of a plant, are none."""
 
     def leaves(cls):
         own = cls.__subclasses__()
@@ -103,7 +99,7 @@ def test_no_member_is_left_out():
 
     package = {cls for cls in leaves(Plant) if cls.__module__.startswith("drake_dae")}
     made = {type(make()) for make in MEMBERS.values()}
-    assert package - made <= {LatchedPlant, *([LcmArm] if sys.version_info >= CRASHES else [])}
+    assert package - made <= {*([LcmArm] if sys.version_info >= CRASHES else [])}
 
 
 @pytest.fixture(params=MEMBERS)

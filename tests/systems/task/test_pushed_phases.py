@@ -4,7 +4,6 @@
 """
 
 import pytest
-from latches import URDF
 from test_screw import ROBOT, TEXT
 
 from drake_dae import load_scenario
@@ -141,55 +140,3 @@ def test_a_bit_that_is_pushed_off_its_screw_ends_as_chosen(case, tmp_path):
     assert told(changes) == expected
     assert reason in (str(failure) if case == "fails" else changes[2].reason)
     assert (failure is None) is (case != "fails")
-
-
-LATCHES = """
-robot: {{file: carts.urdf}}
-constraints:
-- !CoincidentPoints {{name: left_hand, frame_a: left, point_a: [0, 0, 0], frame_b: puck,
-    point_b: [0, 0, 0], axes: x}}
-- !CoincidentPoints {{name: right_hand, frame_a: right, point_a: [0, 0, 0], frame_b: puck,
-    point_b: [0, 0, 0], axes: x}}
-outputs: [!JointPositions {{joints: [puck_x]}}]
-forces: [right_hand.fx]
-gains: {{all: [-8]}}
-plant_disturbances: [{{frame: {frame}, force: {force}, start_time: {start}, end_time: 9}}]
-task:
-  contact_force: 0.01
-  phases:
-  - !Close {{name: grasp, contact: right_hand, over: 0.4, {close}}}
-  - !Move {{name: pull, references: {{right_hand.fx: -6.0}}, duration: 0.3, over: 0.2}}
-  - !Release {{name: pass, contact: left_hand, over: 0.4, {release}}}
-  - !Move {{name: retreat, references: {{left_hand.x: 0.2}}, duration: 0.5, over: 0.4}}
-start: {{positions: {{right_x: 0.1}}}}
-duration: 4
-integrator: {{integration_scheme: runge_kutta3, max_step_size: 0.002, use_error_control: false}}
-"""
-PUSHED_LATCHES = {
-    "a hand that is held back does not close, and stops": (
-        ("right", [30, 0, 0], 0.1),
-        {"close": "within: 1.5, if_late: stop"},
-        ["grasp", "held"],
-        "grasp has waited 1.5 s for a latch within 0.0001 m",
-    ),
-    "a hand that is pulled does not let go, and stops with both hands closed": (
-        ("left", [5, 0, 0], 0.8),
-        {"release": "within: 1, if_late: stop"},
-        ["grasp", "pull", "pass", "held"],
-        "pass has waited 1 s for a force of no more than 0.01 N",
-    ),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", first(PUSHED_LATCHES))
-def test_a_latch_that_is_pushed_ends_as_chosen(case, tmp_path):
-    """By a force that the law does not know, until the end."""
-    (frame, force, start), ends, expected, reason = PUSHED_LATCHES[case]
-    (tmp_path / "carts.urdf").write_text(URDF.replace('"rail"', '"world"'))
-    ends = {"close": "within: 5", "release": "within: 5"} | ends
-    text = LATCHES.format(frame=frame, force=force, start=start, **ends)
-    changes, failure = changes_of(tmp_path / "carts.yaml", text)
-    assert failure is None
-    assert told(changes) == expected
-    assert reason in changes[-1].reason
