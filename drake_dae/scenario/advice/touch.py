@@ -131,7 +131,7 @@ class Touching:
                 felt, speed = phase.felt(task.contact_force), phase.speed_of_approach
                 peak = touch_peak(felt, speed, self.stiffness, self.mobility, self.late)
                 peaks.append((peak, speed, phase.name))
-                if isinstance(then, Press) and speed > (most := self._lasting(task, then)):
+                if isinstance(then, Press) and speed > (most := rounded(self._lasting(task, then))):
                     lost = (
                         f". After {phase.name} at {speed:g} m/s the tool may bounce: {then.name} "
                         f"keeps the contact up to {most:.2g} m/s; a shorter `over` of {then.name} "

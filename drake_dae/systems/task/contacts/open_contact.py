@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
-import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed, unknown_name
+from drake_dae.arrays import listed, unknown_name
 from drake_dae.dae.structure.redundancy import with_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-
 
 FREE, CONTACT = 0, 1
 """The indices of the two laws of a task, and the numbers of their modes."""
